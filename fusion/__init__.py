@@ -1,0 +1,1 @@
+"""What we conclude: preintegration, filter, navigator, tracks, command."""

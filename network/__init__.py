@@ -1,0 +1,1 @@
+"""What is learned: the networks, their training and their use."""

@@ -1,0 +1,33 @@
+"""Noise densities of an inertial sensor, one meaning for simulation, filter and graph."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from stario.sequences.errors import InputError
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous noise densities, independent of the sensor's rate.
+
+    A sample at rate f carries white noise of deviation density * sqrt(f).
+
+    Attributes:
+        gyro_noise: white noise of the gyroscope [rad/s/sqrt(Hz)].
+        accel_noise: white noise of the accelerometer [m/s^2/sqrt(Hz)].
+        gyro_walk: random walk of the gyroscope's bias [rad/s^2/sqrt(Hz)].
+        accel_walk: random walk of the accelerometer's bias [m/s^3/sqrt(Hz)].
+    """
+
+    gyro_noise: float = 1e-3
+    accel_noise: float = 1e-2
+    gyro_walk: float = 3e-5
+    accel_walk: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(item.name, repr(value), "a finite density >= 0")

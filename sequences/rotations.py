@@ -1,0 +1,38 @@
+"""Small rotation helpers shared by readers, windows, metrics and the estimators."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.sequence import FloatArray
+
+
+def yaw_of(attitude_WB: Rotation) -> FloatArray:
+    """Yaw [rad] of the heading-preserving twist about world z (singular only upside down).
+
+    The twist of a quaternion about z is the yaw of the shortest tilt-free part; unlike an Euler
+    angle it stays defined when a device stands upright.
+    """
+    quat_xyzw = np.atleast_2d(attitude_WB.as_quat())
+    return np.asarray(2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3]), dtype=np.float64)
+
+
+def wrap_angle(angle: FloatArray) -> FloatArray:
+    """Angle [rad] brought into (-pi, pi]."""
+    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
+
+
+def about_z(yaw: FloatArray | float) -> Rotation:
+    """Rotation by `yaw` [rad] about the world's vertical."""
+    return Rotation.from_rotvec(np.multiply.outer(np.asarray(yaw, dtype=np.float64), [0.0, 0, 1]))
+
+
+def tilt_aligning(up_B: FloatArray) -> Rotation:
+    """The smallest rotation R_WB that takes the direction `up_B` (3,) to world z (yaw stays 0)."""
+    up = np.asarray(up_B, dtype=np.float64) / np.linalg.norm(up_B)
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
+    if sine < 1e-12:
+        return Rotation.identity() if cosine > 0 else Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))

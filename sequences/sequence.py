@@ -1,0 +1,251 @@
+"""What was recorded: an IMU sequence and, where known, the true trajectory.
+
+Frames: B is the body (the IMU's axes), W the world (z up, gravity along -z, yaw arbitrary).
+`R_WB` takes vectors from B to W; quaternions are `quat_xyzw`; time is float64 seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from stario.sequences.errors import InputError
+
+if TYPE_CHECKING:
+    from typing import Any
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+STANDARD_GRAVITY = 9.80665
+"""Magnitude of gravity [m/s^2] used unless another is given."""
+
+MAX_TRUTH_GAP = 0.1
+"""Longest distance [s] between two valid truth samples that is interpolated across."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A track of poses in the world frame W.
+
+    Attributes:
+        time: (N,) [s], strictly increasing.
+        position_W: (N, 3) [m].
+        attitude_WB: N rotations taking body B to world W.
+        velocity_W: (N, 3) [m/s], or None where unknown.
+        position_covariance_W: (N, 3, 3) [m^2], or None where unknown.
+        valid: (N,) bool, False where the pose must not be used (glitch, gap); all True by default.
+
+    Raises:
+        InputError: lengths differ, time does not increase, or a valid value is not finite.
+    """
+
+    time: FloatArray
+    position_W: FloatArray
+    attitude_WB: Rotation
+    velocity_W: FloatArray | None = None
+    position_covariance_W: FloatArray | None = None
+    valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        time = _checked_time("time", self.time)
+        n = len(time)
+        valid = np.asarray(self.valid, dtype=np.bool_)
+        valid = np.ones(n, dtype=np.bool_) if valid.size == 0 else valid
+        if valid.shape != (n,):
+            raise InputError("valid", f"shape {valid.shape}", f"({n},) as time")
+        if len(self.attitude_WB) != n:
+            raise InputError("attitude_WB", f"{len(self.attitude_WB)} rotations", f"{n} as time")
+        arrays: dict[str, Any] = {"time": time, "valid": valid}
+        for name, shape in _TRAJECTORY_SHAPES.items():
+            value = getattr(self, name)
+            if value is not None:
+                arrays[name] = _checked_array(name, value, (n, *shape), where=valid)
+        for name, value in arrays.items():
+            object.__setattr__(self, name, _frozen(value))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def quat_xyzw(self) -> FloatArray:
+        """Attitude as unit quaternions (N, 4), x y z w, body to world."""
+        return np.asarray(self.attitude_WB.as_quat(), dtype=np.float64)
+
+    def at(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> Trajectory:
+        """Interpolate to other times: linear in position, slerp in attitude.
+
+        Never interpolates across a gap: times outside the track, or between valid samples that
+        lie more than `max_gap` apart, come back with `valid` False.
+
+        Args:
+            time: (M,) [s], strictly increasing.
+            max_gap: longest distance between valid neighbours [s].
+
+        Raises:
+            InputError: fewer than two valid samples to interpolate between.
+        """
+        time = _checked_time("time", time)
+        known = np.flatnonzero(self.valid)
+        if len(known) < 2:
+            raise InputError("trajectory", f"{len(known)} valid samples", "at least 2")
+        t = self.time[known]
+        right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
+        tolerance = 1e-9 * max(1.0, abs(t[-1]))
+        inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
+        bracketed = t[right] - t[right - 1] <= max_gap
+        exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
+        clipped = np.clip(time, t[0], t[-1])
+        velocity = None if self.velocity_W is None else _lerp(clipped, t, self.velocity_W[known])
+        covariance = None
+        if self.position_covariance_W is not None:
+            flat = self.position_covariance_W[known].reshape(len(t), 9)
+            covariance = _lerp(clipped, t, flat).reshape(-1, 3, 3)
+        return Trajectory(
+            time=time,
+            position_W=_lerp(clipped, t, self.position_W[known]),
+            attitude_WB=Slerp(t, self.attitude_WB[known])(clipped),
+            velocity_W=velocity,
+            position_covariance_W=covariance,
+            valid=inside & (bracketed | exact),
+        )
+
+    def slice(self, start: float, stop: float) -> Trajectory:
+        """The samples with start <= time <= stop [s]."""
+        keep = (self.time >= start) & (self.time <= stop)
+        return Trajectory(
+            time=self.time[keep],
+            position_W=self.position_W[keep],
+            attitude_WB=self.attitude_WB[keep],
+            velocity_W=None if self.velocity_W is None else self.velocity_W[keep],
+            position_covariance_W=(
+                None if self.position_covariance_W is None else self.position_covariance_W[keep]
+            ),
+            valid=self.valid[keep],
+        )
+
+    def path_length(self) -> float:
+        """Length of the way [m] along 1 s chords, so that sensor noise does not add to it."""
+        known = np.flatnonzero(self.valid)
+        if len(known) < 2:
+            return 0.0
+        t = self.time[known]
+        ticks = np.append(np.arange(t[0], t[-1], 1.0), t[-1])
+        chords = np.diff(_lerp(ticks, t, self.position_W[known]), axis=0)
+        return float(np.linalg.norm(chords, axis=1).sum())
+
+
+_TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
+    "position_W": (3,),
+    "velocity_W": (3,),
+    "position_covariance_W": (3, 3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSequence:
+    """One recording of an inertial measurement unit, in body axes B.
+
+    Samples are kept as they were recorded: not-a-number, repeated and out-of-order samples are
+    allowed here, because dropping and counting them is the navigator's work (its health report).
+
+    Attributes:
+        name: what the recording is called in tables and file names.
+        time: (N,) [s].
+        gyro: (N, 3) angular rate of B against the inertial frame, in B [rad/s].
+        accel: (N, 3) specific force in B [m/s^2]; at rest it points up with about 9.81.
+        truth: the true trajectory, or None.
+
+    Raises:
+        InputError: the arrays' shapes do not agree or there is no sample.
+    """
+
+    name: str
+    time: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+    truth: Trajectory | None = None
+
+    def __post_init__(self) -> None:
+        time = np.asarray(self.time, dtype=np.float64)
+        if time.ndim != 1 or time.size == 0:
+            raise InputError("time", f"shape {time.shape}", "(N,) with at least one sample")
+        arrays = {"time": time}
+        for name in ("gyro", "accel"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (len(time), 3):
+                raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")
+            arrays[name] = value
+        for name, value in arrays.items():
+            object.__setattr__(self, name, _frozen(value))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def duration(self) -> float:
+        """Time between first and last sample [s]."""
+        return float(np.nanmax(self.time) - np.nanmin(self.time))
+
+    @property
+    def rate(self) -> float:
+        """Median sampling rate [Hz]; 0 for a single sample."""
+        steps = np.diff(self.time)
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        return float(1.0 / np.median(steps)) if len(steps) else 0.0
+
+    def without_truth(self) -> ImuSequence:
+        """The same recording with its truth removed."""
+        return replace(self, truth=None)
+
+    def slice(self, start: float, stop: float) -> ImuSequence:
+        """The samples with start <= time <= stop [s], truth cut likewise."""
+        keep = (self.time >= start) & (self.time <= stop)
+        truth = None if self.truth is None else self.truth.slice(start, stop)
+        return replace(
+            self, time=self.time[keep], gyro=self.gyro[keep], accel=self.accel[keep], truth=truth
+        )
+
+
+def _lerp(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
+    columns = [np.interp(time, t, values[:, k]) for k in range(values.shape[1])]
+    return np.stack(columns, axis=1)
+
+
+def _checked_time(name: str, value: FloatArray) -> FloatArray:
+    time = np.asarray(value, dtype=np.float64)
+    if time.ndim != 1 or time.size == 0:
+        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    if not np.isfinite(time).all():
+        raise InputError(name, "a value that is not finite", "finite seconds")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        k = int(np.argmax(steps <= 0))
+        raise InputError(
+            name, f"{time[k + 1]!r} after {time[k]!r} at row {k + 1}", "strictly increasing seconds"
+        )
+    return time
+
+
+def _checked_array(
+    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
+) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise InputError(name, f"shape {array.shape}", f"{shape}")
+    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) & where
+    if bad.any():
+        raise InputError(
+            name, f"a value that is not finite at row {int(np.argmax(bad))}", "finite values"
+        )
+    return array
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
