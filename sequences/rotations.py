@@ -15,7 +15,7 @@ def yaw_of(attitude_WB: Rotation) -> FloatArray:
     angle it stays defined when a device stands upright.
     """
     quat_xyzw = np.atleast_2d(attitude_WB.as_quat())
-    return np.asarray(2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3]), dtype=np.float64)
+    return wrap_angle(2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3]))
 
 
 def wrap_angle(angle: FloatArray) -> FloatArray:
