@@ -1,0 +1,266 @@
+"""Time offset and mount between an IMU and the body that a motion-capture system tracks.
+
+Frames: V is the tracked body (markers), B the IMU, W the capture system's world. The IMU sits in
+the tracked body with a constant rotation R_VB (the mount) and its clock is off by a constant lag.
+Over any short interval both see the same rotation, in their own axes:
+
+    R_VB  dR_B  =  dR_V  R_VB      so that      phi_V = R_VB phi_B
+
+for the rotation vectors phi; a tracked body that the system mistakes for its mirror image (a flip
+by 170-180 degrees) shows as a jump of dR_V that the gyroscope has not seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.rotations import tilt_aligning
+from stario.sequences.sequence import BoolArray, FloatArray
+
+_STRIDES_S = (0.03, 0.1, 0.25, 0.5)
+_FLIP_RAD = np.deg2rad(15.0)
+_GLITCH_RAD = np.deg2rad(6.0)
+_SAME_MOUNT_RAD = np.deg2rad(30.0)
+_MIN_PIECE_S = 1.0
+_MIN_FIT_S = 10.0
+
+
+@dataclass(frozen=True)
+class BodyAlignment:
+    """Outcome of `align_tracked_body`.
+
+    Attributes:
+        lag: to be added to the truth's time [s].
+        correlation: between the gyroscope and the differentiated attitude, both in V.
+        attitude_WB: the IMU's attitude at the truth's samples, level and mount applied.
+        leveling_WW: the rotation that made the world level, to be applied to positions.
+        valid: truth samples whose attitude agrees with the gyroscope.
+        mounts: R_VB of each piece between flips, with the piece's first and last time [s].
+    """
+
+    lag: float
+    correlation: float
+    attitude_WB: Rotation
+    leveling_WW: Rotation
+    valid: BoolArray
+    mounts: tuple[tuple[float, float, Rotation], ...]
+
+
+def align_tracked_body(
+    imu_time: FloatArray,
+    gyro: FloatArray,
+    accel: FloatArray,
+    truth_time: FloatArray,
+    attitude_WV: Rotation,
+    valid: BoolArray,
+    max_lag: float = 0.15,
+) -> BodyAlignment:
+    """Estimate lag, mount (anew after every flip) and the world's tilt.
+
+    Args:
+        imu_time: (N,) [s].
+        gyro: (N, 3) angular rate in B [rad/s].
+        accel: (N, 3) specific force in B [m/s^2].
+        truth_time: (M,) [s], evenly sampled, on the IMU's clock but for the lag.
+        attitude_WV: M rotations of the tracked body.
+        valid: (M,) samples to be trusted at all.
+        max_lag: largest lag looked for, either way [s].
+    """
+    gyro_B = _GyroIntegral(imu_time, gyro)
+    lag = _lag(gyro_B, truth_time, attitude_WV, valid, max_lag)
+    time = truth_time + lag
+    attitude_B = gyro_B.attitude(time)
+    valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
+    pieces = _pieces(time, attitude_WV, attitude_B, valid)
+    mounts = _mounts(time, attitude_WV, attitude_B, pieces)
+    quat_WB = attitude_WV.as_quat()
+    kept = np.zeros_like(valid)
+    for (start, stop), mount in zip(pieces, mounts, strict=True):
+        quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
+        kept[start:stop] = valid[start:stop]
+    attitude_WB = Rotation.from_quat(quat_WB)
+    force_B = np.stack([np.interp(time, imu_time, accel[:, k]) for k in range(3)], axis=1)
+    leveling = tilt_aligning(attitude_WB[kept].apply(force_B[kept]).mean(axis=0))
+    return BodyAlignment(
+        lag=lag,
+        correlation=_correlation(time, attitude_WB, gyro_B, kept),
+        attitude_WB=leveling * attitude_WB,
+        leveling_WW=leveling,
+        valid=kept,
+        mounts=tuple(
+            (float(time[start]), float(time[stop - 1]), mount)
+            for (start, stop), mount in zip(pieces, mounts, strict=True)
+        ),
+    )
+
+
+class _GyroIntegral:
+    """Attitude from integrating the gyroscope, sampled at any time, and its running integral."""
+
+    def __init__(self, time: FloatArray, gyro: FloatArray) -> None:
+        self.time = time
+        steps = np.diff(time)[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
+        self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._quat = _cumulative(Rotation.from_rotvec(steps))
+        self._rate = gyro
+
+    def attitude(self, time: FloatArray) -> Rotation:
+        """Attitude of B against its start at times inside the recording (held outside)."""
+        clipped = np.clip(time, self.time[0], self.time[-1])
+        left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
+        tau = clipped - self.time[left]
+        return Rotation.from_quat(self._quat[left]) * Rotation.from_rotvec(
+            self._rate[left] * tau[:, None]
+        )
+
+    def mean_rate(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        """Mean rate over intervals (M, 3) [rad/s]."""
+        ends = [
+            np.stack([np.interp(t, self.time, self.angle[:, k]) for k in range(3)], axis=1)
+            for t in (start, stop)
+        ]
+        return np.asarray((ends[1] - ends[0]) / (stop - start)[:, None], dtype=np.float64)
+
+
+def _cumulative(steps: Rotation) -> FloatArray:
+    """Products q_0 q_1 ... q_k as (N + 1, 4), in log2(N) vectorised passes."""
+    product = Rotation.concatenate([Rotation.identity(), steps])
+    shift = 1
+    while shift < len(product):
+        product = Rotation.concatenate([product[:shift], product[:-shift] * product[shift:]])
+        shift *= 2
+    return np.asarray(product.as_quat(), dtype=np.float64)
+
+
+def _rates(
+    time: FloatArray, attitude: Rotation, valid: BoolArray, stride: int
+) -> tuple[FloatArray, BoolArray]:
+    rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    rates = rates / (time[stride:] - time[:-stride])[:, None]
+    return rates, valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)
+
+
+def _lag(
+    gyro_B: _GyroIntegral,
+    time: FloatArray,
+    attitude_WV: Rotation,
+    valid: BoolArray,
+    max_lag: float,
+) -> float:
+    """Lag at which the magnitudes of both rates correlate best: no mount is needed for it."""
+    stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
+    rates_V, good = _rates(time, attitude_WV, valid, stride)
+    speed_V = np.linalg.norm(rates_V, axis=1)
+    lags = np.arange(-max_lag, max_lag + 1e-9, 0.0025)
+    scores = []
+    for lag in lags:
+        rate_B = gyro_B.mean_rate(time[:-stride] + lag, time[stride:] + lag)
+        speed_B = np.linalg.norm(rate_B, axis=1)
+        # Glitches are rare but huge: compare where the two do not contradict each other grossly.
+        use = good & (np.abs(speed_V - speed_B) < 3.0)
+        scores.append(np.corrcoef(speed_V[use], speed_B[use])[0, 1] if use.sum() > 2 else 0.0)
+    best = int(np.clip(np.argmax(scores), 1, len(lags) - 2))
+    before, peak, after = scores[best - 1 : best + 2]
+    curvature = before - 2 * peak + after
+    offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float(lags[best] + np.clip(offset, -1, 1) * 0.0025)
+
+
+def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
+    """Samples whose rotation to most neighbours, before and after, contradicts the gyroscope."""
+    n = len(time)
+    dt = float(np.median(np.diff(time)))
+    ahead, behind = np.zeros(n), np.zeros(n)
+    for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
+        error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
+        ahead[: n - stride] += error
+        behind[stride:] += error
+    enough = len(_STRIDES_S) / 2
+    return (ahead > enough) & (behind > enough)
+
+
+def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
+    """Difference of the rotation angles over `stride` samples, which no mount changes."""
+    angle_V = (attitude_WV[:-stride].inv() * attitude_WV[stride:]).magnitude()
+    angle_B = (attitude_B[:-stride].inv() * attitude_B[stride:]).magnitude()
+    return np.asarray(np.abs(angle_V - angle_B), dtype=np.float64)
+
+
+def _pieces(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
+) -> list[tuple[int, int]]:
+    """Runs of samples [start, stop) between attitude jumps, long enough to be of use."""
+    known = np.flatnonzero(valid)
+    if len(known) < 2:
+        return []
+    jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
+    edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
+    runs = [(known[a], known[b - 1] + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
+
+
+def _mounts(
+    time: FloatArray,
+    attitude_WV: Rotation,
+    attitude_B: Rotation,
+    pieces: list[tuple[int, int]],
+) -> list[Rotation]:
+    """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not."""
+    if not pieces:
+        return []
+    fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
+    longest = int(np.argmax([stop - start for start, stop in pieces]))
+    mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
+    order = [(k, k - 1) for k in range(longest + 1, len(pieces))]
+    order += [(k, k + 1) for k in range(longest - 1, -1, -1)]
+    for k, neighbour in order:
+        here, there = _facing_ends(pieces[k], pieces[neighbour])
+        across = attitude_B[there].inv() * attitude_B[here]
+        carried = attitude_WV[here].inv() * attitude_WV[there] * mounts[neighbour] * across
+        same = (mounts[neighbour].inv() * carried).magnitude() < _SAME_MOUNT_RAD
+        fit = fitted[k]
+        agrees = fit is not None and (fit.inv() * carried).magnitude() < _SAME_MOUNT_RAD
+        mounts[k] = mounts[neighbour] if same else (fit if agrees and fit else carried)
+    return [mounts[k] for k in range(len(pieces))]
+
+
+def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[int, int]:
+    if piece[0] >= neighbour[1]:
+        return piece[0], neighbour[1] - 1
+    return piece[1] - 1, neighbour[0]
+
+
+def _fit(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, piece: tuple[int, int]
+) -> Rotation | None:
+    """R_VB that best takes the rotation vectors of B to those of V, outliers weighted down."""
+    start, stop = piece
+    if time[stop - 1] - time[start] < _MIN_FIT_S:
+        return None
+    stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
+    part_V, part_B = attitude_WV[start:stop], attitude_B[start:stop]
+    phi_V = (part_V[:-stride].inv() * part_V[stride:]).as_rotvec()
+    phi_B = (part_B[:-stride].inv() * part_B[stride:]).as_rotvec()
+    weights = np.ones(len(phi_V))
+    mount = Rotation.identity()
+    for _ in range(5):
+        mount, _residual = Rotation.align_vectors(phi_V, phi_B, weights=weights)
+        residual = np.linalg.norm(phi_V - mount.apply(phi_B), axis=1)
+        scale = max(float(np.median(residual)), 1e-4)
+        weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
+    return mount
+
+
+def _correlation(
+    time: FloatArray, attitude_WB: Rotation, gyro_B: _GyroIntegral, valid: BoolArray
+) -> float:
+    stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
+    rates, good = _rates(time, attitude_WB, valid, stride)
+    measured = gyro_B.mean_rate(time[:-stride], time[stride:])
+    good &= np.linalg.norm(rates - measured, axis=1) < 3.0
+    if good.sum() < 2:
+        return 0.0
+    return float(np.corrcoef(rates[good].ravel(), measured[good].ravel())[0, 1])

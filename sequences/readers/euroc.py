@@ -1,0 +1,76 @@
+"""EuRoC and TUM-VI folders: `mav0/imu0/data.csv` with truth beside it (Burri et al., 2016).
+
+IMU rows: time [ns], gyroscope xyz [rad/s], accelerometer xyz [m/s^2]. Truth rows, in
+`state_groundtruth_estimate0` (EuRoC) or `mocap0` (TUM-VI, Schubert et al., 2018): time [ns],
+position xyz [m], quaternion w x y z, IMU to world; EuRoC adds velocity xyz. Time is returned as
+seconds since the first IMU row. Truth may start later, end earlier and have gaps.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import first_time_ns, read_table
+from stario.sequences.sequence import ImuSequence, Trajectory
+
+TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "leica0", "vicon0", "gt")
+
+
+def read_euroc(path: Path) -> ImuSequence:
+    """Read a recording by its folder, its `mav0` folder or its `imu0/data.csv`.
+
+    Raises:
+        ReadError: the IMU's file is missing or malformed.
+    """
+    imu = imu_file(path)
+    if imu is None:
+        raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
+    table = read_table(imu, columns=7, time_ns=True)
+    truth_file = _truth_file(imu.parent.parent)
+    return ImuSequence(
+        name=_name(imu),
+        time=table[:, 0],
+        gyro=table[:, 1:4],
+        accel=table[:, 4:7],
+        truth=None if truth_file is None else _truth(truth_file, first_time_ns(imu)),
+    )
+
+
+def imu_file(path: Path) -> Path | None:
+    """The recording's `imu0/data.csv`, or None if `path` does not lead to one."""
+    if path.is_file():
+        return path if path.name == "data.csv" and path.parent.name.startswith("imu") else None
+    candidates = (path / "mav0/imu0/data.csv", path / "imu0/data.csv", path / "data.csv")
+    return next((c for c in candidates if c.is_file() and c.parent.name.startswith("imu")), None)
+
+
+def _name(imu: Path) -> str:
+    folder = imu.resolve().parent.parent
+    return folder.parent.name if folder.name == "mav0" else folder.name
+
+
+def _truth_file(mav: Path) -> Path | None:
+    found = (mav / folder / "data.csv" for folder in TRUTH_FOLDERS)
+    return next((path for path in found if path.is_file()), None)
+
+
+def _truth(path: Path, start_ns: int) -> Trajectory:
+    columns = 11 if path.parent.name.startswith("state_groundtruth") else 8
+    table = read_table(path, columns=columns, time_ns=True)
+    time = table[:, 0] + (first_time_ns(path) - start_ns) * 1e-9
+    keep = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0])
+    table, time = table[keep], time[keep]
+    norm = np.linalg.norm(table[:, 4:8], axis=1)
+    valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])
+    return Trajectory(
+        time=time,
+        position_W=table[:, 1:4],
+        attitude_WB=Rotation.from_quat(quat_xyzw),
+        velocity_W=table[:, 8:11] if columns == 11 else None,
+        valid=valid,
+    )

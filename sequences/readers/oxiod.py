@@ -1,0 +1,74 @@
+"""OxIOD, synchronised form: `syn/imuN.csv` beside `syn/viN.csv` (Chen et al., 2018).
+
+`imuN.csv` has no header: time, roll, pitch, yaw [rad], gyroscope xyz [rad/s], gravity xyz [g],
+user acceleration xyz [g], magnetic field xyz [uT], in Apple's signs: the specific force is
+-(gravity + user acceleration) * 9.81. Its printed times are rounded to uselessness; the rows of
+both files are synchronous at 100 Hz. `viN.csv`: time, frame, position xyz [m], quaternion xyzw of
+the tracked body. The phone sits turned in that body, the capture glitches and flips, and its
+world is not quite level: see `stario.sequences.alignment`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.alignment import align_tracked_body
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import read_table
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+
+RATE = 100.0
+_G = 9.81
+_JUMP_M = 0.05
+"""A tracked body that moves further than this within one row (5 m/s) is a glitch."""
+
+
+def read_oxiod(path: Path) -> ImuSequence:
+    """Read `syn/imuN.csv` and, where it lies beside it, `syn/viN.csv`.
+
+    Raises:
+        ReadError: a file is missing, cut short, or the two do not have the same number of rows.
+    """
+    table = read_table(path, columns=16)
+    time = np.arange(len(table)) / RATE
+    gyro = table[:, 4:7]
+    accel = -_G * (table[:, 7:10] + table[:, 10:13])
+    vicon = path.with_name(path.name.replace("imu", "vi", 1))
+    truth = _truth(vicon, time, gyro, accel) if vicon.exists() else None
+    return ImuSequence(name=_name(path), time=time, gyro=gyro, accel=accel, truth=truth)
+
+
+def _name(path: Path) -> str:
+    """`handheld/data1/syn/imu3.csv` becomes `handheld-data1-imu3`."""
+    parts = [p.replace(" ", "_") for p in (*path.parent.parts[-3:], path.stem) if p != "syn"]
+    return "-".join(p for p in parts if p not in ("/", "..", "."))
+
+
+def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Trajectory:
+    table = read_table(path, columns=9)
+    if len(table) != len(time):
+        raise ReadError(path, "rows", str(len(table)), f"{len(time)} as in the IMU's file")
+    position, quat_xyzw = table[:, 2:5], table[:, 5:9]
+    norm = np.linalg.norm(quat_xyzw, axis=1)
+    valid = np.isfinite(table[:, 2:9]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    valid &= ~_position_glitches(position)
+    quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
+    aligned = align_tracked_body(time, gyro, accel, time, Rotation.from_quat(quat_xyzw), valid)
+    return Trajectory(
+        time=time + aligned.lag,
+        position_W=aligned.leveling_WW.apply(position),
+        attitude_WB=aligned.attitude_WB,
+        valid=aligned.valid,
+    )
+
+
+def _position_glitches(position: FloatArray) -> BoolArray:
+    """Rows further from the median of their neighbourhood than a body can be."""
+    half = 12
+    padded = np.pad(position, ((half, half), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
+    distance = np.linalg.norm(position - np.median(windows, axis=-1), axis=1)
+    return np.asarray(~(distance < _JUMP_M * half), dtype=np.bool_)
