@@ -12,6 +12,7 @@ by 170-180 degrees) shows as a jump of dR_V that the gyroscope has not seen.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -198,7 +199,7 @@ def _pieces(
         return []
     jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
     edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
-    runs = [(known[a], known[b - 1] + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
     return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
 
 
