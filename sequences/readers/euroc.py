@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_time_ns, read_table
+from stario.sequences.readers.text import first_time_ns, read_lines, read_table
 from stario.sequences.sequence import ImuSequence, Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "leica0", "vicon0", "gt")
@@ -58,8 +58,16 @@ def _truth_file(mav: Path) -> Path | None:
     return next((path for path in found if path.is_file()), None)
 
 
+def _holds_velocity(path: Path) -> bool:
+    """Some copies of EuRoC's truth are cut to the pose's eight columns."""
+    if not path.parent.name.startswith("state_groundtruth"):
+        return False
+    rows = (line for line in read_lines(path) if not line.lstrip().startswith("#"))
+    return len(next(rows, "").split(",")) >= 11
+
+
 def _truth(path: Path, start_ns: int) -> Trajectory:
-    columns = 11 if path.parent.name.startswith("state_groundtruth") else 8
+    columns = 11 if _holds_velocity(path) else 8
     table = read_table(path, columns=columns, time_ns=True)
     time = table[:, 0] + (first_time_ns(path) - start_ns) * 1e-9
     keep = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0])
