@@ -1,0 +1,181 @@
+"""Writing results so that they appear whole or not at all, and tracks in TUM format."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.sequence import FloatArray, Trajectory
+
+_TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_NORM_TOLERANCE = 1e-2
+
+
+@contextmanager
+def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
+    """Open a file that takes its name only when it is complete.
+
+    The content goes to a temporary file in the same folder, which replaces `path` on leaving the
+    block; an exception inside leaves `path` as it was and no temporary file.
+
+    Args:
+        path: the file to write or replace; its folder must exist.
+        mode: "w" for text (UTF-8, Unix line ends), "wb" for bytes.
+
+    Raises:
+        InputError: another mode, or the folder does not exist.
+    """
+    path = Path(path)
+    if mode not in ("w", "wb"):
+        raise InputError("mode", repr(mode), "'w' or 'wb'")
+    if not path.parent.is_dir():
+        raise InputError("path", str(path), "a file in an existing folder", "create the folder")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    text: dict[str, str] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
+    try:
+        # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.
+        with temporary.open(mode.replace("w", "x"), **text) as file:  # type: ignore[call-overload]
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write the valid poses as TUM lines `t x y z qx qy qz qw` with 9 decimals, body to world.
+
+    Raises:
+        InputError: there is no valid pose, or the folder does not exist.
+    """
+    valid = trajectory.valid
+    if not valid.any():
+        raise InputError("trajectory", "no valid pose", "at least one")
+    rows = np.column_stack(
+        [trajectory.time[valid], trajectory.position_W[valid], trajectory.quat_xyzw[valid]]
+    )
+    with atomic_write(path) as file:
+        np.savetxt(file, rows, fmt="%.9f", delimiter=" ")
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a TUM track; lines that start with `#` and empty lines are skipped.
+
+    Raises:
+        ReadError: the file cannot be read, or a line does not hold eight finite numbers with
+            increasing time and a unit quaternion; it names the line and the field.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReadError(path, "file", str(error), "a readable TUM text file") from error
+    numbered = [
+        (number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not numbered:
+        raise ReadError(path, "file", "no pose", "lines of " + " ".join(_TUM_FIELDS))
+    rows = np.array([_tum_row(path, number, line) for number, line in numbered])
+    _check_tum(path, [number for number, _ in numbered], rows)
+    return Trajectory(
+        time=rows[:, 0], position_W=rows[:, 1:4], attitude_WB=Rotation.from_quat(rows[:, 4:])
+    )
+
+
+def write_json(path: Path | str, obj: object) -> None:
+    """Write JSON, indented by 2, keys in their order; nan and infinity become null.
+
+    NumPy numbers and arrays, dataclasses and paths are written as their plain counterparts.
+
+    Raises:
+        InputError: the object holds something else, or the folder does not exist.
+    """
+    text = json.dumps(_plain(obj), indent=2, sort_keys=False, allow_nan=False, ensure_ascii=False)
+    with atomic_write(path) as file:
+        file.write(text + "\n")
+
+
+def write_npz(path: Path | str, **arrays: ArrayLike) -> None:
+    """Write arrays to a compressed npz, exactly at `path`; it holds nothing pickled.
+
+    Raises:
+        InputError: an array of objects, or the folder does not exist.
+    """
+    plain = {name: np.asarray(value) for name, value in arrays.items()}
+    for name, value in plain.items():
+        if value.dtype.hasobject:
+            raise InputError(name, f"dtype {value.dtype}", "numbers, bool or text")
+    with atomic_write(path, "wb") as file:
+        np.savez_compressed(file, **plain)  # type: ignore[arg-type]
+
+
+def _tum_row(path: Path, number: int, line: str) -> list[float]:
+    words = line.split()
+    if len(words) != len(_TUM_FIELDS):
+        expected = f"{len(_TUM_FIELDS)}: " + " ".join(_TUM_FIELDS)
+        raise ReadError(path, f"line {number}", f"{len(words)} values", expected)
+    try:
+        row = [float(word) for word in words]
+    except ValueError:
+        row = [math.nan]
+    if not all(map(math.isfinite, row)):
+        k = next(k for k, word in enumerate(words) if not _is_finite(word))
+        raise ReadError(path, f"line {number}, {_TUM_FIELDS[k]}", repr(words[k]), "a finite number")
+    return row
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return False
+
+
+def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:
+    stuck = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    if len(stuck):
+        k = int(stuck[0])
+        found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
+        raise ReadError(path, f"line {numbers[k + 1]}, t", found, "strictly increasing seconds")
+    norm = np.linalg.norm(rows[:, 4:], axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1) > _NORM_TOLERANCE)
+    if len(bad):
+        k = int(bad[0])
+        raise ReadError(
+            path, f"line {numbers[k]}, qx qy qz qw", f"norm {norm[k]:.4g}", "a unit quaternion"
+        )
+
+
+def _plain(obj: object) -> object:
+    """`obj` in JSON's own types."""
+    if is_dataclass(obj) and not isinstance(obj, type):
+        return _plain(asdict(obj))
+    if isinstance(obj, dict):
+        return {str(key): _plain(value) for key, value in obj.items()}
+    if isinstance(obj, (list, tuple)):
+        return [_plain(value) for value in obj]
+    if isinstance(obj, (np.ndarray, np.generic)):
+        return _plain(obj.tolist())
+    if isinstance(obj, Path):
+        return str(obj)
+    if isinstance(obj, float):
+        return obj if math.isfinite(obj) else None
+    if obj is None or isinstance(obj, (bool, int, str)):
+        return obj
+    raise InputError("JSON value", type(obj).__name__, "numbers, text, lists and dictionaries")

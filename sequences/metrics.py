@@ -1,0 +1,350 @@
+"""How far a track is from the truth: ATE, RTE, PDE, AYE and NEES, each with one meaning.
+
+Every error is that of a pose of the estimate against the truth interpolated to its time, never
+across a gap of the truth. `CONVENTIONS` says in words what each number means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.stats import chi2
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.sequence import FloatArray, Trajectory
+
+Alignment = Literal["none", "first", "yaw"]
+Convention = Literal["rms", "ronin", "mean"]
+
+CONVENTIONS: dict[str, str] = {
+    "ate_m": "absolute trajectory error [m]: root mean square of the position error's norm",
+    "rte_m": "relative trajectory error [m]: root mean square of the norm of the displacement "
+    "error over 60 s, in world axes; for tracks shorter than that the end-to-end displacement "
+    "error scaled by 60 s / length",
+    "pde": "position drift error [1]: final position error / length of the true way",
+    "aye_rad": "absolute yaw error [rad]: root mean square of the wrapped yaw error, which is the "
+    "twist about the vertical of R_estimate R_truth^T",
+    "nees": "normalised estimation error squared of the position [1]: error^T covariance^-1 error, "
+    "3-D; its expectation is 3",
+    "nis": "normalised innovation squared [1]: innovation^T S^-1 innovation; its expectation is "
+    "the number of components",
+    "coverage": "share [1] of the estimate's poses at whose time the truth is known; the truth is "
+    "interpolated linearly, never across its gaps",
+    "path_m": "length of the true way [m] along 1 s chords, within the times compared",
+    "duration_s": "time [s] between the first and the last pose compared",
+    "alignment": "what is done to the estimate before: none; first (yaw and position of the first "
+    "common pose); yaw (least squares in yaw and position); tilt is never changed",
+    "horizontal": "true: position errors and way in x and y alone; false: in x, y and z",
+    "convention": "rms as said above; ronin averages the squares over coordinates too, as RoNIN's "
+    "code does, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
+    "norms, not squares, as TLIO's code does; PDE and AYE are the same in all",
+}
+
+
+@dataclass(frozen=True)
+class TrackMetrics:
+    """Errors of one track, see `CONVENTIONS`; lengths in m, angles in rad, times in s.
+
+    `rte_m` is nan where gaps leave no pair of poses `rte_interval_s` apart, `pde` where the true
+    way has no length. `rte_scaled` tells that the track was shorter than the interval.
+    """
+
+    ate_m: float
+    rte_m: float
+    pde: float
+    aye_rad: float
+    coverage: float
+    path_m: float
+    duration_s: float
+    alignment: Alignment
+    horizontal: bool
+    convention: Convention
+    rte_interval_s: float
+    rte_scaled: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Estimate minus truth at the M poses of the estimate where both are known.
+
+    Attributes:
+        estimate: the M poses of the estimate.
+        truth: the truth at their times.
+        position_W: (M, 3) [m].
+        yaw: (M,) wrapped [rad].
+        coverage: M / number of valid poses of the estimate.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    position_W: FloatArray
+    yaw: FloatArray
+    coverage: float
+
+
+@dataclass(frozen=True, eq=False)
+class PositionNees:
+    """3-D position NEES of a track: time (M,) [s], nees (M,), and its mean and median."""
+
+    time: FloatArray
+    nees: FloatArray
+    mean: float
+    median: float
+
+
+def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
+    """Compare two tracks as they are, at the estimate's times.
+
+    Raises:
+        InputError: there is no time at which both are known.
+    """
+    at_estimate = truth.at(estimate.time)
+    common = estimate.valid & at_estimate.valid
+    if not common.any():
+        raise InputError(
+            "estimate",
+            f"no overlap: {_span(estimate)} against truth {_span(truth)}",
+            "a pose at a time when the truth is known",
+        )
+    ours, theirs = _select(estimate, common), _select(at_estimate, common)
+    return PoseErrors(
+        estimate=ours,
+        truth=theirs,
+        position_W=ours.position_W - theirs.position_W,
+        yaw=yaw_of(ours.attitude_WB * theirs.attitude_WB.inv()),
+        coverage=float(common.sum() / estimate.valid.sum()),
+    )
+
+
+def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajectory:
+    """Turn an estimate about the vertical and shift it onto the truth; tilt stays as it is.
+
+    Position, attitude, velocity and covariance are turned alike.
+
+    Args:
+        estimate: the track to move.
+        truth: where to.
+        mode: "none"; "first", by yaw and position of the first common pose; "yaw", by the yaw and
+            position of least squared position error (Horn 1987, restricted to the vertical axis).
+
+    Raises:
+        InputError: unknown mode, or no overlap.
+    """
+    _check_choice("alignment", mode, get_args(Alignment))
+    if mode == "none":
+        return estimate
+    errors = pose_errors(estimate, truth)
+    ours, theirs = errors.estimate.position_W, errors.truth.position_W
+    if mode == "first":
+        return _moved(estimate, -float(errors.yaw[0]), ours[0], theirs[0])
+    center, target = ours.mean(axis=0), theirs.mean(axis=0)
+    x, y = (ours - center)[:, :2].T
+    u, v = (theirs - target)[:, :2].T
+    yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
+    return _moved(estimate, float(yaw), center, target)
+
+
+def evaluate_track(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    alignment: Alignment = "first",
+    horizontal: bool = True,
+    convention: Convention = "rms",
+    rte_interval: float = 60.0,
+) -> TrackMetrics:
+    """Errors of a track against the truth, as `CONVENTIONS` defines them.
+
+    Args:
+        estimate: the track.
+        truth: the true track; it may be sampled more coarsely and have gaps.
+        alignment: see `align`.
+        horizontal: positions in x and y alone.
+        convention: how position errors are averaged.
+        rte_interval: span of the relative error [s].
+
+    Raises:
+        InputError: no overlap, an unknown choice, or an interval that is not positive.
+    """
+    _check_choice("convention", convention, get_args(Convention))
+    if not (np.isfinite(rte_interval) and rte_interval > 0):
+        raise InputError("rte_interval", repr(rte_interval), "seconds > 0")
+    errors = pose_errors(align(estimate, truth, alignment), truth)
+    time = errors.estimate.time
+    error = errors.position_W[:, : 2 if horizontal else 3]
+    path = _way(errors.truth, horizontal)
+    rte, scaled = _relative_error(time, error, rte_interval, convention)
+    return TrackMetrics(
+        ate_m=_average(error, convention),
+        rte_m=rte,
+        pde=float(np.linalg.norm(error[-1]) / path) if path > 0 else float("nan"),
+        aye_rad=float(np.sqrt(np.mean(errors.yaw**2))),
+        coverage=errors.coverage,
+        path_m=path,
+        duration_s=float(time[-1] - time[0]),
+        alignment=alignment,
+        horizontal=horizontal,
+        convention=convention,
+        rte_interval_s=rte_interval,
+        rte_scaled=scaled,
+    )
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared, e^T P^-1 e; chi-square with k degrees if P is true.
+
+    Args:
+        error: (N, k).
+        covariance: (N, k, k), in the squared units of `error`.
+
+    Returns:
+        (N,), without unit.
+
+    Raises:
+        InputError: shapes do not agree or a covariance is not positive definite.
+    """
+    error = np.asarray(error, dtype=np.float64)
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if error.ndim != 2:
+        raise InputError("error", f"shape {error.shape}", "(N, k)")
+    n, k = error.shape
+    if covariance.shape != (n, k, k):
+        raise InputError("covariance", f"shape {covariance.shape}", f"({n}, {k}, {k}) as error")
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        row = int(np.argmax([np.linalg.eigvalsh(P).min() <= 0 for P in covariance]))
+        raise InputError(
+            "covariance", f"row {row} not positive definite", "positive definite matrices"
+        ) from None
+    whitened = np.linalg.solve(factor, error[..., None])[..., 0]
+    return np.asarray(np.sum(whitened**2, axis=1), dtype=np.float64)
+
+
+def nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Bounds of the mean NEES (or NIS) of a consistent estimator over independent samples.
+
+    Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 5.4.
+
+    Args:
+        dof: length of the error vector; the expectation of the mean.
+        runs: number of independent samples averaged; poses of one track are not independent.
+        confidence: probability between the bounds.
+
+    Raises:
+        InputError: `dof` or `runs` below 1, or a confidence outside (0, 1).
+    """
+    for name, count in (("dof", dof), ("runs", runs)):
+        if count < 1:
+            raise InputError(name, repr(count), "at least 1")
+    if not 0 < confidence < 1:
+        raise InputError("confidence", repr(confidence), "a probability between 0 and 1")
+    tail = (1 - confidence) / 2
+    low, high = chi2.ppf([tail, 1 - tail], dof * runs) / runs
+    return float(low), float(high)
+
+
+def position_nees(
+    estimate: Trajectory, truth: Trajectory, alignment: Alignment = "first"
+) -> PositionNees:
+    """NEES of a track's 3-D position under its own covariance.
+
+    Poses with a covariance of exactly zero, such as a start that is the origin by definition,
+    carry no statement and are left out. Aligning takes away the share of the initial yaw in the
+    error but not in the covariance: for a check of that share give the truth's frame and "none".
+
+    Raises:
+        InputError: no overlap, no covariance, or one that is not positive definite.
+    """
+    if estimate.position_covariance_W is None:
+        raise InputError("estimate.position_covariance_W", "None", "(N, 3, 3) [m^2]")
+    errors = pose_errors(align(estimate, truth, alignment), truth)
+    covariance = errors.estimate.position_covariance_W
+    assert covariance is not None  # align and selection keep it
+    stated = covariance.any(axis=(1, 2))
+    if not stated.any():
+        raise InputError("estimate.position_covariance_W", "only zeros", "covariances [m^2]")
+    values = nees(errors.position_W[stated], covariance[stated])
+    time = errors.estimate.time[stated]
+    return PositionNees(time, values, float(values.mean()), float(np.median(values)))
+
+
+def _relative_error(
+    time: FloatArray, error: FloatArray, interval: float, convention: Convention
+) -> tuple[float, bool]:
+    """Average error of the displacement over `interval` [m], and whether it had to be scaled.
+
+    The displacement's error between two poses is the difference of their position errors.
+    """
+    duration = time[-1] - time[0]
+    # A partner may lie half a step of the estimate off, but no more than a hundredth of the span.
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    tolerance = min(0.5 * step + 1e-6, 0.01 * interval)
+    if duration < interval - tolerance:
+        drift = (error[-1:] - error[:1]) * (interval / duration if duration > 0 else np.nan)
+        return _average(drift, convention), True
+    end = _nearest(time, time + interval)
+    paired = np.abs(time[end] - time - interval) <= tolerance
+    if not paired.any():
+        return float("nan"), False
+    return _average(error[end[paired]] - error[paired], convention), False
+
+
+def _average(error: FloatArray, convention: Convention) -> float:
+    square = np.sum(error**2, axis=1)
+    if convention == "mean":
+        return float(np.mean(np.sqrt(square)))
+    coordinates = error.shape[1] if convention == "ronin" else 1
+    return float(np.sqrt(np.mean(square) / coordinates))
+
+
+def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    return right - (wanted - time[right - 1] < time[right] - wanted)
+
+
+def _way(truth: Trajectory, horizontal: bool) -> float:
+    if not horizontal:
+        return truth.path_length()
+    return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()
+
+
+def _moved(
+    trajectory: Trajectory, yaw: float, pivot_W: FloatArray, target_W: FloatArray
+) -> Trajectory:
+    """Turn by `yaw` [rad] about the vertical through `pivot_W`, then take that to `target_W`."""
+    turn = about_z(yaw)
+    R = turn.as_matrix()
+    velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
+    return replace(
+        trajectory,
+        position_W=(trajectory.position_W - pivot_W) @ R.T + target_W,
+        attitude_WB=turn * trajectory.attitude_WB,
+        velocity_W=None if velocity is None else velocity @ R.T,
+        position_covariance_W=None if covariance is None else R @ covariance @ R.T,
+    )
+
+
+def _select(trajectory: Trajectory, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Trajectory:
+    velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
+    return Trajectory(
+        time=trajectory.time[keep],
+        position_W=trajectory.position_W[keep],
+        attitude_WB=trajectory.attitude_WB[keep],
+        velocity_W=None if velocity is None else velocity[keep],
+        position_covariance_W=None if covariance is None else covariance[keep],
+        valid=trajectory.valid[keep],
+    )
+
+
+def _span(trajectory: Trajectory) -> str:
+    time = trajectory.time[trajectory.valid]
+    return f"{time[0]:.3f} to {time[-1]:.3f} s" if len(time) else "no valid pose"
+
+
+def _check_choice(field: str, found: str, choices: tuple[str, ...]) -> None:
+    if found not in choices:
+        raise InputError(field, repr(found), "one of " + ", ".join(choices))
