@@ -1,0 +1,238 @@
+"""An IMU along any trajectory: a spline through the poses, differentiated, with sensor errors.
+
+The position is a quintic spline, so that its second derivative is smooth. The attitude is a cubic
+spline s(t) through sign-continuous quaternions, normalised: q = s / |s| is as smooth as s and its
+body rate is exactly 2 Im(conj(s) s') / |s|^2, because the part of s' along s only changes the
+length. That is the derivative of the very attitude given as truth, at the cost of one spline
+(scipy's RotationSpline solves a nonlinear system for the same order of smoothness).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import (
+    MAX_TRUTH_GAP,
+    STANDARD_GRAVITY,
+    FloatArray,
+    ImuSequence,
+    Trajectory,
+)
+
+_MIN_POSES = 6
+"""A quintic spline passes through at least this many points."""
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """What a sensor adds to the truth; every deviation is that of a zero-mean normal draw.
+
+    A sample is `clip(T x + b + n)`: T holds a scale error per axis and a small rotation of the
+    sensor's axes (drawn for each sensor on its own), b the turn-on bias and its random walk,
+    n the white noise.
+
+    Attributes:
+        noise: continuous densities of white noise and bias walk.
+        gyro_turn_on: deviation of the gyroscope's bias at the first sample [rad/s].
+        accel_turn_on: deviation of the accelerometer's bias at the first sample [m/s^2].
+        gyro_scale: deviation of the gyroscope's scale error, per axis [1].
+        accel_scale: deviation of the accelerometer's scale error, per axis [1].
+        misalignment: deviation of a sensor's rotation against the body, per axis [rad].
+        gyro_range: absolute rate beyond which an axis saturates [rad/s].
+        accel_range: absolute specific force beyond which an axis saturates [m/s^2].
+
+    Raises:
+        InputError: a deviation is negative or not finite, or a range is not positive.
+    """
+
+    noise: ImuNoise = field(default_factory=ImuNoise)
+    gyro_turn_on: float = 0.0
+    accel_turn_on: float = 0.0
+    gyro_scale: float = 0.0
+    accel_scale: float = 0.0
+    misalignment: float = 0.0
+    gyro_range: float = math.inf
+    accel_range: float = math.inf
+
+    def __post_init__(self) -> None:
+        for item in fields(self)[1:]:
+            value = getattr(self, item.name)
+            if item.name.endswith("_range"):
+                if not value > 0:
+                    raise InputError(item.name, repr(value), "a range > 0, inf for none")
+            elif not (math.isfinite(value) and value >= 0):
+                raise InputError(item.name, repr(value), "a finite deviation >= 0")
+
+
+PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
+"""No error at all."""
+
+PHONE_IMU = ImuErrors(
+    noise=ImuNoise(gyro_noise=2e-4, accel_noise=2e-3, gyro_walk=2e-5, accel_walk=2e-4),
+    gyro_turn_on=5e-3,
+    accel_turn_on=0.05,
+    gyro_scale=0.01,
+    accel_scale=0.005,
+    misalignment=0.01,
+    gyro_range=math.radians(2000.0),
+    accel_range=8.0 * STANDARD_GRAVITY,
+)
+"""A phone's IMU, factory-calibrated: biases and scales as they are left after that."""
+
+GOOD_IMU = ImuErrors(
+    noise=ImuNoise(gyro_noise=5e-5, accel_noise=5e-4, gyro_walk=2e-6, accel_walk=5e-5),
+    gyro_turn_on=5e-4,
+    accel_turn_on=0.01,
+    gyro_scale=5e-4,
+    accel_scale=5e-4,
+    misalignment=5e-4,
+    gyro_range=math.radians(2000.0),
+    accel_range=16.0 * STANDARD_GRAVITY,
+)
+"""A calibrated industrial unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated recording with what only a simulation knows.
+
+    Attributes:
+        sequence: the recording, its truth sampled at the IMU's times.
+        b_g: (N, 3) the gyroscope's bias at each sample [rad/s].
+        b_a: (N, 3) the accelerometer's bias at each sample [m/s^2].
+    """
+
+    sequence: ImuSequence
+    b_g: FloatArray
+    b_a: FloatArray
+
+
+def simulate_imu(
+    trajectory: Trajectory,
+    rate: float = 200.0,
+    errors: ImuErrors = PHONE_IMU,
+    seed: int = 0,
+    gravity: float = STANDARD_GRAVITY,
+    name: str = "simulated",
+) -> ImuSequence:
+    """The recording of `simulate`, without its biases. Arguments and errors are the same."""
+    return simulate(trajectory, rate, errors, seed, gravity, name).sequence
+
+
+def simulate(
+    trajectory: Trajectory,
+    rate: float = 200.0,
+    errors: ImuErrors = PHONE_IMU,
+    seed: int = 0,
+    gravity: float = STANDARD_GRAVITY,
+    name: str = "simulated",
+) -> Simulation:
+    """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
+
+    Args:
+        trajectory: poses at any rate that shows the motion, at least 6. Samples marked not valid
+            are bridged by the spline.
+        rate: of the IMU [Hz].
+        errors: of the sensors.
+        seed: of every random draw; the same seed gives the same recording.
+        gravity: its magnitude [m/s^2].
+        name: of the sequence.
+
+    Raises:
+        InputError: too few poses, a stretch of poses that are not valid longer than 0.1 s, or a
+            rate or gravity out of range.
+    """
+    _check(trajectory, rate, gravity)
+    truth, gyro, acceleration_W = _sampled(trajectory, rate)
+    up = np.array([0.0, 0.0, gravity])
+    accel = truth.attitude_WB.apply(acceleration_W + up, inverse=True)
+    rng = np.random.default_rng(seed)
+    noise = errors.noise
+    gyro, b_g = _measured(
+        gyro, rate, rng, (noise.gyro_noise, noise.gyro_walk), errors.gyro_turn_on,
+        errors.gyro_scale, errors.misalignment, errors.gyro_range,
+    )  # fmt: skip
+    accel, b_a = _measured(
+        accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
+        errors.accel_scale, errors.misalignment, errors.accel_range,
+    )  # fmt: skip
+    return Simulation(ImuSequence(name, truth.time, gyro, accel, truth), b_g, b_a)
+
+
+def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:
+    if not (math.isfinite(rate) and rate > 0):
+        raise InputError("rate", repr(rate), "a finite rate > 0 Hz")
+    if not (math.isfinite(gravity) and gravity >= 0):
+        raise InputError("gravity", repr(gravity), "a finite magnitude >= 0 m/s^2")
+    known = np.flatnonzero(trajectory.valid)
+    if len(known) < _MIN_POSES:
+        raise InputError("trajectory", f"{len(known)} valid poses", f"at least {_MIN_POSES}")
+    bridged = (np.diff(known) > 1) & (np.diff(trajectory.time[known]) > MAX_TRUTH_GAP)
+    if bridged.any():
+        start = trajectory.time[known[int(np.argmax(bridged))]]
+        raise InputError(
+            "trajectory", f"no valid pose after {start:.3f} s for more than {MAX_TRUTH_GAP} s",
+            "a track without gaps", "simulate its pieces one by one",
+        )  # fmt: skip
+
+
+def _sampled(trajectory: Trajectory, rate: float) -> tuple[Trajectory, FloatArray, FloatArray]:
+    """Truth, body rate [rad/s] and acceleration_W [m/s^2] on the IMU's own time grid."""
+    t = trajectory.time[trajectory.valid]
+    # The last pose belongs to the recording even if rounding puts it a hair beyond the end.
+    count = int(np.floor((t[-1] - t[0]) * rate + 1e-6)) + 1
+    time = np.minimum(t[0] + np.arange(count) / rate, t[-1])
+    position = _spline(t, trajectory.position_W[trajectory.valid], 5)
+    attitude_WB, gyro = _attitude_and_rate(t, trajectory.quat_xyzw[trajectory.valid], time)
+    truth = Trajectory(time, position(time), attitude_WB, velocity_W=position(time, 1))
+    return truth, gyro, np.asarray(position(time, 2), dtype=np.float64)
+
+
+def _attitude_and_rate(
+    t: FloatArray, quat_xyzw: FloatArray, time: FloatArray
+) -> tuple[Rotation, FloatArray]:
+    spline = _spline(t, sign_continuous(quat_xyzw), 3)
+    s, ds = spline(time), spline(time, 1)
+    vector, scalar = s[:, :3], s[:, 3:]
+    rate = 2.0 * (scalar * ds[:, :3] - ds[:, 3:] * vector - np.cross(vector, ds[:, :3]))
+    return Rotation.from_quat(s), rate / np.sum(s * s, axis=1, keepdims=True)
+
+
+def sign_continuous(quat_xyzw: FloatArray) -> FloatArray:
+    """The same rotations (N, 4) with signs such that neighbours lie on one half-sphere."""
+    dots = np.sum(quat_xyzw[1:] * quat_xyzw[:-1], axis=1)
+    signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
+    signed = quat_xyzw * np.concatenate([[1.0], signs])[:, None]
+    return np.asarray(signed, dtype=np.float64)
+
+
+def _spline(t: FloatArray, values: FloatArray, degree: int) -> BSpline:
+    return make_interp_spline(t, values, k=degree)
+
+
+def _measured(
+    true: FloatArray,
+    rate: float,
+    rng: np.random.Generator,
+    densities: tuple[float, float],
+    turn_on: float,
+    scale: float,
+    misalignment: float,
+    limit: float,
+) -> tuple[FloatArray, FloatArray]:
+    """What a sensor shows for `true` (N, 3), and its bias (N, 3)."""
+    white, walk = densities
+    axes = Rotation.from_rotvec(misalignment * rng.standard_normal(3)).as_matrix()
+    scales = 1.0 + scale * rng.standard_normal(3)
+    steps = walk / math.sqrt(rate) * rng.standard_normal(true.shape)
+    steps[0] = turn_on * rng.standard_normal(3)
+    bias = np.cumsum(steps, axis=0)
+    noise = white * math.sqrt(rate) * rng.standard_normal(true.shape)
+    return np.clip(true @ axes.T * scales + bias + noise, -limit, limit), bias
