@@ -1,0 +1,194 @@
+"""Where a generated person goes: speed, course, heading and height over time.
+
+A route is a row of activities drawn at random (walk straight, along a curve, around a corner,
+turn on the spot, stand, step sideways or backward, climb stairs), each a constant command for a
+while. Smoothing the commands by a Gaussian gives a person's gentle changes, and makes the route
+differentiable as often as anyone may ask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, rfft, rfftfreq
+
+from stario.sequences.sequence import FloatArray
+
+_RISER, _TREAD = 0.17, 0.29
+"""A stair's height and depth [m]."""
+
+_ROOM = 12.0
+"""Distance from the start beyond which the person turns towards it again [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """Motion of the person's body at regular times, without the gait.
+
+    Attributes:
+        position_W: (N, 3) of the point on the floor below the person [m].
+        heading: (N,) where the person faces [rad].
+        speed: (N,) over the floor [m/s].
+        turn_rate: (N,) of the heading [rad/s].
+    """
+
+    position_W: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    turn_rate: FloatArray
+
+
+@dataclass(frozen=True)
+class _Command:
+    """One activity: how long [s], how fast [m/s], turning [rad/s], course off the heading [rad]."""
+
+    duration: float
+    speed: float
+    turn_rate: float = 0.0
+    course: float = 0.0
+    climb: float = 0.0
+
+
+def random_route(
+    rng: np.random.Generator, count: int, rate: float, preferred_speed: float, wheels: bool = False
+) -> Route:
+    """Draw a route of `count` samples at `rate` [Hz].
+
+    Args:
+        rng: source of every draw.
+        count: number of samples.
+        rate: of the samples [Hz].
+        preferred_speed: of the person [m/s]; actual speeds are 0.3 to 2.2 m/s and standing still.
+        wheels: pushing something on wheels: no stairs, no steps sideways or backward.
+    """
+    commands: list[_Command] = []
+    lasted = 0.0
+    while lasted < count / rate:
+        commands += _activity(rng, preferred_speed, wheels)
+        lasted = sum(command.duration for command in commands)
+    tables = np.array([[c.speed, c.turn_rate, c.course, c.climb] for c in commands])
+    repeats = np.diff(np.round(np.cumsum([0.0] + [c.duration for c in commands]) * rate))
+    held = np.repeat(tables, repeats.astype(np.int64), axis=0)[:count]
+    # A course is only met at its speed: smooth velocity components, not the angle.
+    velocity_H = held[:, :1] * np.stack([np.cos(held[:, 2]), np.sin(held[:, 2])], axis=1)
+    sigma = rng.uniform(0.2, 0.35)
+    velocity_H = smoothed(velocity_H, rate, sigma)
+    turn_rate = smoothed(held[:, 1], rate, sigma) + 0.08 * drift(rng, count, rate, 1.5)
+    climb = smoothed(held[:, 3], rate, sigma)
+    return _integrated(velocity_H, turn_rate, climb, rate, rng.uniform(-np.pi, np.pi))
+
+
+def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[_Command]:
+    speed = float(np.clip(preferred * rng.uniform(0.6, 1.4), 0.3, 2.2))
+    side = float(rng.choice([-1.0, 1.0]))
+    kinds = ["straight", "curve", "corner", "spot", "stand", "sidle", "stairs", "slow"]
+    odds = np.array([0.28, 0.24, 0.2, 0.06, 0.07, 0.05, 0.06, 0.04])
+    if wheels:
+        odds[[5, 6]] = 0.0
+    kind = rng.choice(kinds, p=odds / odds.sum())
+    if kind == "curve":
+        radius = rng.uniform(0.8, 6.0)
+        turn_rate = min(speed / radius, 1.5)
+        angle = rng.uniform(0.3, 2.0) * np.pi
+        return [_Command(min(angle / turn_rate, 12.0), speed, side * turn_rate)]
+    if kind == "corner":
+        turn_rate = rng.uniform(1.2, 3.0)
+        angle = rng.uniform(0.4, 1.6)
+        slowed = speed * rng.uniform(0.5, 1.0)
+        return [
+            _Command(rng.uniform(0.8, 4.0), speed),
+            _Command(angle / turn_rate, slowed, side * turn_rate),
+        ]
+    if kind == "spot":
+        turn_rate = rng.uniform(0.8, 2.5)
+        turn = _Command(rng.uniform(0.8, 3.3) / turn_rate, 0.0, side * turn_rate)
+        return [_Command(0.6, 0.0), turn, _Command(rng.uniform(0.2, 1.5), 0.0)]
+    if kind == "stand":
+        return [_Command(rng.uniform(1.0, 6.0), 0.0)]
+    if kind == "sidle":
+        course = side * rng.uniform(0.4, 1.0) * np.pi
+        return [_Command(rng.uniform(1.0, 3.0), rng.uniform(0.3, 0.7), 0.0, course)]
+    if kind == "stairs":
+        steps_per_second = rng.uniform(1.3, 2.0)
+        climb = side * _RISER * steps_per_second
+        flight = rng.integers(6, 18) / steps_per_second
+        return [_Command(flight, _TREAD * steps_per_second, 0.0, 0.0, climb)]
+    if kind == "slow":
+        return [_Command(rng.uniform(2.0, 5.0), rng.uniform(0.3, 0.6))]
+    return [_Command(rng.uniform(1.5, 7.0), speed)]
+
+
+def _integrated(
+    velocity_H: FloatArray, turn_rate: FloatArray, climb: FloatArray, rate: float, heading: float
+) -> Route:
+    """Integrate step by step in whole columns, turning home in passes when it goes too far."""
+    for _ in range(4):
+        headings = heading + integral(turn_rate, rate)
+        c, s = np.cos(headings), np.sin(headings)
+        forward, left = velocity_H.T
+        velocity = np.stack([c * forward - s * left, s * forward + c * left, climb], axis=1)
+        position = integral(velocity, rate)
+        homing = _homing(position, headings, np.hypot(forward, left), rate)
+        if not homing.any():
+            break
+        turn_rate = turn_rate + homing
+    return Route(position, headings, np.hypot(forward, left), turn_rate)
+
+
+def _homing(
+    position: FloatArray, headings: FloatArray, speed: FloatArray, rate: float
+) -> FloatArray:
+    """Extra turn rate at the first time the route leaves the room: a turn towards the start."""
+    extra = np.zeros(len(headings))
+    outside = np.flatnonzero((np.hypot(position[:, 0], position[:, 1]) > _ROOM) & (speed > 0.3))
+    if len(outside) == 0:
+        return extra
+    k = int(outside[0])
+    home = np.arctan2(-position[k, 1], -position[k, 0])
+    angle = np.angle(np.exp(1j * (home - headings[k])))
+    extra[k : k + round(2.0 * rate)] = angle / 2.0
+    return smoothed(extra, rate, 0.3)
+
+
+def integral(values: FloatArray, rate: float) -> FloatArray:
+    """Trapezoidal integral along the first axis, starting at 0."""
+    steps = 0.5 * (values[1:] + values[:-1]) / rate
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+def smoothed(values: FloatArray, rate: float, sigma: float) -> FloatArray:
+    """Convolve with a Gaussian of deviation `sigma` [s] along the first axis, ends held."""
+    pad = int(np.ceil(5.0 * sigma * rate))
+    padded = np.concatenate([np.repeat(values[:1], pad, 0), values, np.repeat(values[-1:], pad, 0)])
+    gain = np.exp(-0.5 * (2.0 * np.pi * sigma * rfftfreq(len(padded), 1.0 / rate)) ** 2)
+    spectrum = rfft(padded, axis=0) * gain.reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(irfft(spectrum, n=len(padded), axis=0)[pad : pad + len(values)])
+
+
+def drift(
+    rng: np.random.Generator, count: int, rate: float, sigma: float, columns: int = 0
+) -> FloatArray:
+    """Smooth noise of unit deviation and a correlation time of about `sigma` [s].
+
+    Returns:
+        (count,), or (count, columns) where columns are asked for.
+    """
+    pad = int(np.ceil(5.0 * sigma * rate))
+    shape = (count + 2 * pad, columns) if columns else (count + 2 * pad,)
+    # A Gaussian of deviation s samples leaves 1 / (2 sqrt(pi) s) of white noise's variance.
+    scale = np.sqrt(2.0 * np.sqrt(np.pi) * sigma * rate)
+    return scale * smoothed(rng.standard_normal(shape), rate, sigma)[pad : pad + count]
+
+
+def band_noise(
+    rng: np.random.Generator, count: int, rate: float, low: float, high: float, columns: int
+) -> FloatArray:
+    """Noise (count, columns) of unit deviation between `low` and `high` [Hz], soft edges."""
+    f = rfftfreq(count, 1.0 / rate)
+    gain = np.exp(-0.5 * ((f - 0.5 * (low + high)) / (0.5 * (high - low))) ** 2)
+    gain[0] = 0.0
+    white = rfft(rng.standard_normal((count, columns)), axis=0)
+    noise = irfft(white * gain[:, None], n=count, axis=0)
+    # White noise spreads its variance evenly over the bins, each but the first counted twice.
+    return np.asarray(noise / np.sqrt(2.0 * np.sum(gain**2) / count))
