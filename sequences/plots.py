@@ -1,0 +1,379 @@
+"""Every figure: plan view, errors over time, innovations, and the IMU's samples.
+
+Functions return a `matplotlib.figure.Figure` drawn by Agg, without pyplot and its global state,
+so that they work headless and in threads. matplotlib is imported where it is used, because it is
+slow to import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_write
+from stario.sequences.metrics import PoseErrors, pose_errors
+from stario.sequences.sequence import (
+    MAX_TRUTH_GAP,
+    STANDARD_GRAVITY,
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Trajectory,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
+_BLUE, _ORANGE, _GREEN, _PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
+_RED, _SKY, _GREY, _INK = "#D55E00", "#56B4E9", "#999999", "#333333"
+_STYLES = {
+    "inertial": ("inertial", _GREY),
+    "network": ("network", _ORANGE),
+    "network_true_attitude": ("network, true attitude", _GREEN),
+    "ekf": ("EKF", _BLUE),
+    "graph": ("factor graph", _PINK),
+}
+_SPARE_COLOURS = (_RED, _SKY, "#7F5539", "#6A4C93")
+_AXIS_COLOURS = (_BLUE, _ORANGE, _GREEN)
+_LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
+_DPI = 150
+_CLIP_FACTOR = 3.0
+_MAX_ENVELOPE = 4000
+
+
+def save_figure(fig: Figure, path: Path | str) -> None:
+    """Write a figure as PNG, whole or not at all.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    with atomic_write(path, "wb") as file:
+        fig.savefig(file, format="png", dpi=_DPI)
+
+
+def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title: str) -> Figure:
+    """All tracks from above, on equal axes that fit the truth and the tracks near it.
+
+    A track that drifts far beyond these is cut at the frame and the legend says how far it goes.
+    Invalid poses and gaps show as breaks. Tracks are drawn as given: align them before.
+
+    Args:
+        tracks: by name; "inertial", "network", "network_true_attitude", "ekf" and "graph" have
+            fixed colours.
+        truth: the true track in the same frame, or None.
+        title: of the figure.
+
+    Raises:
+        InputError: there is nothing to draw.
+    """
+    ways = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
+    way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
+    boxes = {name: _box(way) for name, way in ways.items() if np.isfinite(way).any()}
+    if way_truth is not None and np.isfinite(way_truth[1]).any():
+        home = _box(way_truth[1])
+    elif boxes:
+        # Drift only makes a track larger, so the lower median is a track that did not run away.
+        home = sorted(boxes.values(), key=_size)[(len(boxes) - 1) // 2]
+    else:
+        raise InputError("tracks", "no valid pose", "at least one track to draw")
+    near = [box for box in boxes.values() if _excess(box, home) <= 0.5 * _size(home)]
+    fig = _figure(8.0, 7.0, title)
+    (axes,) = _panels(fig)
+    if way_truth is not None:
+        _draw_way(axes, way_truth[1], "truth", "black", width=2.2, order=2)
+    for k, (name, box) in enumerate(boxes.items()):
+        label, colour = _style(name, k)
+        far = _excess(box, home)
+        if far > 0.5 * _size(home):
+            label += f"\n(leaves the figure, by {_distance(far)})"
+        _draw_way(axes, ways[name], label, colour, width=1.3, order=3)
+    _frame(axes, np.array([home, *near]))
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
+    axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
+    fig.legend(loc="outside right upper", **_LEGEND)
+    return fig
+
+
+def error_over_time(
+    tracks: Mapping[str, Trajectory], truth: Trajectory, title: str = "Position error"
+) -> Figure:
+    """Horizontal error of all tracks, and the error per axis within 3 sigma where one is stated.
+
+    The axes fit the better tracks; one with more than thrice the error of the others is cut. Per
+    axis only tracks with `position_covariance_W` are drawn, or all where none has one. Tracks are
+    compared as given: align them before.
+
+    Raises:
+        InputError: no track, or one that has no time in common with the truth.
+    """
+    if not tracks:
+        raise InputError("tracks", "none", "at least one track")
+    errors = {name: pose_errors(track, truth) for name, track in tracks.items()}
+    norms = {name: np.linalg.norm(e.position_W[:, :2], axis=1) for name, e in errors.items()}
+    largest = {name: float(norm.max()) for name, norm in norms.items()}
+    typical = sorted(largest.values())[(len(largest) - 1) // 2]
+    good = [name for name in tracks if largest[name] <= _CLIP_FACTOR * max(typical, 0.1)]
+    fig = _figure(9.0, 9.0, title)
+    panels = _panels(fig, 1.7, 1, 1, 1)
+    for k, name in enumerate(tracks):
+        label, colour = _style(name, k)
+        if name not in good:
+            label += f" (leaves the figure, up to {_distance(largest[name])})"
+        time, norm = _broken(errors[name].estimate.time, norms[name][:, None])
+        panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
+    panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
+    panels[0].set_ylabel("horizontal error [m]")
+    stated = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
+    for k, name in enumerate(tracks):
+        if name in (stated or good):
+            _draw_axis_errors(panels[1:], errors[name], *_style(name, k))
+    panels[-1].set_xlabel("time [s]")
+    panels[0].legend(loc="upper left", ncols=2, **_LEGEND)
+    if stated:
+        panels[1].legend(loc="upper left", ncols=2, **_LEGEND)
+    return fig
+
+
+def innovations(
+    time: FloatArray,
+    residual: FloatArray,
+    sigma: FloatArray,
+    nis: FloatArray,
+    dof: int,
+    gated: BoolArray,
+    title: str = "Innovations of the filter",
+) -> Figure:
+    """What the filter's measurements said beyond its prediction, against what it expected.
+
+    Args:
+        time: (M,) of the updates [s].
+        residual: (M, 3) innovation, x y z [m].
+        sigma: (M, 3) its standard deviation as the filter states it [m].
+        nis: (M,) normalised innovation squared.
+        dof: expectation of the NIS.
+        gated: (M,) True where the gate refused or weakened the update.
+        title: of the figure.
+
+    Raises:
+        InputError: shapes do not agree or there is no update.
+    """
+    m = len(time)
+    arrays = {"residual": (residual, (m, 3)), "sigma": (sigma, (m, 3)), "nis": (nis, (m,))}
+    for name, (value, shape) in {**arrays, "gated": (gated, (m,))}.items():
+        if np.shape(value) != shape or m == 0:
+            raise InputError(name, f"shape {np.shape(value)}", f"{shape}, with at least one update")
+    gated = np.asarray(gated, dtype=np.bool_)
+    fig = _figure(9.0, 9.0, title)
+    panels = _panels(fig, 1, 1, 1, 1.3)
+    for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
+        band_time, band = _broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
+        axes.fill_between(band_time, -band[:, 0], band[:, 0], color=_BLUE, alpha=0.15, lw=0)
+        _draw_dots(axes, time, residual[:, k], gated)
+        axes.set_ylabel(f"{axis} [m]")
+        axes.set_ylim(*_symmetric(np.abs(residual[~gated, k]), 3 * sigma[:, k]))
+    panels[0].set_title("residual, band: 3 sigma", loc="left")
+    _draw_nis(panels[3], time, nis, dof, gated)
+    panels[3].set_xlabel("time [s]")
+    return fig
+
+
+def imu_overview(sequence: ImuSequence) -> Figure:
+    """Angular rate, specific force and its norm, and the true speed where there is a truth.
+
+    Long recordings are drawn as their envelope, so that no peak is lost.
+
+    Raises:
+        InputError: no sample has finite values.
+    """
+    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    if not finite.any():
+        raise InputError("sequence", "no finite sample", "finite time, gyro and accel")
+    order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
+    time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
+    fig = _figure(9.0, 6.0 if sequence.truth is None else 8.0, f"IMU of {sequence.name}")
+    panels = _panels(fig, *([1] * (2 if sequence.truth is None else 3)))
+    norm = np.linalg.norm(accel, axis=1, keepdims=True)
+    panels[1].plot(*_envelope(time, norm), color=_GREY, lw=0.8, label="norm")
+    for axes, values in ((panels[0], gyro), (panels[1], accel)):
+        for k, axis in enumerate("xyz"):
+            curve = _envelope(time, values[:, k : k + 1])
+            axes.plot(*curve, color=_AXIS_COLOURS[k], lw=0.8, alpha=0.85, label=axis)
+    panels[1].axhline(STANDARD_GRAVITY, color=_INK, lw=0.9, ls="--", label="gravity")
+    panels[0].set_ylabel("angular rate [rad/s]")
+    panels[1].set_ylabel("specific force [m/s$^2$]")
+    for axes in panels[:2]:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
+    if sequence.truth is not None:
+        panels[2].plot(*_speed(sequence.truth), color="black", lw=1.0)
+        panels[2].set_ylabel("true speed [m/s]")
+        panels[2].set_ylim(bottom=0)
+    panels[-1].set_xlabel("time [s]")
+    panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)
+    return fig
+
+
+def _figure(width: float, height: float, title: str) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(fig)
+    fig.suptitle(title, fontsize=13, color=_INK, x=0.02, ha="left")
+    return fig
+
+
+def _panels(fig: Figure, *heights: float) -> list[Axes]:
+    """Panels above each other with these relative heights and one abscissa; one without any."""
+    ratios = heights or (1,)
+    panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color(_GREY)
+        axes.tick_params(colors=_INK, labelsize=9)
+        axes.grid(color="#E6E6E6", lw=0.7)
+        axes.set_axisbelow(True)
+        axes.margins(x=0.01)
+    return list(panels)
+
+
+def _style(name: str, index: int) -> tuple[str, str]:
+    """Legend text and colour of a track; unknown names take spare colours by their position."""
+    return _STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
+
+
+def _broken(
+    time: FloatArray,
+    values: FloatArray,
+    valid: BoolArray | None = None,
+    max_gap: float = MAX_TRUTH_GAP,
+) -> tuple[FloatArray, FloatArray]:
+    """The valid rows of time (N,) and values (N, k), with a row of nan in each gap.
+
+    A gap is longer than `max_gap` [s] and than three usual steps.
+    """
+    if valid is not None:
+        time, values = time[valid], values[valid]
+    steps = np.diff(time)
+    if len(steps) == 0:
+        return time, values
+    gaps = np.flatnonzero(steps > max(max_gap, 3 * float(np.median(steps)))) + 1
+    return (
+        np.insert(time, gaps, 0.5 * (time[gaps] + time[gaps - 1])),
+        np.insert(values, gaps, np.nan, axis=0),
+    )
+
+
+def _envelope(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Curve through values (N, 1), beyond a few thousand samples through each block's extremes."""
+    block = -(-len(time) // (_MAX_ENVELOPE // 2))
+    if block > 2:
+        whole = len(time) // block * block
+        blocks = values[:whole, 0].reshape(-1, block)
+        time = time[:whole:block].repeat(2)
+        values = np.stack([blocks.min(axis=1), blocks.max(axis=1)], axis=1).reshape(-1, 1)
+    return _broken(time, values)
+
+
+def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Speed [m/s] from positions 0.2 s apart, which averages the noise of motion capture."""
+    step = 0.2
+    ticks = np.arange(truth.time[0], truth.time[-1], step)
+    if len(ticks) < 2 or truth.valid.sum() < 2:
+        return np.empty(0), np.empty(0)
+    at = truth.at(ticks)
+    speed = np.linalg.norm(np.diff(at.position_W, axis=0), axis=1) / step
+    known = at.valid[1:] & at.valid[:-1]
+    return ticks[:-1] + step / 2, np.where(known, speed, np.nan)
+
+
+def _box(way: FloatArray) -> FloatArray:
+    return np.array([np.nanmin(way, axis=0), np.nanmax(way, axis=0)])
+
+
+def _size(box: FloatArray) -> float:
+    return max(float(np.ptp(box, axis=0).max()), 1.0)
+
+
+def _excess(box: FloatArray, home: FloatArray) -> float:
+    """How far [m] one box reaches beyond another, in x or y."""
+    return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
+
+
+def _distance(metres: float) -> str:
+    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
+
+
+def _draw_way(
+    axes: Axes, way: FloatArray, label: str, colour: str, width: float, order: int
+) -> None:
+    axes.plot(way[:, 0], way[:, 1], color=colour, lw=width, label=label, zorder=order)
+    known = way[np.isfinite(way).all(axis=1)]
+    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
+    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
+
+
+def _frame(axes: Axes, boxes: FloatArray) -> None:
+    """Equal axes around boxes (n, 2, 2) with a margin."""
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    half = np.maximum(0.5 * (high - low), 0.5) * 1.08
+    half = np.maximum(half, 0.6 * half.max())  # a straight way, too, gets a frame of some width
+    center = 0.5 * (low + high)
+    axes.set(xlim=center[0] + half[0] * np.array([-1, 1]))
+    axes.set(ylim=center[1] + half[1] * np.array([-1, 1]))
+    axes.set_aspect("equal", adjustable="box")
+
+
+def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
+    time = errors.estimate.time
+    for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
+        axes.plot(
+            *_broken(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label
+        )
+        if errors.estimate.position_covariance_W is not None:
+            sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
+            band_time, band = _broken(time, 3 * sigma[:, None])
+            axes.fill_between(
+                band_time,
+                -band[:, 0],
+                band[:, 0],
+                color=colour,
+                alpha=0.15,
+                lw=0,
+                label=f"{label}, 3 sigma",
+            )
+        axes.set_ylabel(f"error in {axis} [m]")
+
+
+def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
+    axes.plot(time[~gated], value[~gated], ".", color=_BLUE, ms=3, label="used")
+    axes.plot(time[gated], value[gated], "x", color=_RED, ms=5, label="gated", clip_on=False)
+
+
+def _symmetric(*values: FloatArray) -> tuple[float, float]:
+    finite = np.concatenate([value[np.isfinite(value)] for value in values])
+    reach = 1.1 * float(finite.max(initial=0.0)) or 1.0
+    return -reach, reach
+
+
+def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
+    low, bound, top = chi2.ppf([0.001, 0.95, 0.9999], dof)
+    _draw_dots(axes, time, np.maximum(nis, low), gated)
+    axes.axhline(dof, color=_INK, lw=1.0, label=f"expected {dof}")
+    axes.axhline(bound, color=_INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
+    axes.set_yscale("log")
+    axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
+    axes.set_ylabel("NIS [1]")
+    axes.set_title(
+        f"normalised innovation squared: mean {np.nanmean(nis):.2f}, "
+        f"{100 * np.mean(gated):.1f} % gated",
+        loc="left",
+    )
+    axes.legend(loc="lower right", ncols=4, **_LEGEND)
