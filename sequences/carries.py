@@ -63,9 +63,8 @@ def trunk(gait: Gait) -> FloatArray:
     trunk by L^2 / (8 l), of which knees and ankles take about a third (Zijlstra & Hof, 2003).
     """
     rng, phi = gait.rng, gait.phase
-    bounce, sway, surge, limp = rng.uniform([0.5, 0.5, 0.4, 0.0], [0.8, 1.4, 1.2, 0.25])
-    step = gait.effort * step_length(gait)
-    rise = 0.5 * bounce * step**2 / (8.0 * 0.53 * gait.height)
+    bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
+    rise = 0.5 * bounce * gait.effort * step_length(gait) ** 2 / (8.0 * 0.53 * gait.height)
     shift = rng.uniform(-np.pi, np.pi, 6)
     z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
@@ -111,7 +110,8 @@ def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMot
     rng, n = gait.rng, len(gait)
     offset = trunk(gait) + heel_strikes(gait, strength)
     offset += 0.012 * drift(rng, n, gait.rate, 0.6, 3)
-    turn = 0.05 * drift(rng, n, gait.rate, 0.8, 3)
+    turn = 0.08 * drift(rng, n, gait.rate, 0.7, 3)
+    turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     shift, size = rng.uniform(-np.pi, np.pi, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
     for k, order in enumerate((0.5, 1.0)):
@@ -124,7 +124,8 @@ def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMot
 
 def _handheld(gait: Gait) -> CarryMotion:
     rng = gait.rng
-    motion = _held(gait, rng.uniform(0.2, 0.6), rng.uniform(0.08, 0.25), rng.uniform(0.01, 0.03))
+    strength = 0.2 * np.exp(rng.uniform(0.0, 2.0))
+    motion = _held(gait, strength, rng.uniform(0.08, 0.25), rng.uniform(0.01, 0.03))
     place = np.array([rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height])
     return CarryMotion(motion.offset_H + place, motion.turn_H)
 
@@ -141,7 +142,7 @@ def _call(gait: Gait) -> CarryMotion:
 
 def _swinging(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    amplitude = np.radians(rng.uniform(12.0, 32.0)) * gait.vigor
+    amplitude = np.radians(rng.uniform(12.0, 30.0)) * np.sqrt(gait.vigor)
     forward = np.radians(rng.uniform(0.0, 12.0))
     angle = _pendulum(gait, amplitude, forward, harmonic=0.12)
     side = rng.choice([-1.0, 1.0])
@@ -242,21 +243,16 @@ def _looks(gait: Gait, spread: FloatArray) -> FloatArray:
 
 def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> FloatArray:
     """Angle (N,) [rad] of a limb that swings with the stride about a resting angle `forward`."""
-    rng = gait.rng
-    size = (
-        amplitude
-        * np.minimum(gait.effort, 1.3)
-        * (1.0 + 0.1 * drift(rng, len(gait), gait.rate, 1.0))
-    )
+    rng, n = gait.rng, len(gait)
+    size = amplitude * np.minimum(gait.effort, 1.2) * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
     stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
     overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-np.pi, np.pi))
-    return (
-        forward + size * (np.sin(stride) + overtone) + 0.03 * drift(rng, len(gait), gait.rate, 0.6)
-    )
+    restless = 0.03 * drift(rng, n, gait.rate, 0.6)
+    return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
 
 
 def _slap(gait: Gait, rate_deviation: float) -> FloatArray:
-    """Turns (N, 3) [rad] of a loose device at each step's harmonics, about `rate_deviation` rad/s."""
+    """Turns (N, 3) [rad] of a loose device at a step's harmonics, of about so many rad/s."""
     turn = np.zeros((len(gait), 3))
     for k in range(2, 6):
         shift = gait.rng.uniform(-np.pi, np.pi, 3)

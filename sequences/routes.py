@@ -15,11 +15,8 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 from stario.sequences.sequence import FloatArray
 
-_RISER, _TREAD = 0.17, 0.29
+RISER, _TREAD = 0.17, 0.29
 """A stair's height and depth [m]."""
-
-_ROOM = 12.0
-"""Distance from the start beyond which the person turns towards it again [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +28,14 @@ class Route:
         heading: (N,) where the person faces [rad].
         speed: (N,) over the floor [m/s].
         turn_rate: (N,) of the heading [rad/s].
+        climb: (N,) vertical speed on stairs [m/s], negative going down.
     """
 
     position_W: FloatArray
     heading: FloatArray
     speed: FloatArray
     turn_rate: FloatArray
+    climb: FloatArray
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,12 @@ def random_route(
     velocity_H = smoothed(velocity_H, rate, sigma)
     turn_rate = smoothed(held[:, 1], rate, sigma) + 0.08 * drift(rng, count, rate, 1.5)
     climb = smoothed(held[:, 3], rate, sigma)
-    return _integrated(velocity_H, turn_rate, climb, rate, rng.uniform(-np.pi, np.pi))
+    heading = rng.uniform(-np.pi, np.pi) + integral(turn_rate, rate)
+    c, s = np.cos(heading), np.sin(heading)
+    forward, left = velocity_H.T
+    velocity_W = np.stack([c * forward - s * left, s * forward + c * left, climb], axis=1)
+    speed = np.hypot(forward, left)
+    return Route(integral(velocity_W, rate), heading, speed, turn_rate, climb)
 
 
 def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[_Command]:
@@ -111,44 +115,12 @@ def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[
         return [_Command(rng.uniform(1.0, 3.0), rng.uniform(0.3, 0.7), 0.0, course)]
     if kind == "stairs":
         steps_per_second = rng.uniform(1.3, 2.0)
-        climb = side * _RISER * steps_per_second
+        climb = side * RISER * steps_per_second
         flight = rng.integers(6, 18) / steps_per_second
         return [_Command(flight, _TREAD * steps_per_second, 0.0, 0.0, climb)]
     if kind == "slow":
         return [_Command(rng.uniform(2.0, 5.0), rng.uniform(0.3, 0.6))]
     return [_Command(rng.uniform(1.5, 7.0), speed)]
-
-
-def _integrated(
-    velocity_H: FloatArray, turn_rate: FloatArray, climb: FloatArray, rate: float, heading: float
-) -> Route:
-    """Integrate step by step in whole columns, turning home in passes when it goes too far."""
-    for _ in range(4):
-        headings = heading + integral(turn_rate, rate)
-        c, s = np.cos(headings), np.sin(headings)
-        forward, left = velocity_H.T
-        velocity = np.stack([c * forward - s * left, s * forward + c * left, climb], axis=1)
-        position = integral(velocity, rate)
-        homing = _homing(position, headings, np.hypot(forward, left), rate)
-        if not homing.any():
-            break
-        turn_rate = turn_rate + homing
-    return Route(position, headings, np.hypot(forward, left), turn_rate)
-
-
-def _homing(
-    position: FloatArray, headings: FloatArray, speed: FloatArray, rate: float
-) -> FloatArray:
-    """Extra turn rate at the first time the route leaves the room: a turn towards the start."""
-    extra = np.zeros(len(headings))
-    outside = np.flatnonzero((np.hypot(position[:, 0], position[:, 1]) > _ROOM) & (speed > 0.3))
-    if len(outside) == 0:
-        return extra
-    k = int(outside[0])
-    home = np.arctan2(-position[k, 1], -position[k, 0])
-    angle = np.angle(np.exp(1j * (home - headings[k])))
-    extra[k : k + round(2.0 * rate)] = angle / 2.0
-    return smoothed(extra, rate, 0.3)
 
 
 def integral(values: FloatArray, rate: float) -> FloatArray:
@@ -178,7 +150,8 @@ def drift(
     shape = (count + 2 * pad, columns) if columns else (count + 2 * pad,)
     # A Gaussian of deviation s samples leaves 1 / (2 sqrt(pi) s) of white noise's variance.
     scale = np.sqrt(2.0 * np.sqrt(np.pi) * sigma * rate)
-    return scale * smoothed(rng.standard_normal(shape), rate, sigma)[pad : pad + count]
+    noise = smoothed(rng.standard_normal(shape), rate, sigma)[pad : pad + count]
+    return np.asarray(scale * noise)
 
 
 def band_noise(

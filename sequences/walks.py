@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.carries import CARRIES, CarryMotion, Gait
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z
-from stario.sequences.routes import Route, drift, integral, random_route, smoothed
+from stario.sequences.routes import RISER, Route, drift, integral, random_route, smoothed
 from stario.sequences.sequence import FloatArray, Trajectory
 
 CARRY_WAYS = tuple(CARRIES)
@@ -128,12 +128,11 @@ def generate_walk(
     gait = _gait(rng, rate, route, style)
     motion = _carried(gait, style)
     R_WH = about_z(route.heading)
+    R_HD = Rotation.from_rotvec(motion.turn_H) * Rotation.from_rotvec(style.mount_rotvec)
     return Trajectory(
         time=np.arange(count) / rate,
         position_W=route.position_W + R_WH.apply(motion.offset_H),
-        attitude_WB=R_WH
-        * Rotation.from_rotvec(motion.turn_H)
-        * Rotation.from_rotvec(style.mount_rotvec),
+        attitude_WB=R_WH * R_HD,
     )
 
 
@@ -147,17 +146,19 @@ def _gait(rng: np.random.Generator, rate: float, route: Route, style: WalkStyle)
     # Turning on the spot takes steps as well: a person's feet move on a circle of 0.3 m.
     moving = np.hypot(route.speed, 0.3 * route.turn_rate)
     uneven = 1.0 + 0.025 * drift(rng, n, rate, 0.4)
-    floor = _SLOWEST_STEP_RATE
-    steps = (step_rate(moving, style) ** 4 + floor**4) ** 0.25 * uneven
+    stairs = np.abs(route.climb) / RISER
+    wanted = np.stack([step_rate(moving, style), stairs, np.full(n, _SLOWEST_STEP_RATE)])
+    steps = uneven * np.sum(wanted**8, axis=0) ** 0.125  # the largest of the three, smoothly
     strength = 1.0 + 0.1 * drift(rng, n, rate, 0.5)
     # Below 0.2 m/s a person shuffles: the gait fades out towards standing.
-    fade = np.square(moving) / (np.square(moving) + 0.1**2)
+    pace = np.hypot(moving, 0.8 * stairs)
+    fade = np.square(pace) / (np.square(pace) + 0.1**2)
     return Gait(
         rng=rng,
         rate=rate,
         phase=rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * integral(steps, rate),
         step_rate=steps,
-        effort=fade * (0.35 + 0.65 * moving / _BRISK) * strength,
+        effort=fade * (0.35 + 0.65 * pace / _BRISK) * strength,
         speed=route.speed,
         height=style.height,
         vigor=style.vigor,
