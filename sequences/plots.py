@@ -43,9 +43,12 @@ _STYLES = {
 _SPARE_COLOURS = (_RED, _SKY, "#7F5539", "#6A4C93")
 _AXIS_COLOURS = (_BLUE, _ORANGE, _GREEN)
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
+_ABOVE_LEFT = {**_LEGEND, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "ncols": 3}
+_ABOVE_RIGHT = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4}
 _DPI = 150
 _CLIP_FACTOR = 3.0
-_MAX_ENVELOPE = 4000
+_MAX_SAMPLES = 3000
+_BLOCKS = 600
 
 
 def save_figure(fig: Figure, path: Path | str) -> None:
@@ -84,7 +87,9 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
     near = [box for box in boxes.values() if _excess(box, home) <= 0.5 * _size(home)]
-    fig = _figure(8.0, 7.0, title)
+    frame = _frame(np.array([home, *near]))
+    width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
+    fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
     if way_truth is not None:
         _draw_way(axes, way_truth[1], "truth", "black", width=2.2, order=2)
@@ -92,13 +97,12 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
         label, colour = _style(name, k)
         far = _excess(box, home)
         if far > 0.5 * _size(home):
-            label += f"\n(leaves the figure, by {_distance(far)})"
+            label += f" (leaves the figure, by {_distance(far)})"
         _draw_way(axes, ways[name], label, colour, width=1.3, order=3)
-    _frame(axes, np.array([home, *near]))
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
     axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
-    fig.legend(loc="outside right upper", **_LEGEND)
+    fig.legend(loc="outside lower center", ncols=3, **_LEGEND)
     return fig
 
 
@@ -136,9 +140,10 @@ def error_over_time(
         if name in (stated or good):
             _draw_axis_errors(panels[1:], errors[name], *_style(name, k))
     panels[-1].set_xlabel("time [s]")
-    panels[0].legend(loc="upper left", ncols=2, **_LEGEND)
+    fig.align_ylabels()
+    panels[0].legend(**_ABOVE_LEFT)
     if stated:
-        panels[1].legend(loc="upper left", ncols=2, **_LEGEND)
+        panels[1].legend(**_ABOVE_LEFT)
     return fig
 
 
@@ -176,19 +181,21 @@ def innovations(
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
         band_time, band = _broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
         axes.fill_between(band_time, -band[:, 0], band[:, 0], color=_BLUE, alpha=0.15, lw=0)
-        _draw_dots(axes, time, residual[:, k], gated)
-        axes.set_ylabel(f"{axis} [m]")
-        axes.set_ylim(*_symmetric(np.abs(residual[~gated, k]), 3 * sigma[:, k]))
-    panels[0].set_title("residual, band: 3 sigma", loc="left")
+        reach = _reach(residual[~gated, k], 3 * sigma[:, k])
+        # A gated residual can be huge: marked at the edge, it leaves the others their room.
+        _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
+        axes.set(ylabel=f"{axis} [m]", ylim=(-reach, reach))
+    panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
     _draw_nis(panels[3], time, nis, dof, gated)
     panels[3].set_xlabel("time [s]")
+    fig.align_ylabels()
     return fig
 
 
 def imu_overview(sequence: ImuSequence) -> Figure:
     """Angular rate, specific force and its norm, and the true speed where there is a truth.
 
-    Long recordings are drawn as their envelope, so that no peak is lost.
+    Long recordings are drawn as mean and envelope, so that no peak is lost.
 
     Raises:
         InputError: no sample has finite values.
@@ -200,22 +207,21 @@ def imu_overview(sequence: ImuSequence) -> Figure:
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     fig = _figure(9.0, 6.0 if sequence.truth is None else 8.0, f"IMU of {sequence.name}")
     panels = _panels(fig, *([1] * (2 if sequence.truth is None else 3)))
-    norm = np.linalg.norm(accel, axis=1, keepdims=True)
-    panels[1].plot(*_envelope(time, norm), color=_GREY, lw=0.8, label="norm")
+    _draw_samples(panels[1], time, np.linalg.norm(accel, axis=1), "norm", _GREY)
     for axes, values in ((panels[0], gyro), (panels[1], accel)):
         for k, axis in enumerate("xyz"):
-            curve = _envelope(time, values[:, k : k + 1])
-            axes.plot(*curve, color=_AXIS_COLOURS[k], lw=0.8, alpha=0.85, label=axis)
+            _draw_samples(axes, time, values[:, k], axis, _AXIS_COLOURS[k])
     panels[1].axhline(STANDARD_GRAVITY, color=_INK, lw=0.9, ls="--", label="gravity")
     panels[0].set_ylabel("angular rate [rad/s]")
     panels[1].set_ylabel("specific force [m/s$^2$]")
     for axes in panels[:2]:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
     if sequence.truth is not None:
-        panels[2].plot(*_speed(sequence.truth), color="black", lw=1.0)
-        panels[2].set_ylabel("true speed [m/s]")
-        panels[2].set_ylim(bottom=0)
+        ticks, speed = _speed(sequence.truth)
+        panels[2].plot(ticks, speed, color="black", lw=1.0)
+        panels[2].set(ylabel="true speed [m/s]", ylim=(0, _reach(speed)))
     panels[-1].set_xlabel("time [s]")
+    fig.align_ylabels()
     panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)
     return fig
 
@@ -271,20 +277,9 @@ def _broken(
     )
 
 
-def _envelope(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Curve through values (N, 1), beyond a few thousand samples through each block's extremes."""
-    block = -(-len(time) // (_MAX_ENVELOPE // 2))
-    if block > 2:
-        whole = len(time) // block * block
-        blocks = values[:whole, 0].reshape(-1, block)
-        time = time[:whole:block].repeat(2)
-        values = np.stack([blocks.min(axis=1), blocks.max(axis=1)], axis=1).reshape(-1, 1)
-    return _broken(time, values)
-
-
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Speed [m/s] from positions 0.2 s apart, which averages the noise of motion capture."""
-    step = 0.2
+    """Speed [m/s] along 1 s chords, as the length of the way is measured."""
+    step = 1.0
     ticks = np.arange(truth.time[0], truth.time[-1], step)
     if len(ticks) < 2 or truth.valid.sum() < 2:
         return np.empty(0), np.empty(0)
@@ -320,15 +315,13 @@ def _draw_way(
     axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
 
 
-def _frame(axes: Axes, boxes: FloatArray) -> None:
-    """Equal axes around boxes (n, 2, 2) with a margin."""
+def _frame(boxes: FloatArray) -> FloatArray:
+    """Corners (2, 2), lower left and upper right, of a frame around boxes (n, 2, 2)."""
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     half = np.maximum(0.5 * (high - low), 0.5) * 1.08
     half = np.maximum(half, 0.6 * half.max())  # a straight way, too, gets a frame of some width
     center = 0.5 * (low + high)
-    axes.set(xlim=center[0] + half[0] * np.array([-1, 1]))
-    axes.set(ylim=center[1] + half[1] * np.array([-1, 1]))
-    axes.set_aspect("equal", adjustable="box")
+    return np.array([center - half, center + half])
 
 
 def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
@@ -357,10 +350,22 @@ def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray
     axes.plot(time[gated], value[gated], "x", color=_RED, ms=5, label="gated", clip_on=False)
 
 
-def _symmetric(*values: FloatArray) -> tuple[float, float]:
-    finite = np.concatenate([value[np.isfinite(value)] for value in values])
-    reach = 1.1 * float(finite.max(initial=0.0)) or 1.0
-    return -reach, reach
+def _draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
+    """A curve through the samples; through block means, within their extremes, if they are many."""
+    block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)
+    starts = np.arange(0, len(time), block)
+    mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
+    extremes = [ufunc.reduceat(value, starts) for ufunc in (np.minimum, np.maximum)]
+    ticks, curves = _broken(time[starts], np.column_stack([mean, *extremes]))
+    axes.plot(ticks, curves[:, 0], color=colour, lw=0.8, label=label)
+    if block > 1:
+        axes.fill_between(ticks, curves[:, 1], curves[:, 2], color=colour, alpha=0.3, lw=0.4)
+
+
+def _reach(*values: FloatArray) -> float:
+    """A little more than the largest finite magnitude."""
+    finite = np.abs(np.concatenate([value[np.isfinite(value)] for value in values]))
+    return 1.1 * float(finite.max(initial=0.0)) or 1.0
 
 
 def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
@@ -372,8 +377,8 @@ def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: Bo
     axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
     axes.set_ylabel("NIS [1]")
     axes.set_title(
-        f"normalised innovation squared: mean {np.nanmean(nis):.2f}, "
-        f"{100 * np.mean(gated):.1f} % gated",
+        f"NIS: mean {np.nanmean(nis):.2f}, {100 * np.mean(gated):.1f} % gated",
         loc="left",
+        fontsize=10,
     )
-    axes.legend(loc="lower right", ncols=4, **_LEGEND)
+    axes.legend(**_ABOVE_RIGHT)
