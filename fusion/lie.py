@@ -1,0 +1,136 @@
+"""Rotations and extended poses as matrix groups: SO(3), SE(3) and SE_2(3) in closed form.
+
+Every function works on stacks, leading axes first, because the filter corrects all of its clones at
+once. Conventions: X = exp(xi) with xi = (theta, rho_v, rho_p), rotation [rad] first; the left
+Jacobian J carries the translation parts, exp(theta, rho) = (exp(theta), J(theta) rho).
+
+Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics",
+2018, appendices B and D; A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable
+observer", 2017, for SE_2(3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# theta @ _HAT is the skew-symmetric matrix of theta, flattened: one product for a whole stack.
+_HAT = np.zeros((3, 9))
+_HAT[0, [5, 7]] = -1.0, 1.0
+_HAT[1, [2, 6]] = 1.0, -1.0
+_HAT[2, [1, 3]] = -1.0, 1.0
+
+# Taylor coefficients in theta^2 of sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3.
+_POWERS = np.arange(5.0)
+_SERIES = np.array(
+    [
+        [1.0, 1.0 / 2.0, 1.0 / 6.0],
+        [-1.0 / 6.0, -1.0 / 24.0, -1.0 / 120.0],
+        [1.0 / 120.0, 1.0 / 720.0, 1.0 / 5040.0],
+        [-1.0 / 5040.0, -1.0 / 40320.0, -1.0 / 362880.0],
+        [1.0 / 362880.0, 1.0 / 3628800.0, 1.0 / 39916800.0],
+    ]
+)
+_SERIES_LIMIT = 0.04  # theta^2 [rad^2] up to which five terms are exact to rounding
+_EYE = np.eye(3)
+
+
+def skew(vector: FloatArray) -> FloatArray:
+    """Cross-product matrices [x]x (..., 3, 3) of vectors (..., 3)."""
+    return (vector @ _HAT).reshape(*vector.shape[:-1], 3, 3)
+
+
+def exp_and_left_jacobian(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation matrices exp([theta]x) and left Jacobians J_l(theta), sharing their work.
+
+    Args:
+        theta: (..., 3) rotation vectors [rad].
+
+    Returns:
+        Two arrays (..., 3, 3).
+    """
+    K = skew(theta)
+    KK = K @ K
+    a, b, c = np.moveaxis(_coefficients((theta * theta).sum(axis=-1)), -1, 0)[..., None, None]
+    bK = b * K
+    return _EYE + a * K + b * KK, _EYE + bK + c * KK
+
+
+def exp_so3(theta: FloatArray) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    return exp_and_left_jacobian(theta)[0]
+
+
+def log_so3(R: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) [rad], of norm up to pi, of rotation matrices (..., 3, 3)."""
+    # Through the unit quaternion: its largest component is never small, so neither half turns nor
+    # tiny angles lose digits.
+    m = np.moveaxis(R, (-2, -1), (0, 1))
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    products = np.stack([1.0 + 2.0 * m[k, k] - trace for k in range(3)] + [1.0 + trace], axis=-1)
+    odd = np.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], axis=-1)
+    even = np.stack([m[1, 2] + m[2, 1], m[0, 2] + m[2, 0], m[0, 1] + m[1, 0]], axis=-1)
+    x, y, z, w = np.moveaxis(products, -1, 0)
+    rows = np.stack(  # 4 q q^T, one row per candidate for the largest component
+        [
+            np.stack([x, even[..., 2], even[..., 1], odd[..., 0]], axis=-1),
+            np.stack([even[..., 2], y, even[..., 0], odd[..., 1]], axis=-1),
+            np.stack([even[..., 1], even[..., 0], z, odd[..., 2]], axis=-1),
+            np.stack([odd[..., 0], odd[..., 1], odd[..., 2], w], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = products.argmax(axis=-1)[..., None, None]
+    quat_xyzw = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
+    quat_xyzw = quat_xyzw * np.where(quat_xyzw[..., 3:] < 0.0, -1.0, 1.0)
+    sine = np.linalg.norm(quat_xyzw[..., :3], axis=-1, keepdims=True)
+    cosine = quat_xyzw[..., 3:]
+    angle = 2.0 * np.arctan2(sine, cosine)
+    tiny = sine < 1e-12 * cosine
+    scale = np.where(tiny, 2.0 / np.where(tiny, cosine, 1.0), angle / np.where(tiny, 1.0, sine))
+    return np.asarray(quat_xyzw[..., :3] * scale, dtype=np.float64)
+
+
+def left_jacobian_so3(theta: FloatArray) -> FloatArray:
+    """J_l (..., 3, 3): exp(theta + d) = exp(J_l d) exp(theta) to first order."""
+    return exp_and_left_jacobian(theta)[1]
+
+
+def right_jacobian_so3(theta: FloatArray) -> FloatArray:
+    """J_r (..., 3, 3): exp(theta + d) = exp(theta) exp(J_r d) to first order."""
+    return exp_and_left_jacobian(-theta)[1]
+
+
+def exp_se23(xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Exponential of SE_2(3).
+
+    Args:
+        xi: (..., 9) theta [rad], rho_v [m/s], rho_p [m].
+
+    Returns:
+        R (..., 3, 3), v (..., 3), p (..., 3).
+    """
+    R, J = exp_and_left_jacobian(xi[..., :3])
+    return R, (J @ xi[..., 3:6, None])[..., 0], (J @ xi[..., 6:9, None])[..., 0]
+
+
+def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
+    """Logarithm (..., 9) of SE_2(3), the inverse of `exp_se23` for angles below pi."""
+    theta = log_so3(R)
+    J = left_jacobian_so3(theta)
+    rho = np.linalg.solve(J, np.stack([v, p], axis=-1))
+    return np.concatenate([theta, rho[..., 0], rho[..., 1]], axis=-1)
+
+
+def _coefficients(theta_squared: FloatArray) -> FloatArray:
+    """Columns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3, accurate down to zero."""
+    series: FloatArray = np.power.outer(theta_squared, _POWERS) @ _SERIES
+    large = theta_squared > _SERIES_LIMIT
+    if large.any():
+        t = np.sqrt(np.where(large, theta_squared, 1.0))
+        sine, half = np.sin(t), np.sin(0.5 * t)
+        closed = np.stack([sine / t, 2.0 * (half / t) ** 2, (t - sine) / t**3], axis=-1)
+        series = np.where(large[..., None], closed, series)
+    return series

@@ -1,0 +1,237 @@
+"""Raw IMU between two updates, folded once into a segment that filter and graph share.
+
+gtsam's `PreintegratedCombinedMeasurements` does the folding. Each of its steps holds rate and
+specific force constant and rotates the force by the attitude at the step's start; instantaneous
+samples are therefore first turned into the equivalent constants (`corrected_increments`).
+
+Error state, its order and its meaning (right-invariant, first order):
+    theta [rad], rho_v [m/s], rho_p [m], d_bg [rad/s], d_ba [m/s^2]
+    R = (I + [theta]x) R^,  v = v^ + rho_v - [v^]x theta,  p = p^ + rho_p - [p^]x theta
+where ^ marks the estimate. The transition of theta, rho_v, rho_p does not depend on the state, so
+the filter cannot learn yaw or position by linearising at different estimates.
+
+Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
+2017; A. Barrau, S. Bonnabel, 2017 (invariant error); P. Savage, "Strapdown inertial navigation
+integration algorithm design", 1998 (coning, sculling).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+
+from stario.fusion.lie import FloatArray, skew
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+
+CORE = 15
+"""Size of the error state of one navigation state."""
+
+# gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
+# the graph and is far below any sensor's.
+_POSITION_NOISE = 1e-5
+
+
+class Propagation(NamedTuple):
+    """State at a segment's end and its linearisation, order theta, rho_v, rho_p, d_bg, d_ba."""
+
+    R_WB: FloatArray
+    """(3, 3)."""
+    v_W: FloatArray
+    """(3,) [m/s]."""
+    p_W: FloatArray
+    """(3,) [m]."""
+    transition: FloatArray
+    """(15, 15)."""
+    noise: FloatArray
+    """(15, 15)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """IMU samples between two times, preintegrated.
+
+    Attributes:
+        start: time of the first sample [s].
+        stop: time of the last sample [s].
+        gravity: magnitude of gravity [m/s^2].
+        pim: gtsam's preintegrated measurements, for a `CombinedImuFactor`.
+    """
+
+    start: float
+    stop: float
+    gravity: float
+    pim: Any
+
+    @property
+    def duration(self) -> float:
+        """Length of the segment [s]."""
+        return self.stop - self.start
+
+    def predict(
+        self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Dead reckoning across the segment.
+
+        Args:
+            R_WB: (3, 3) attitude at the start.
+            v_W: (3,) velocity [m/s].
+            p_W: (3,) position [m].
+            b_g: (3,) gyroscope bias [rad/s].
+            b_a: (3,) accelerometer bias [m/s^2].
+
+        Returns:
+            R_WB, v_W, p_W at the end.
+        """
+        start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
+        end = self.pim.predict(start, gtsam.imuBias.ConstantBias(b_a, b_g))
+        return end.attitude().matrix(), end.velocity(), end.position()
+
+    def linearise(
+        self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
+    ) -> Propagation:
+        """`predict`, with the transition and the noise of the right-invariant error.
+
+        gtsam's tangent is local, R exp(w), p + R dp, v + R dv, in the order rotation, position,
+        velocity, accelerometer bias, gyroscope bias; the adjoint of the end state turns it into
+        the right-invariant error.
+        """
+        start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
+        bias_jacobian = np.empty((9, 6), order="F")
+        bias = gtsam.imuBias.ConstantBias(b_a, b_g)
+        end = self.pim.predict(start, bias, None, bias_jacobian)
+        R, v, p = end.attitude().matrix(), end.velocity(), end.position()
+
+        adjoint = _BIAS_SWAP.copy()
+        adjoint[0:3, 0:3] = R
+        adjoint[3:6, 6:9] = R
+        adjoint[6:9, 3:6] = R
+        adjoint[3:6, 0:3] = skew(v) @ R
+        adjoint[6:9, 0:3] = skew(p) @ R
+        noise = adjoint @ self.pim.residualCovariance() @ adjoint.T
+
+        transition = _nav_transition(self.duration, self.gravity)
+        by_bias = adjoint[:9, :9] @ bias_jacobian
+        transition[:9, 9:12] = by_bias[:, 3:]
+        transition[:9, 12:15] = by_bias[:, :3]
+        return Propagation(R, v, p, transition, noise)
+
+
+def preintegrate(
+    time: FloatArray,
+    gyro: FloatArray,
+    accel: FloatArray,
+    b_g: FloatArray,
+    b_a: FloatArray,
+    noise: ImuNoise,
+    gravity: float,
+    noise_scale: float = 1.0,
+) -> Segment:
+    """Fold the samples of an interval into a segment.
+
+    Args:
+        time: (n + 1,) [s], strictly increasing; first and last are the interval's ends.
+        gyro: (n + 1, 3) [rad/s] in B, interpolated to the ends by the caller.
+        accel: (n + 1, 3) specific force [m/s^2] in B, likewise.
+        b_g: (3,) gyroscope bias to integrate with [rad/s]; later changes act to first order.
+        b_a: (3,) accelerometer bias [m/s^2], likewise.
+        noise: noise densities over this interval.
+        gravity: magnitude [m/s^2].
+        noise_scale: factor on the white densities (saturated or violent stretches); the walks of
+            the biases stay.
+
+    Raises:
+        InputError: fewer than two samples, shapes that differ, time that does not increase, or a
+            value that is not finite.
+    """
+    _check_samples(time, gyro, accel)
+    dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
+    params = _params(noise, gravity, noise_scale)
+    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
+    integrate = pim.integrateMeasurement
+    # gtsam subtracts the bias itself, so it is added back here.
+    for step_force, step_rate, step in zip(force + b_a, rate + b_g, dt.tolist(), strict=True):
+        integrate(step_force, step_rate, step)
+    return Segment(float(time[0]), float(time[-1]), gravity, pim)
+
+
+def corrected_increments(
+    time: FloatArray, gyro: FloatArray, accel: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Constant rate and force per interval that are equivalent to the samples at its ends.
+
+    Rate w and force a are taken as linear between samples. With their means w_, a_ over an interval
+    dt the rotation vector is  dt w_ + dt^2/12 w0 x w1  (coning) and the velocity increment in the
+    axes of the interval's start is
+    dt a_ + dt^2/2 w_ x a_ + dt^2/12 (w0 x a1 - w1 x a0) + dt^3/6 w_ x (w_ x a_)
+    (rotation of the force, sculling, second order of the rotation).
+
+    Args:
+        time: (n + 1,) [s].
+        gyro: (n + 1, 3) [rad/s], bias removed.
+        accel: (n + 1, 3) [m/s^2], bias removed.
+
+    Returns:
+        dt (n,) [s], rate (n, 3) [rad/s], force (n, 3) [m/s^2].
+    """
+    dt = time[1:] - time[:-1]
+    step = dt[:, None]
+    w0, w1, a0, a1 = gyro[:-1], gyro[1:], accel[:-1], accel[1:]
+    w, a = 0.5 * (w0 + w1), 0.5 * (a0 + a1)
+    W0, W1 = skew(w0), skew(w1)
+    W = 0.5 * (W0 + W1)
+    turned = _apply(W, a)
+    sculling = _apply(W0, a1) - _apply(W1, a0)
+    rate = w + step / 12.0 * _apply(W0, w1)
+    force = a + step * (0.5 * turned + sculling / 12.0 + step / 6.0 * _apply(W, turned))
+    return dt, rate, force
+
+
+def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    product: FloatArray = (matrices @ vectors[:, :, None])[:, :, 0]
+    return product
+
+
+_BIAS_SWAP = np.zeros((CORE, CORE))
+_BIAS_SWAP[9:12, 12:15] = np.eye(3)
+_BIAS_SWAP[12:15, 9:12] = np.eye(3)
+
+
+def _nav_transition(dt: float, gravity: float) -> FloatArray:
+    """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
+    transition = np.eye(CORE)
+    fall, drop = gravity * dt, 0.5 * gravity * dt * dt
+    transition[3, 1], transition[4, 0] = fall, -fall
+    transition[6, 1], transition[7, 0] = drop, -drop
+    transition[6, 3] = transition[7, 4] = transition[8, 5] = dt
+    return transition
+
+
+@lru_cache(maxsize=256)
+def _params(noise: ImuNoise, gravity: float, noise_scale: float) -> Any:
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+    eye = np.eye(3)
+    params.setGyroscopeCovariance(eye * (noise.gyro_noise * noise_scale) ** 2)
+    params.setAccelerometerCovariance(eye * (noise.accel_noise * noise_scale) ** 2)
+    params.setIntegrationCovariance(eye * _POSITION_NOISE**2)
+    params.setBiasOmegaCovariance(eye * noise.gyro_walk**2)
+    params.setBiasAccCovariance(eye * noise.accel_walk**2)
+    return params
+
+
+def _check_samples(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
+    n = len(time)
+    if n < 2:
+        raise InputError("time", f"{n} samples", "at least 2, the ends of the interval")
+    if gyro.shape != (n, 3) or accel.shape != (n, 3):
+        raise InputError("gyro, accel", f"{gyro.shape}, {accel.shape}", f"({n}, 3) as time")
+    if not (time[1:] > time[:-1]).all():
+        raise InputError("time", "a step that is not positive", "strictly increasing seconds")
+    # One product sees a not-a-number or infinite value in either array.
+    if not math.isfinite(np.vdot(gyro, gyro) + np.vdot(accel, accel)):
+        raise InputError("gyro, accel", "a value that is not finite", "finite samples")
