@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
@@ -38,7 +39,7 @@ _MAX_STEP_RAD = 0.15
 _MIN_RUN = 0.3
 """Rows between two implausible steps are trusted if they last at least this long [s]."""
 
-_MAX_BRIDGE = 0.25
+_MAX_BRIDGE = 0.3
 """Longest loss that the smoothing fills [s]; a stride takes about one second."""
 
 _BRIDGED_SPEED = 2.5
@@ -50,9 +51,15 @@ _ATTITUDE_CUTOFF = 8.0
 """Half-amplitude frequency of the smoothing [Hz]: above it the capture's noise, differentiated,
 exceeds what the accelerometer or the gyroscope of the same walks shows."""
 
-_MAX_RESIDUAL_M = 0.01
-_MAX_RESIDUAL_RAD = 0.06
-"""Rows further than this from the smoothed track are small glitches, dropped in a second pass."""
+_MAX_RESIDUAL_M = 0.0025
+_MAX_RESIDUAL_RAD = 0.03
+"""Rows further than this from the smoothed track are small glitches: ten times the median."""
+
+_PASSES = (4.0, 2.0, 1.0)
+"""The limits are approached from above, because glitches pull the track towards them."""
+
+_WIDEN = 2
+"""Neighbours of a glitch that go with it [rows]."""
 
 _EDGE = 0.15
 """Cut at both ends of a piece [s]: smoothing is one-sided there."""
@@ -92,12 +99,11 @@ def clean_capture(table: FloatArray) -> list[Trajectory]:
     rows = np.rint((table[:, 0] - table[:1, 0]) * RATE).astype(np.int64)
     table, rows = table[np.unique(rows, return_index=True)[1]], np.unique(rows)
     start = float(table[0, 0]) if len(table) else 0.0
-    pieces = []
-    for part in _continuous_parts(table, rows):
-        piece = _smoothed(start, rows[part], table[part, 1:4], table[part, 4:8])
-        if piece is not None:
-            pieces.append(piece)
-    return pieces
+    return [
+        piece
+        for part in _continuous_parts(table, rows)
+        for piece in _smoothed(start, rows[part], table[part, 1:4], table[part, 4:8])
+    ]
 
 
 def _continuous_parts(table: FloatArray, rows: IntArray) -> list[IntArray]:
@@ -139,9 +145,8 @@ def _distance(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _smoothed(
     start: float, rows: IntArray, position: FloatArray, quat_xyzw: FloatArray
-) -> Trajectory | None:
-    if rows[-1] - rows[0] < (MIN_DURATION + 2 * _EDGE) * RATE:
-        return None
+) -> list[Trajectory]:
+    """Smooth one part, and cut it where more was lost than can be bridged."""
     grid = np.arange(rows[0], rows[-1] + 1)
     captured = rows - rows[0]
     poses = np.zeros((len(grid), 7))
@@ -149,13 +154,23 @@ def _smoothed(
     weight = np.zeros(len(grid))
     weight[captured] = 1.0
     smooth = _smooth_poses(poses, weight)
-    residual = np.abs(poses - smooth)
-    near = np.linalg.norm(residual[:, :3], axis=1) < _MAX_RESIDUAL_M
-    near &= np.linalg.norm(residual[:, 3:], axis=1) < _MAX_RESIDUAL_RAD / 2
-    smooth = _smooth_poses(poses, weight * near)
-    inner = slice(round(_EDGE * RATE), len(grid) - round(_EDGE * RATE))
-    attitude_WB = Rotation.from_quat(smooth[inner, 3:])
-    return Trajectory(start + grid[inner] / RATE, smooth[inner, :3], attitude_WB)
+    for scale in _PASSES:
+        off = np.linalg.norm((poses - smooth)[:, :3], axis=1) > scale * _MAX_RESIDUAL_M
+        # Half the angle between two close attitudes is the distance of their quaternions.
+        off |= np.linalg.norm((poses - smooth)[:, 3:], axis=1) > scale * _MAX_RESIDUAL_RAD / 2
+        weight[captured] = ~binary_dilation(off, iterations=_WIDEN)[captured]
+        smooth = _smooth_poses(poses, weight)
+    edge = round(_EDGE * RATE)
+    trusted = np.flatnonzero(weight)
+    ends = np.flatnonzero(np.diff(trusted) > _MAX_BRIDGE * RATE)
+    pieces = []
+    for stretch in np.split(trusted, ends + 1):
+        inner = slice(stretch[0] + edge, stretch[-1] - edge + 1) if len(stretch) else slice(0)
+        if len(grid[inner]) > MIN_DURATION * RATE:
+            attitude_WB = Rotation.from_quat(smooth[inner, 3:])
+            time = start + grid[inner] / RATE
+            pieces.append(Trajectory(time, smooth[inner, :3], attitude_WB))
+    return pieces
 
 
 def _smooth_poses(poses: FloatArray, weight: FloatArray) -> FloatArray:
