@@ -49,6 +49,7 @@ _DPI = 150
 _CLIP_FACTOR = 3.0
 _MAX_SAMPLES = 3000
 _BLOCKS = 600
+_CROWDED = 12.0  # rounds from which lines are drawn finer
 
 
 def save_figure(fig: Figure, path: Path | str) -> None:
@@ -80,25 +81,27 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
     boxes = {name: _box(way) for name, way in ways.items() if np.isfinite(way).any()}
     if way_truth is not None and np.isfinite(way_truth[1]).any():
-        home = _box(way_truth[1])
+        way_home = way_truth[1]
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track that did not run away.
-        home = sorted(boxes.values(), key=_size)[(len(boxes) - 1) // 2]
+        way_home = ways[sorted(boxes, key=lambda name: _size(boxes[name]))[(len(boxes) - 1) // 2]]
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
+    home = _box(way_home)
     near = [box for box in boxes.values() if _excess(box, home) <= 0.5 * _size(home)]
     frame = _frame(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
+    fine = 0.6 if _rounds(way_home, home) > _CROWDED else 1.0
     if way_truth is not None:
-        _draw_way(axes, way_truth[1], "truth", "black", width=2.2, order=2)
+        _draw_way(axes, way_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
         label, colour = _style(name, k)
         far = _excess(box, home)
         if far > 0.5 * _size(home):
             label += f" (leaves the figure, by {_distance(far)})"
-        _draw_way(axes, ways[name], label, colour, width=1.3, order=3)
+        _draw_way(axes, ways[name], label, colour, width=1.3 * fine, order=3)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
     axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
@@ -300,6 +303,11 @@ def _size(box: FloatArray) -> float:
 def _excess(box: FloatArray, home: FloatArray) -> float:
     """How far [m] one box reaches beyond another, in x or y."""
     return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
+
+
+def _rounds(way: FloatArray, box: FloatArray) -> float:
+    """Length of a way over the size of its box: how often it comes by the same place."""
+    return float(np.nansum(np.linalg.norm(np.diff(way, axis=0), axis=1))) / _size(box)
 
 
 def _distance(metres: float) -> str:
