@@ -159,6 +159,8 @@ def _smoothed(
         # Half the angle between two close attitudes is the distance of their quaternions.
         off |= np.linalg.norm((poses - smooth)[:, 3:], axis=1) > scale * _MAX_RESIDUAL_RAD / 2
         weight[captured] = ~binary_dilation(off, iterations=_WIDEN)[captured]
+        if weight.mean() < 0.5:
+            return []  # no track to speak of
         smooth = _smooth_poses(poses, weight)
     edge = round(_EDGE * RATE)
     trusted = np.flatnonzero(weight)

@@ -1,0 +1,149 @@
+"""Random windows cut from world-frame streams, and what is done to them before a network learns.
+
+Everything works on whole batches: a training step draws start points, a replay speed, a yaw, a
+tilt, biases, noise and a mirror image for each window at once. Sources: yaw, tilt and biases after
+TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How far windows are varied.
+
+    Attributes:
+        speeds: range of the replay speed; a window replayed s times as fast has angular rates x s,
+            linear accelerations x s^2, and covers s seconds of the recording.
+        replayed: share of windows that are replayed; the others keep speed 1.
+        tilt: largest error of the gravity direction [rad], about a random horizontal axis.
+        gyro_bias: half-width of the uniform bias [rad/s].
+        accel_bias: half-width of the uniform bias [m/s^2].
+        gyro_noise: largest deviation of white noise on the 200 Hz samples [rad/s].
+        accel_noise: largest deviation of white noise on the 200 Hz samples [m/s^2].
+    """
+
+    speeds: tuple[float, float] = (0.6, 1.8)
+    replayed: float = 0.5
+    tilt: float = 0.087
+    gyro_bias: float = 0.05
+    accel_bias: float = 0.2
+    gyro_noise: float = 0.02
+    accel_noise: float = 0.15
+
+
+class WindowSampler:
+    """Draws augmented training batches from streams, each stream weighted.
+
+    Args:
+        streams: at least one, each longer than a window at the fastest replay.
+        weights: relative frequency of each stream per second of it.
+        augmentation: how far windows are varied.
+        seed: of all randomness.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[WorldStream],
+        weights: Sequence[float],
+        augmentation: Augmentation,
+        seed: int,
+    ) -> None:
+        self.augmentation = augmentation
+        reach = int(WINDOW_SAMPLES * augmentation.speeds[1]) + 2
+        self._imu = torch.cat([torch.from_numpy(s.imu_W) for s in streams])
+        self._position = torch.cat([torch.from_numpy(s.position_W) for s in streams])
+        first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
+        self._first = first
+        self._starts = torch.tensor([max(len(s) - reach, 1) for s in streams])
+        share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
+        self._cumulative = (share / share.sum()).cumsum(0)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def batch(self, size: int) -> tuple[Tensor, Tensor]:
+        """Windows (size, 6, 200) and displacements (size, 3) [m], augmented."""
+        uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
+        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._first) - 1)
+        offset = self._uniform(size).double() * (self._starts[stream] - 1)
+        speed = self._speeds(size)
+        start = self._first[stream].double() + offset
+        steps = torch.arange(WINDOW_SAMPLES + 1, dtype=torch.float64)
+        at = start[:, None] + steps * speed[:, None].double()
+        imu = _lerp(self._imu, at[:, :-1])
+        ends = _lerp(self._position, at[:, [0, -1]])
+        return self._vary(_replayed(imu, speed), ends[:, 1] - ends[:, 0])
+
+    def _speeds(self, size: int) -> Tensor:
+        low, high = self.augmentation.speeds
+        speed = low + (high - low) * self._uniform(size)
+        return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
+
+    def _vary(self, imu: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Mirror, turn, tilt, bias and noise; imu is (B, 200, 6)."""
+        a = self.augmentation
+        size = len(imu)
+        mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
+        imu, displacement = _mirrored(imu, displacement, mirror)
+        R_yaw = _about_z(self._symmetric(size) * torch.pi)
+        R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
+        turned = imu.view(size, WINDOW_SAMPLES, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)
+        imu = turned.reshape(size, WINDOW_SAMPLES, 6)
+        limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
+        deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
+        imu = imu + (self._symmetric(size, 6) * limits).unsqueeze(1)
+        white = torch.randn(imu.shape, generator=self.generator)
+        imu = imu + white * (self._uniform(size)[:, None, None] ** 2 * deviations)
+        displacement = (R_yaw @ displacement.unsqueeze(2)).squeeze(2)
+        return imu.transpose(1, 2).contiguous(), displacement
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator)
+
+    def _symmetric(self, *shape: int) -> Tensor:
+        return 2.0 * self._uniform(*shape) - 1.0
+
+
+def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
+    """Rates x s; linear accelerations x s^2 with gravity as it is."""
+    s = speed[:, None, None]
+    gravity = torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
+    accel = (imu[..., 3:] - gravity) * s**2 + gravity
+    return torch.cat([imu[..., :3] * s, accel], dim=2)
+
+
+def _mirrored(imu: Tensor, displacement: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
+    """Image in the vertical x-z plane where sign is -1: rates are axial vectors, the rest polar."""
+    one = torch.ones_like(sign)
+    factors = torch.stack([sign, one, sign, one, sign, one], dim=1)
+    return imu * factors.unsqueeze(1), displacement * factors[:, 3:]
+
+
+def _about_z(yaw: Tensor) -> Tensor:
+    cos, sin, zero, one = yaw.cos(), yaw.sin(), torch.zeros_like(yaw), torch.ones_like(yaw)
+    rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=1)
+    return rows.view(-1, 3, 3)
+
+
+def _small_tilt(angles: Tensor) -> Tensor:
+    """Rotation by the horizontal rotation vector (B, 2) [rad]."""
+    zero = torch.zeros_like(angles[:, 0])
+    x, y = angles[:, 0], angles[:, 1]
+    skew = torch.stack([zero, zero, y, zero, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
+    R: Tensor = torch.linalg.matrix_exp(skew)
+    return R
+
+
+def _lerp(table: Tensor, at: Tensor) -> Tensor:
+    """Rows of table (N, K) at fractional indices (B, M), as (B, M, K)."""
+    left = at.floor().long().clamp(max=len(table) - 2)
+    weight = (at - left).float().unsqueeze(-1)
+    return table[left] * (1.0 - weight) + table[left + 1] * weight

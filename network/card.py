@@ -1,0 +1,125 @@
+"""The card that travels with weights: what they are, what they eat, what they were trained on.
+
+Weights are a safetensors file; the card is the JSON beside it. Loading refuses a pair that does
+not match: another architecture, window, frame or checksum. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from stario.sequences.errors import WeightsError
+from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
+
+FORMAT = 1
+FRAME = "gravity-aligned, z up, yaw arbitrary"
+CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How log standard deviations become honest ones, fitted on validation recordings.
+
+    sigma = sqrt((scale * exp(log_sigma))^2 + floor^2), each per axis x, y, z of the window's frame
+    (x and y share theirs: the frame's yaw is arbitrary).
+
+    Attributes:
+        scale: factors on the network's sigma.
+        floor: smallest sigma [m].
+    """
+
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    floor: tuple[float, float, float] = (0.005, 0.005, 0.005)
+
+
+@dataclass(frozen=True)
+class Card:
+    """Description of a weights file.
+
+    Attributes:
+        architecture: a name `build_network` knows.
+        outputs: 3 displacements [m], then 3 log standard deviations.
+        rate: samples per second of a window [Hz].
+        samples: samples of a window.
+        frame: of the window and the displacement.
+        channels: rows of a window; gyroscope in rad/s, accelerometer in m/s^2.
+        sha256: checksum of the weights file.
+        calibration: of the standard deviations.
+        trained_on: recordings and simulations, in words.
+        recipe: the command and settings that made the weights.
+        figures: results on named recordings.
+    """
+
+    architecture: str
+    sha256: str = ""
+    outputs: int = 6
+    rate: float = WINDOW_RATE
+    samples: int = WINDOW_SAMPLES
+    frame: str = FRAME
+    channels: list[str] = field(default_factory=lambda: list(CHANNELS))
+    calibration: Calibration = field(default_factory=Calibration)
+    trained_on: list[str] = field(default_factory=list)
+    recipe: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+    format: int = FORMAT
+
+
+def card_path(weights: Path) -> Path:
+    """The card of `NAME.safetensors` is `NAME.json` beside it."""
+    return weights.with_suffix(".json")
+
+
+def dump_card(card: Card) -> str:
+    """The card as JSON text."""
+    return json.dumps(asdict(card), indent=2) + "\n"
+
+
+def read_card(weights: Path) -> Card:
+    """Read and check the card of a weights file.
+
+    Raises:
+        WeightsError: card or weights are missing, malformed, of another kind, or the checksum
+            differs.
+    """
+    path = card_path(weights)
+    for needed in (weights, path):
+        if not needed.is_file():
+            raise WeightsError(needed, "file", "nothing there", "weights and card side by side")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        calibration = Calibration(**{k: tuple(v) for k, v in content.pop("calibration").items()})
+        unknown = set(content) - {f.name for f in fields(Card)}
+        if unknown:
+            raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
+        card = Card(calibration=calibration, **content)
+    except (ValueError, TypeError, KeyError, AttributeError, UnicodeDecodeError) as error:
+        raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
+    _check(card, path)
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    if digest != card.sha256:
+        raise WeightsError(
+            weights,
+            "sha256",
+            digest[:12],
+            f"{card.sha256[:12]} as on the card",
+            "the file is cut short or belongs to another card",
+        )
+    return card
+
+
+def _check(card: Card, path: Path) -> None:
+    expected = {
+        "format": FORMAT,
+        "outputs": 6,
+        "rate": WINDOW_RATE,
+        "samples": WINDOW_SAMPLES,
+        "frame": FRAME,
+        "channels": CHANNELS,
+    }
+    for name, value in expected.items():
+        if getattr(card, name) != value:
+            raise WeightsError(path, name, repr(getattr(card, name)), repr(value))

@@ -1,0 +1,156 @@
+"""StarIO: star operation, dual-wing attention, multi-scale gated convolution unit.
+
+A stem and four stages of residual blocks over a window of IMU data. Each block is a DWSB (the
+star operation, element-wise product of two pointwise branches, weighted by the two wings of its
+average and deviation over time and over channels) followed by an MSGCU (a depthwise value branch
+gated per channel). Widths, expansion and biases are those whose counts match the published table.
+
+Shapes below: B windows, C channels, L time steps.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+WIDTHS = (64, 128, 192, 256)
+BLOCKS = (2, 2, 2, 2)
+_LENGTH_AT_HEAD = 3
+_EPSILON = 1e-5
+
+
+def moments(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation along `dim`, in one pass over x.
+
+    sqrt(E[x^2] - E[x]^2 + eps) is several times faster than `torch.std`, and the epsilon keeps
+    its gradient finite where x does not vary.
+    """
+    mean = x.mean(dim, keepdim=True)
+    square = (x * x).mean(dim, keepdim=True)
+    return mean, torch.sqrt(torch.clamp(square - mean * mean, min=0.0) + _EPSILON)
+
+
+class Wing(nn.Module):
+    """Attention weights along one axis from average and deviation over the other.
+
+    `mu` and `xi` mix the two pooled vectors; a convolution of width 3 along the axis and a sigmoid
+    turn them into weights.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mu = nn.Parameter(torch.ones(1))
+        self.xi = nn.Parameter(torch.ones(1))
+        self.convolution = nn.Conv1d(1, 1, 3, padding=1, bias=False)
+
+    def forward(self, mean: Tensor, deviation: Tensor) -> Tensor:
+        """Weights (B, 1, A) from pooled vectors (B, 1, A)."""
+        return torch.sigmoid(self.convolution(self.mu * mean + self.xi * deviation))
+
+
+class DualWingStarBlock(nn.Module):
+    """DWSB: depthwise convolution, star operation, channel wing plus time wing."""
+
+    def __init__(self, channels: int, expansion: int = 2) -> None:
+        super().__init__()
+        inner = expansion * channels
+        self.depthwise = nn.Conv1d(channels, channels, 3, padding=1, groups=channels, bias=False)
+        self.norm = nn.BatchNorm1d(channels)
+        self.branch_gate = nn.Conv1d(channels, inner, 1)
+        self.branch_value = nn.Conv1d(channels, inner, 1)
+        self.channel_wing = Wing()
+        self.time_wing = Wing()
+        self.project = nn.Conv1d(inner, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, L) to (B, C, L)."""
+        x = self.norm(self.depthwise(x))
+        star = rms_normalised(F.relu6(self.branch_gate(x)) * self.branch_value(x))
+        over_time = [m.transpose(1, 2) for m in moments(star, dim=2)]
+        weight_channel = self.channel_wing(*over_time).transpose(1, 2)
+        weight_time = self.time_wing(*moments(star, dim=1))
+        mixed: Tensor = self.project(star * (weight_channel + weight_time))
+        return mixed
+
+
+class GatedUnit(nn.Module):
+    """MSGCU: depthwise value branch times a softmax gate over channels."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(channels)
+        self.value = nn.Conv1d(channels, channels, 3, padding=1, groups=channels)
+        self.squeeze = nn.Linear(channels, channels // 2, bias=False)
+        self.excite = nn.Linear(channels // 2, channels, bias=False)
+        self.softmax = nn.Softmax(dim=1)
+        self.project = nn.Conv1d(channels, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, L) to (B, C, L)."""
+        x = self.norm(x)
+        gate = self.softmax(self.excite(F.relu(self.squeeze(x.mean(dim=2)))))
+        gated: Tensor = self.project(rms_normalised(self.value(x) * gate.unsqueeze(2)))
+        return gated
+
+
+def rms_normalised(x: Tensor) -> Tensor:
+    """X over its root mean square of each window.
+
+    Star products have heavy tails and a softmax gate averages 1/C: without this the blocks start
+    almost silent and single batches explode later. It has no parameter, so the counts stay.
+    """
+    return x * torch.rsqrt((x * x).mean(dim=(1, 2), keepdim=True) + _EPSILON)
+
+
+class Block(nn.Module):
+    """X' = X + DWSB(X), then X' + MSGCU(X')."""
+
+    def __init__(self, channels: int, gated_unit: bool) -> None:
+        super().__init__()
+        self.star = DualWingStarBlock(channels)
+        self.gated = GatedUnit(channels) if gated_unit else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, L) to (B, C, L)."""
+        x = x + self.star(x)
+        return x if self.gated is None else x + self.gated(x)
+
+
+class StarIO(nn.Module):
+    """The network: (B, 6, 200) of gyroscope and accelerometer to (B, outputs).
+
+    Args:
+        outputs: 6 for displacement and log standard deviation, 2 as the paper's table counts it.
+        gated_unit: False leaves out the MSGCU (the paper's ablation).
+    """
+
+    def __init__(self, outputs: int = 6, gated_unit: bool = True) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        previous = 6
+        for width, blocks in zip(WIDTHS, BLOCKS, strict=True):
+            stem = previous == 6
+            stride, padding = (2, 1) if stem else (3, 0)
+            layers += [
+                nn.Conv1d(previous, width, 3, stride=stride, padding=padding, bias=False),
+                nn.BatchNorm1d(width),
+                *(Block(width, gated_unit) for _ in range(blocks)),
+            ]
+            previous = width
+        self.trunk = nn.Sequential(*layers)
+        self.head = nn.Sequential(
+            nn.Flatten(),
+            nn.Linear(previous * _LENGTH_AT_HEAD, 512),
+            nn.ReLU(),
+            nn.Dropout(0.5),
+            nn.Linear(512, 256),
+            nn.ReLU(),
+            nn.Dropout(0.5),
+            nn.Linear(256, outputs),
+        )
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """(B, 6, 200) to (B, outputs)."""
+        output: Tensor = self.head(self.trunk(windows))
+        return output

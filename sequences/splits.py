@@ -1,0 +1,30 @@
+"""Which recordings train, validate and test: the split that figures are compared on."""
+
+from __future__ import annotations
+
+TEST = (
+    "oxiod/handheld/data1/syn/imu3.csv",
+    "oxiod/multi users/user2/syn/imu5.csv",
+    "oxiod/trolley/data2/syn/imu5.csv",
+    "tumvi/dataset-room4_512_16",
+)
+"""Test recordings, in the order of every table; nothing is ever tuned on them."""
+
+VALIDATION = (
+    "oxiod/handheld/data1/syn/imu7.csv",
+    "oxiod/multi users/user2/syn/imu4.csv",
+    "oxiod/trolley/data2/syn/imu1.csv",
+    "tumvi/dataset-room3_512_16",
+)
+"""Recordings kept from training: early stop, calibration of the covariance."""
+
+TRAINING = (
+    "oxiod/handheld/data1/syn/imu2.csv",
+    "oxiod/multi users/user2/syn/imu6.csv",
+    "oxiod/trolley/data1/syn/imu7.csv",
+    "oxiod/trolley/data2/syn/imu2.csv",
+    "oxiod/trolley/data2/syn/imu3.csv",
+    "oxiod/trolley/data2/syn/imu4.csv",
+    "tumvi/dataset-room1_512_16",
+    "tumvi/dataset-room2_512_16",
+)

@@ -1,0 +1,145 @@
+"""Windows for the networks: one second at 200 Hz in a gravity-aligned frame, and their targets.
+
+A window that starts at t_i holds the 200 samples at t_i + k / 200 s, gyroscope then accelerometer,
+each rotated from the body into a gravity-aligned frame; its target is the displacement from t_i to
+t_j = t_i + 1 s in that frame (TLIO, Liu et al. 2020, section IV). The same functions serve
+training (true attitude) and the navigator (estimated attitude).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
+
+WINDOW_RATE = 200.0
+"""Samples per second of a window [Hz]."""
+
+WINDOW_SAMPLES = 200
+"""Samples of a window."""
+
+WINDOW_SECONDS = WINDOW_SAMPLES / WINDOW_RATE
+"""Length of a window [s]."""
+
+MAX_IMU_GAP = 0.1
+"""Longest distance [s] between IMU samples that is bridged by interpolation."""
+
+MIN_RATE, MAX_RATE = 40.0, 1200.0
+"""Sampling rates [Hz] that are accepted (50 Hz to 1 kHz, with some slack for jitter)."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorldStream:
+    """An unbroken stretch of a recording at 200 Hz in the world frame, ready to cut windows from.
+
+    Attributes:
+        name: the recording's.
+        imu_W: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] rotated into W.
+        position_W: (N, 3) float32 [m], relative to the stretch's start.
+    """
+
+    name: str
+    imu_W: NDArray[np.float32]
+    position_W: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.imu_W)
+
+
+def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
+    """Values (N, K) at `time` brought to the even `grid` (M,) at 200 Hz.
+
+    Faster sensors are averaged over each grid step, so that noise and vibration above 100 Hz do
+    not alias; slower ones are interpolated linearly.
+    """
+    step = 1.0 / WINDOW_RATE
+    if len(time) < 2 or float(np.median(np.diff(time))) > 0.67 * step:
+        return _interpolate(grid, time, values)
+    areas = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
+    edges = np.clip(np.append(grid - 0.5 * step, grid[-1] + 0.5 * step), time[0], time[-1])
+    widths = np.diff(edges)
+    means = np.diff(_interpolate(edges, time, integral), axis=0) / np.maximum(widths, 1e-9)[:, None]
+    return np.where((widths > 0.25 * step)[:, None], means, _interpolate(grid, time, values))
+
+
+def world_streams(
+    sequence: ImuSequence, min_seconds: float = 2.0 * WINDOW_SECONDS
+) -> list[WorldStream]:
+    """Cut a recording with truth into unbroken 200 Hz stretches in the world frame.
+
+    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`).
+
+    Raises:
+        InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
+    time, gyro, accel = clean_samples(sequence)
+    pose = sequence.truth.at(time)
+    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
+    usable = sequence.truth.at(grid).valid & ~_spans_gap(time, grid)
+    imu_W = np.concatenate([pose.attitude_WB.apply(gyro), pose.attitude_WB.apply(accel)], axis=1)
+    imu_W = resample(time, imu_W, grid).astype(np.float32)
+    position_W = sequence.truth.at(grid).position_W
+    return [
+        WorldStream(
+            name=sequence.name,
+            imu_W=imu_W[start:stop],
+            position_W=(position_W[start:stop] - position_W[start]).astype(np.float32),
+        )
+        for start, stop in runs(usable)
+        if (stop - start) / WINDOW_RATE >= min_seconds
+    ]
+
+
+def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Time, gyroscope and accelerometer with bad, repeated and out-of-order samples dropped.
+
+    Raises:
+        InputError: what is left has fewer than two samples or a rate that is not accepted.
+    """
+    finite = np.isfinite(sequence.time) & np.isfinite(sequence.gyro).all(axis=1)
+    finite &= np.isfinite(sequence.accel).all(axis=1)
+    index = np.flatnonzero(finite)
+    newest = np.maximum.accumulate(sequence.time[index])
+    index = index[np.concatenate([[True], newest[1:] > newest[:-1]])] if len(index) else index
+    if len(index) < 2:
+        raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
+    time = sequence.time[index]
+    rate = float(1.0 / np.median(np.diff(time)))
+    if not MIN_RATE <= rate <= MAX_RATE:
+        raise InputError(
+            f"{sequence.name}: rate",
+            f"{rate:.1f} Hz",
+            "50 Hz to 1 kHz",
+            "is the time column in seconds?",
+        )
+    return time, sequence.gyro[index], sequence.accel[index]
+
+
+def windows_of(stream: WorldStream, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Windows (M, 6, 200) every `stride` samples with their displacements (M, 3) [m]."""
+    starts = np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
+    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
+    windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
+    return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Maximal runs [start, stop) of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _spans_gap(time: FloatArray, grid: FloatArray) -> BoolArray:
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    return np.asarray(time[right] - time[right - 1] > max(MAX_IMU_GAP, MAX_TRUTH_GAP))
+
+
+def _interpolate(grid: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
+    return np.stack([np.interp(grid, time, values[:, k]) for k in range(values.shape[1])], axis=1)
