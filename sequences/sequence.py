@@ -66,7 +66,7 @@ class Trajectory:
             if value is not None:
                 arrays[name] = _checked_array(name, value, (n, *shape), where=valid)
         for name, value in arrays.items():
-            object.__setattr__(self, name, _frozen(value))
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -181,7 +181,7 @@ class ImuSequence:
                 raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")
             arrays[name] = value
         for name, value in arrays.items():
-            object.__setattr__(self, name, _frozen(value))
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -243,9 +243,3 @@ def _checked_array(
             name, f"a value that is not finite at row {int(np.argmax(bad))}", "finite values"
         )
     return array
-
-
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    view = array.view()
-    view.flags.writeable = False
-    return view

@@ -13,6 +13,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.alignment import align_tracked_body
@@ -22,8 +23,11 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajec
 
 RATE = 100.0
 _G = 9.81
-_JUMP_M = 0.05
-"""A tracked body that moves further than this within one row (5 m/s) is a glitch."""
+_JUMP_M = 0.04
+"""A tracked body that moves further than this within one row (4 m/s) is a glitch."""
+
+_SPIKE_M = 0.1
+"""Nor is it ever this far from the median of the half second around it."""
 
 
 def read_oxiod(path: Path) -> ImuSequence:
@@ -66,9 +70,13 @@ def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def _position_glitches(position: FloatArray) -> BoolArray:
-    """Rows further from the median of their neighbourhood than a body can be."""
-    half = 12
+    """Rows at either end of an impossible step or far from the median around them, widened."""
+    half = 25
     padded = np.pad(position, ((half, half), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
     distance = np.linalg.norm(position - np.median(windows, axis=-1), axis=1)
-    return np.asarray(~(distance < _JUMP_M * half), dtype=np.bool_)
+    jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < _JUMP_M)
+    bad = ~(distance < _SPIKE_M)
+    bad[1:] |= jump
+    bad[:-1] |= jump
+    return np.asarray(binary_dilation(bad, iterations=2), dtype=np.bool_)
