@@ -90,12 +90,14 @@ def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
         expected_p = expected_p + expected_v * dt + 0.5 * a_W * dt * dt
         expected_v = expected_v + a_W * dt
         expected_R = expected_R @ exp_so3(rate * dt)
-    segment = preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY)
-    R_end, v_end, p_end = segment.predict(R, v, p, b_g, b_a)
-    assert segment.duration == pytest.approx(0.5)
-    np.testing.assert_allclose(log_so3(R_end @ expected_R.T), 0.0, atol=1e-6)
-    np.testing.assert_allclose(v_end, expected_v, atol=1e-5)
-    np.testing.assert_allclose(p_end, expected_p, atol=1e-4)
+    for k in range(0, 100, 10):
+        part = slice(k, k + 11)
+        segment = preintegrate(t[part], gyro[part], accel[part], b_g, b_a, NOISE, GRAVITY)
+        assert segment.duration == pytest.approx(0.05)
+        R, v, p = segment.predict(R, v, p, b_g, b_a)
+    np.testing.assert_allclose(log_so3(R @ expected_R.T), 0.0, atol=1e-5)
+    np.testing.assert_allclose(v, expected_v, atol=5e-5)
+    np.testing.assert_allclose(p, expected_p, atol=5e-5)
 
 
 def test_a_device_at_rest_stays() -> None:
