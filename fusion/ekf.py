@@ -27,7 +27,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.lie import FloatArray, exp_and_left_jacobian, skew
+from stario.fusion.lie import FloatArray, exp_times, skew
 from stario.fusion.preintegration import CORE, Segment
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -84,9 +84,8 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         self.Q = np.zeros((self.dim_x, self.dim_x))
         self.time = math.nan
         # Row 0 is the current pose, row 1 + s the clone in slot s: one stack to correct at once.
-        self._R: FloatArray = np.tile(np.eye(3), (slots + 1, 1, 1))
-        self._p: FloatArray = np.zeros((slots + 1, 3))
-        self._v: FloatArray = np.zeros(3)
+        # Columns R, v, p; a clone's v is not used and stays zero.
+        self._X: FloatArray = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         self._b_g = np.zeros(3)
         self._b_a = np.zeros(3)
         self._clone_time: list[float | None] = [None] * slots
@@ -96,17 +95,17 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
     @property
     def R_WB(self) -> FloatArray:
         """Attitude (3, 3), body to world."""
-        return np.array(self._R[0])
+        return np.array(self._X[0, :, :3])
 
     @property
     def v_W(self) -> FloatArray:
         """Velocity (3,) [m/s]."""
-        return self._v.copy()
+        return np.array(self._X[0, :, 3])
 
     @property
     def p_W(self) -> FloatArray:
         """Position (3,) [m]."""
-        return np.array(self._p[0])
+        return np.array(self._X[0, :, 4])
 
     @property
     def b_g(self) -> FloatArray:
@@ -125,7 +124,7 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
             InputError: the slot holds no clone.
         """
         self._check_slot(slot)
-        return self._R[1 + slot].copy(), self._p[1 + slot].copy()
+        return np.array(self._X[1 + slot, :, :3]), np.array(self._X[1 + slot, :, 4])
 
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
@@ -142,7 +141,7 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         Order: rotation error about the world's axes [rad], velocity error [m/s] and position error
         [m] in W, biases [rad/s], [m/s^2], each true minus estimate (R = (I + [theta]x) R^).
         """
-        to_world = _world_from_invariant(self._v, self._p[0])
+        to_world = _world_from_invariant(self.v_W, self.p_W)
         return np.asarray(to_world @ self.P[:CORE, :CORE] @ to_world.T)
 
     def initialise(
@@ -179,11 +178,10 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         _check_covariance(covariance)
 
         self.time = _checked("time", time, ()).item()
-        self._R[:], self._p[:] = R, 0.0
-        self._v, self._p[0] = arrays["v_W"], arrays["p_W"]
+        self._set_pose(R, arrays["v_W"], arrays["p_W"])
         self._b_g, self._b_a = arrays["b_g"], arrays["b_a"]
         self._clone_time = [None] * self.slots
-        from_world = np.linalg.inv(_world_from_invariant(self._v, self._p[0]))
+        from_world = np.linalg.inv(_world_from_invariant(arrays["v_W"], arrays["p_W"]))
         core = from_world @ covariance @ from_world.T
         self.P[:] = 0.0
         self.P[:CORE, :CORE] = 0.5 * (core + core.T)
@@ -194,8 +192,9 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
 
     def propagate(self, segment: Segment) -> None:
         """Move the current state and its covariance across a preintegrated segment."""
-        step = segment.linearise(self._R[0], self._v, self._p[0], self._b_g, self._b_a)
-        self._R[0], self._v, self._p[0] = step.R_WB, step.v_W, step.p_W
+        X = self._X[0]
+        step = segment.linearise(X[:, :3], X[:, 3], X[:, 4], self._b_g, self._b_a)
+        self._set_pose(step.R_WB, step.v_W, step.p_W)
         self._propagate_covariance(step.transition, step.noise)
         self.time = segment.stop
 
@@ -209,7 +208,8 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
             raise InputError("clone", f"all {self.slots} slots taken", "a free slot", "release one")
         slot = self._clone_time.index(None)
         self._clone_time[slot] = time
-        self._R[1 + slot], self._p[1 + slot] = self._R[0], self._p[0]
+        self._X[1 + slot] = self._X[0]
+        self._X[1 + slot, :, 3] = 0.0
         first, P = CORE + CLONE * slot, self.P
         for offset, core in ((0, slice(0, 3)), (3, slice(6, 9))):
             P[first + offset : first + offset + 3] = P[core]
@@ -265,8 +265,8 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         self._check_slot(slot_i)
         if slot_j is not None:
             self._check_slot(slot_j)
-        p_i = self._p[1 + slot_i]
-        p_j = self._p[0 if slot_j is None else 1 + slot_j]
+        p_i = self._X[1 + slot_i, :, 4]
+        p_j = self._X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
         return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode)
 
@@ -290,8 +290,9 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
             gate: NIS from which the measurement counts as an outlier, None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
         """
-        blocks = mean_velocity_jacobian(self._v)
-        return self.update_linear(v_mean_W - self._v, blocks, covariance, gate, gate_mode)
+        v_W = self.v_W
+        blocks = mean_velocity_jacobian(v_W)
+        return self.update_linear(v_mean_W - v_W, blocks, covariance, gate, gate_mode)
 
     def update_position_W(
         self,
@@ -301,9 +302,9 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
         """Current position (3,) [m] with covariance (3, 3) [m^2]."""
-        H = np.zeros((3, 9))
-        H[:, 0:3], H[:, 6:9] = -skew(self._p[0]), np.eye(3)
-        return self.update_linear(p_W - self._p[0], [(0, H)], covariance, gate, gate_mode)
+        H, predicted = np.zeros((3, 9)), self.p_W
+        H[:, 0:3], H[:, 6:9] = -skew(predicted), _EYE
+        return self.update_linear(p_W - predicted, [(0, H)], covariance, gate, gate_mode)
 
     def update_linear(
         self,
@@ -408,17 +409,17 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
     def _inject(self) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
         dx = self.x[:, 0]
-        clones = dx[CORE:].reshape(self.slots, CLONE)
-        theta, rho = np.empty((2, self.slots + 1, 3))
-        theta[0], theta[1:] = dx[0:3], clones[:, :3]
-        rho[0], rho[1:] = dx[6:9], clones[:, 3:]
-        E, J = exp_and_left_jacobian(theta)
-        self._R = E @ self._R
-        self._p = (E @ self._p[:, :, None] + J @ rho[:, :, None])[:, :, 0]
-        self._v = E[0] @ self._v + J[0] @ dx[3:6]
+        xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
+        xi[0] = dx[:9].reshape(3, 3)
+        xi[1:, ::2] = dx[CORE:].reshape(self.slots, 2, 3)
+        self._X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self._X)
         self._b_g = self._b_g + dx[9:12]
         self._b_a = self._b_a + dx[12:15]
         self.x = np.zeros((self.dim_x, 1))
+
+    def _set_pose(self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray) -> None:
+        X = self._X[0]
+        X[:, :3], X[:, 3], X[:, 4] = R_WB, v_W, p_W
 
     def _check_slot(self, slot: int) -> None:
         if not 0 <= slot < self.slots or self._clone_time[slot] is None:

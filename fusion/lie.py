@@ -22,19 +22,20 @@ _HAT[0, [5, 7]] = -1.0, 1.0
 _HAT[1, [2, 6]] = 1.0, -1.0
 _HAT[2, [1, 3]] = -1.0, 1.0
 
-# Taylor coefficients in theta^2 of sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3.
+# Taylor coefficients in t^2 of (1 - cos t)/t^2 and (t - sin t)/t^3.
 _POWERS = np.arange(5.0)
 _SERIES = np.array(
     [
-        [1.0, 1.0 / 2.0, 1.0 / 6.0],
-        [-1.0 / 6.0, -1.0 / 24.0, -1.0 / 120.0],
-        [1.0 / 120.0, 1.0 / 720.0, 1.0 / 5040.0],
-        [-1.0 / 5040.0, -1.0 / 40320.0, -1.0 / 362880.0],
-        [1.0 / 362880.0, 1.0 / 3628800.0, 1.0 / 39916800.0],
+        [1.0 / 2.0, 1.0 / 6.0],
+        [-1.0 / 24.0, -1.0 / 120.0],
+        [1.0 / 720.0, 1.0 / 5040.0],
+        [-1.0 / 40320.0, -1.0 / 362880.0],
+        [1.0 / 3628800.0, 1.0 / 39916800.0],
     ]
 )
-_SERIES_LIMIT = 0.04  # theta^2 [rad^2] up to which five terms are exact to rounding
+_SERIES_LIMIT = 0.04  # t^2 [rad^2] up to which five terms are exact to rounding
 _EYE = np.eye(3)
+_ONES = np.ones(3)
 
 
 def skew(vector: FloatArray) -> FloatArray:
@@ -53,9 +54,28 @@ def exp_and_left_jacobian(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     K = skew(theta)
     KK = K @ K
-    a, b, c = np.moveaxis(_coefficients((theta * theta).sum(axis=-1)), -1, 0)[..., None, None]
-    bK = b * K
-    return _EYE + a * K + b * KK, _EYE + bK + c * KK
+    b, c = _coefficients(theta)
+    J = _EYE + b * K + c * KK
+    return _EYE + K @ J, J
+
+
+def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
+    """exp(theta, rho) X for a stack of poses, without forming the exponential.
+
+    By Rodrigues' formula in homogeneous form, exp(A) X = X + A X + b A^2 X + c A^3 X, where A maps
+    [R | p] to [K R | K p + rho] once and multiplies by K = [theta]x from then on.
+
+    Args:
+        theta: (n, 3) rotation vectors [rad].
+        rho: (n, 3, m) translation parts, one column per vector of the pose.
+        X: (n, 3, 3 + m) poses [R | vectors].
+    """
+    K = skew(theta)
+    b, c = _coefficients(theta)
+    first = K @ X
+    first[:, :, 3:] += rho
+    second = K @ first
+    return X + first + (b * _EYE + c * K) @ second
 
 
 def exp_so3(theta: FloatArray) -> FloatArray:
@@ -124,13 +144,15 @@ def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
     return np.concatenate([theta, rho[..., 0], rho[..., 1]], axis=-1)
 
 
-def _coefficients(theta_squared: FloatArray) -> FloatArray:
-    """Columns sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3, accurate down to zero."""
-    series: FloatArray = np.power.outer(theta_squared, _POWERS) @ _SERIES
-    large = theta_squared > _SERIES_LIMIT
-    if large.any():
-        t = np.sqrt(np.where(large, theta_squared, 1.0))
-        sine, half = np.sin(t), np.sin(0.5 * t)
-        closed = np.stack([sine / t, 2.0 * (half / t) ** 2, (t - sine) / t**3], axis=-1)
-        series = np.where(large[..., None], closed, series)
-    return series
+def _coefficients(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(1 - cos t)/t^2 and (t - sin t)/t^3 (..., 1, 1), accurate down to zero."""
+    squared = (theta * theta) @ _ONES
+    if (squared <= _SERIES_LIMIT).all():
+        columns = np.power.outer(squared, _POWERS) @ _SERIES
+        return columns[..., 0, None, None], columns[..., 1, None, None]
+    large = squared > _SERIES_LIMIT
+    t = np.sqrt(np.where(large, squared, 1.0))
+    columns = np.power.outer(np.where(large, 0.0, squared), _POWERS) @ _SERIES
+    b = np.where(large, 2.0 * (np.sin(0.5 * t) / t) ** 2, columns[..., 0])
+    c = np.where(large, (t - np.sin(t)) / t**3, columns[..., 1])
+    return b[..., None, None], c[..., None, None]

@@ -113,8 +113,7 @@ class Segment:
         adjoint[0:3, 0:3] = R
         adjoint[3:6, 6:9] = R
         adjoint[6:9, 3:6] = R
-        adjoint[3:6, 0:3] = skew(v) @ R
-        adjoint[6:9, 0:3] = skew(p) @ R
+        adjoint[3:9, 0:3] = (skew(np.stack((v, p))) @ R).reshape(6, 3)
         noise = adjoint @ self.pim.residualCovariance() @ adjoint.T
 
         transition = _nav_transition(self.duration, self.gravity)
@@ -183,22 +182,21 @@ def corrected_increments(
     """
     dt = time[1:] - time[:-1]
     step = dt[:, None]
-    w0, w1, a0, a1 = gyro[:-1], gyro[1:], accel[:-1], accel[1:]
-    w, a = 0.5 * (w0 + w1), 0.5 * (a0 + a1)
-    W0, W1 = skew(w0), skew(w1)
-    W = 0.5 * (W0 + W1)
-    turned = _apply(W, a)
-    sculling = _apply(W0, a1) - _apply(W1, a0)
-    rate = w + step / 12.0 * _apply(W0, w1)
-    force = a + step * (0.5 * turned + sculling / 12.0 + step / 6.0 * _apply(W, turned))
-    return dt, rate, force
+    pairs = np.stack((gyro, accel), axis=2)
+    W = skew(gyro)
+    forward = W[:-1] @ pairs[1:]  # w0 x w1, w0 x a1
+    backward = W[1:] @ pairs[:-1]  # w1 x w0, w1 x a0
+    W_mean = 0.5 * (W[:-1] + W[1:])
+    mean = 0.5 * (pairs[:-1] + pairs[1:])
+    turned = W_mean @ mean[:, :, 1:]
+    force = mean[:, :, 1] + step * (
+        (0.5 * turned + step[:, None] / 6.0 * (W_mean @ turned))[:, :, 0]
+        + (forward - backward)[:, :, 1] / 12.0
+    )
+    return dt, mean[:, :, 0] + step / 12.0 * forward[:, :, 0], force
 
 
-def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    product: FloatArray = (matrices @ vectors[:, :, None])[:, :, 0]
-    return product
-
-
+_IDENTITY = np.eye(CORE)
 _BIAS_SWAP = np.zeros((CORE, CORE))
 _BIAS_SWAP[9:12, 12:15] = np.eye(3)
 _BIAS_SWAP[12:15, 9:12] = np.eye(3)
@@ -206,7 +204,7 @@ _BIAS_SWAP[12:15, 9:12] = np.eye(3)
 
 def _nav_transition(dt: float, gravity: float) -> FloatArray:
     """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
-    transition = np.eye(CORE)
+    transition = _IDENTITY.copy()
     fall, drop = gravity * dt, 0.5 * gravity * dt * dt
     transition[3, 1], transition[4, 0] = fall, -fall
     transition[6, 1], transition[7, 0] = drop, -drop

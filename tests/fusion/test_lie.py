@@ -78,3 +78,14 @@ def test_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     singly = np.stack([lie.exp_so3(row) for row in theta])
     np.testing.assert_allclose(lie.exp_so3(theta), singly, atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_times_is_the_product_with_the_exponential(angle: float) -> None:
+    rng = np.random.default_rng(2)
+    theta = rotation_vectors(angle)
+    rho, X = rng.normal(size=(5, 3, 2)), rng.normal(size=(5, 3, 5))
+    R, J = lie.exp_and_left_jacobian(theta)
+    expected = R @ X
+    expected[:, :, 3:] += J @ rho
+    np.testing.assert_allclose(lie.exp_times(theta, rho, X), expected, atol=1e-13)
