@@ -1,0 +1,135 @@
+"""Attitude from the IMU alone: gravity initialisation and a levelled integration.
+
+N is the frame this attitude is given in: gravity-aligned like W, its yaw zero at the start and
+drifting with the gyroscope. It needs neither truth nor network, so that windows can be prepared
+before any filter runs, and streaming and batch see the same ones.
+
+The tilt is corrected by a proportional-integral loop (Mahony et al. 2008): the specific force,
+averaged over an update period and seen in N, should point up; the mean of a walker's acceleration
+vanishes over the loop's time constant. The integral is the horizontal gyroscope bias in N.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.lie import exp_so3
+from stario.fusion.preintegration import corrected_increments
+from stario.sequences.rotations import tilt_aligning
+from stario.sequences.sequence import FloatArray
+
+STILL_ACCEL = 0.3
+"""Deviation of the specific force [m/s^2] below which a device counts as held still."""
+
+STILL_GYRO = 0.1
+"""Root mean square rate [rad/s] below which a device counts as held still."""
+
+_START_UP = 3.0
+"""Time constant [s] from which the loop's rate falls to its final one."""
+
+
+@dataclass(frozen=True, eq=False)
+class GravityStart:
+    """First attitude from gravity.
+
+    Attributes:
+        R_WB: (3, 3) at the first sample, yaw zero.
+        still: whether the device was at rest, so that the tilt can be trusted.
+        b_g: (3,) mean rate while still [rad/s]; None when moving.
+    """
+
+    R_WB: FloatArray
+    still: bool
+
+
+def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> GravityStart:
+    """Level the first attitude by the mean specific force of a short stretch.
+
+    The samples are turned into the first sample's axes with the gyroscope before averaging, so
+    that the stretch may be one of motion.
+
+    Args:
+        time: (n + 1,) [s], about one second.
+        gyro: (n + 1, 3) [rad/s] in B.
+        accel: (n + 1, 3) [m/s^2] in B.
+    """
+    R_0B = integrate(np.eye(3), time, gyro)
+    force_0 = (R_0B @ accel[:, :, None])[:, :, 0]
+    still = bool(
+        np.linalg.norm(force_0.std(axis=0)) < STILL_ACCEL
+        and math.sqrt(float((gyro**2).sum(axis=1).mean())) < STILL_GYRO
+    )
+    return GravityStart(tilt_aligning(force_0.mean(axis=0)).as_matrix(), still)
+
+
+def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
+    """Attitudes (n + 1, 3, 3) at the samples from the one at the first sample."""
+    dt, rate, _ = corrected_increments(time, gyro, np.zeros_like(gyro))
+    w, x, y, z = 1.0, 0.0, 0.0, 0.0
+    quaternions = [(x, y, z, w)]
+    for (rx, ry, rz), step in zip(rate.tolist(), dt.tolist(), strict=True):
+        hx, hy, hz = 0.5 * step * rx, 0.5 * step * ry, 0.5 * step * rz
+        half = math.sqrt(hx * hx + hy * hy + hz * hz)
+        s = math.sin(half) / half if half > 1e-12 else 1.0
+        c = math.cos(half)
+        hx, hy, hz = s * hx, s * hy, s * hz
+        w, x, y, z = (
+            w * c - x * hx - y * hy - z * hz,
+            w * hx + x * c + y * hz - z * hy,
+            w * hy - x * hz + y * c + z * hx,
+            w * hz + x * hy - y * hx + z * c,
+        )
+        quaternions.append((x, y, z, w))
+    matrices: FloatArray = R_NB @ Rotation.from_quat(quaternions).as_matrix()
+    return matrices
+
+
+class LevelledAttitude:
+    """Attitude R_NB, integrated from the gyroscope and levelled by the accelerometer.
+
+    Args:
+        R_NB: (3, 3) at the start.
+        rate: natural frequency of the levelling loop [rad/s].
+    """
+
+    def __init__(self, R_NB: FloatArray, rate: float) -> None:
+        self.R_NB = R_NB
+        self._rate = rate
+        self._bias_N = np.zeros(3)
+        self._since_start = 0.0
+
+    def advance(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+        """Move over one update period and return the attitudes (n + 1, 3, 3) at its samples.
+
+        Args:
+            time: (n + 1,) [s].
+            gyro: (n + 1, 3) [rad/s] in B.
+            accel: (n + 1, 3) [m/s^2] in B.
+        """
+        corrected = gyro - self.R_NB.T @ self._bias_N
+        attitudes = integrate(self.R_NB, time, corrected)
+        self.R_NB = self._levelled(attitudes, time, accel)
+        return attitudes
+
+    def restart(self) -> None:
+        """After a gap the tilt is not known well: level quickly again."""
+        self._since_start = 0.0
+
+    def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
+        dt = float(time[-1] - time[0])
+        force_N = (attitudes @ accel[:, :, None])[:, :, 0]
+        weights = np.gradient(time)
+        up = weights @ force_N
+        up /= np.linalg.norm(up)
+        self._since_start += dt
+        loop = max(self._rate, 1.0 / (_START_UP + self._since_start))
+        # The smallest turn that takes `up` to the vertical, to first order; none about it.
+        error = np.array([up[1], -up[0], 0.0])
+        if loop <= self._rate:
+            self._bias_N -= self._rate**2 * dt * error
+        turned: FloatArray = exp_so3(1.414 * loop * dt * error) @ attitudes[-1]
+        return turned

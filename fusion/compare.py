@@ -1,0 +1,118 @@
+"""Tracks of one recording side by side, measured against its truth where there is one."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.navigator import Navigator, Predictor, Progress
+from stario.fusion.state import Track
+from stario.fusion.tracks import inertial_track, network_track, network_track_true_attitude
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import CONVENTIONS, align, evaluate_track, position_nees
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.walks import WalkStyle, generate_walk
+
+log = logging.getLogger(__name__)
+
+TRACKS = ("inertial", "network", "network_true_attitude", "ekf")
+
+DEMONSTRATION_SEED = 2**31 + 2026
+"""Of the bundled demonstration; training draws its seeds below 2^31, so it never saw this walk."""
+
+Metrics = dict[str, float | None]
+
+METRIC_WORDS = {
+    **CONVENTIONS,
+    "nees": "median over time of the 3-D position's NEES, aligned at the start (expected: 3)",
+    "nis": "mean NIS of the network's measurements (expected: 3)",
+    "seconds_network": "computing time of the network [s]",
+    "seconds_filter": "computing time of everything but the network [s]",
+    "alignment": "yaw and position of the first common pose; tilt is never aligned",
+}
+"""What every figure in `metrics.json` means."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The tracks of one recording.
+
+    Attributes:
+        sequence: the recording.
+        tracks: by name, in the order of `TRACKS`; without truth there is no
+            "network_true_attitude".
+        metrics: by track name.
+    """
+
+    sequence: ImuSequence
+    tracks: dict[str, Track]
+    metrics: dict[str, Metrics]
+
+    @property
+    def path_m(self) -> float | None:
+        """Length of the true way [m], None without truth."""
+        truth = self.sequence.truth
+        return None if truth is None else truth.path_length()
+
+    def as_dict(self) -> dict[str, object]:
+        """The recording's entry in `metrics.json`."""
+        tracks = {name: self.metrics.get(name) for name in TRACKS}
+        return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
+
+    def aligned(self) -> dict[str, Trajectory]:
+        """Trajectories for figures: aligned with the truth at the start where there is one."""
+        truth = self.sequence.truth
+        raw = {name: track.trajectory for name, track in self.tracks.items()}
+        if truth is None:
+            return raw
+        return {name: align(track, truth, "first") for name, track in raw.items()}
+
+
+def compare(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    progress: Progress = lambda share: None,
+) -> Comparison:
+    """Every track of a recording; the network sees each window once.
+
+    Raises:
+        InputError: the recording is too short, or its units or rate are wrong.
+    """
+    navigator = Navigator(model, config)
+    observed = navigator.observe(sequence, progress)
+    tracks = {
+        "inertial": inertial_track(observed, config),
+        "network": network_track(observed),
+    }
+    if sequence.truth is not None:
+        try:
+            tracks["network_true_attitude"] = network_track_true_attitude(model, sequence, config)
+        except InputError as error:
+            log.warning("no track with true attitude: %s", error)
+    tracks["ekf"] = navigator.track(observed, progress)
+    metrics = {name: measure(track, sequence.truth) for name, track in tracks.items()}
+    return Comparison(sequence, tracks, metrics)
+
+
+def measure(track: Track, truth: Trajectory | None) -> Metrics:
+    """Figures of one track; null where there is no truth, or no covariance."""
+    figures: Metrics = dict.fromkeys(("ate_m", "rte_m", "pde", "aye_rad", "nees"))
+    if truth is not None:
+        result = evaluate_track(track.trajectory, truth)
+        figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
+        if track.trajectory.position_covariance_W is not None:
+            figures["nees"] = position_nees(track.trajectory, truth).median
+    figures["nis"] = track.nis
+    figures["seconds_network"] = track.seconds_network
+    figures["seconds_filter"] = track.seconds_filter
+    return figures
+
+
+def demonstration() -> ImuSequence:
+    """The bundled demonstration: a simulated phone carried in the hand for two minutes."""
+    style = WalkStyle(carry="handheld", preferred_speed=1.1, mount_rotvec=(0.3, -0.2, 0.9))
+    walk = generate_walk(DEMONSTRATION_SEED, duration=120.0, style=style)
+    return simulate_imu(walk, 200.0, PHONE_IMU, DEMONSTRATION_SEED, name="demonstration")

@@ -1,0 +1,179 @@
+"""Configuration: frozen groups, each field with its unit and default.
+
+A file (TOML or JSON) may set any of them; an unknown key is refused. The configuration a run used
+is saved beside its results and can be given to the next run as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WINDOW_SECONDS
+
+UPDATE_RATES = (1, 2, 4, 5, 10, 20)
+"""Updates per second for which the window's start falls on an earlier update."""
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """The state-cloning EKF.
+
+    Attributes:
+        update_rate: network updates per second.
+        measurement: "displacement" between clones, or "velocity" (mean over the window, no clones).
+        covariance_scale: factor on the network's covariance beyond update_rate x window length,
+            which accounts for overlapping windows; it covers errors that persist over windows.
+        gate: probability of the chi-square test; beyond it the covariance is inflated.
+        tilt_sigma: of the first attitude when the device is moving [rad].
+        yaw_sigma: of the first attitude's yaw [rad]; small, since the start defines the yaw.
+        velocity_sigma: of the first velocity, taken as zero [m/s].
+        gyro_bias_sigma: of the first gyroscope bias [rad/s].
+        accel_bias_sigma: of the first accelerometer bias [m/s^2].
+        gyro_motion_noise: white noise that grows with the rate, from scale and alignment errors
+            [rad/s/sqrt(Hz) per rad/s].
+        accel_motion_noise: white noise that grows with the linear acceleration
+            [m/s^2/sqrt(Hz) per m/s^2].
+        gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
+        gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
+    """
+
+    update_rate: int = 10
+    measurement: str = "displacement"
+    covariance_scale: float = 1.0
+    gate: float = 0.997
+    tilt_sigma: float = 0.05
+    yaw_sigma: float = 1e-3
+    velocity_sigma: float = 1.0
+    gyro_bias_sigma: float = 3e-3
+    accel_bias_sigma: float = 0.05
+    gyro_motion_noise: float = 0.0
+    accel_motion_noise: float = 0.0
+    gap_gyro_noise: float = 0.3
+    gap_accel_noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.update_rate not in UPDATE_RATES:
+            raise ConfigError("update_rate", repr(self.update_rate), f"one of {UPDATE_RATES}")
+        if self.measurement not in ("displacement", "velocity"):
+            raise ConfigError("measurement", repr(self.measurement), "displacement or velocity")
+        if not 0.5 <= self.gate < 1.0:
+            raise ConfigError("gate", repr(self.gate), "a probability from 0.5 to below 1")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
+                raise ConfigError(item.name, repr(value), "a finite value >= 0")
+
+    @property
+    def period(self) -> float:
+        """Time between updates [s]."""
+        return 1.0 / self.update_rate
+
+    @property
+    def window_updates(self) -> int:
+        """Updates per window: how many clones are held."""
+        return round(self.update_rate * WINDOW_SECONDS)
+
+    @property
+    def overlap_scale(self) -> float:
+        """Factor on the network's covariance: the same motion is measured this many times."""
+        return self.update_rate * WINDOW_SECONDS * self.covariance_scale
+
+
+@dataclass(frozen=True)
+class NavigatorConfig:
+    """Everything a run depends on besides the recording and the weights.
+
+    Attributes:
+        noise: densities of the IMU as the filter assumes them.
+        filter: the EKF.
+        gravity: magnitude [m/s^2].
+        levelling_rate: natural frequency of the loop that levels the attitude [rad/s].
+    """
+
+    noise: ImuNoise = field(
+        default_factory=lambda: ImuNoise(
+            gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3
+        )
+    )
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    gravity: float = STANDARD_GRAVITY
+    levelling_rate: float = 0.06
+
+    def __post_init__(self) -> None:
+        if not 9.5 < self.gravity < 10.1:
+            raise ConfigError("gravity", repr(self.gravity), "9.5 to 10.1 m/s^2")
+        if not 0.0 < self.levelling_rate < 10.0:
+            raise ConfigError("levelling_rate", repr(self.levelling_rate), "0 to 10 rad/s")
+
+
+_GROUPS: dict[str, type] = {"noise": ImuNoise, "filter": FilterConfig}
+
+
+def config_from_dict(values: dict[str, Any]) -> NavigatorConfig:
+    """A configuration from plain values; what is not given keeps its default.
+
+    Raises:
+        ConfigError: a key is unknown or a value does not fit.
+    """
+    _refuse_unknown("", values, NavigatorConfig)
+    default = NavigatorConfig()
+    arguments: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in _GROUPS:
+            if not isinstance(value, dict):
+                raise ConfigError(name, repr(value), "a table of values")
+            _refuse_unknown(f"{name}.", value, _GROUPS[name])
+            for key, entry in value.items():
+                _check_type(f"{name}.{key}", entry, getattr(getattr(default, name), key))
+            value = _built(_GROUPS[name], {**asdict(getattr(default, name)), **value}, name)
+        else:
+            _check_type(name, value, getattr(default, name))
+        arguments[name] = value
+    return NavigatorConfig(**arguments)
+
+
+def read_config(path: Path | str) -> NavigatorConfig:
+    """A configuration from a TOML or JSON file.
+
+    Raises:
+        ConfigError: the file is missing or malformed, a key is unknown or a value does not fit.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except FileNotFoundError:
+        raise ConfigError(str(path), "nothing there", "a TOML or JSON file") from None
+    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise ConfigError(str(path), str(error), "a TOML or JSON file") from error
+    if not isinstance(values, dict):
+        raise ConfigError(str(path), type(values).__name__, "a table of values")
+    return config_from_dict(values)
+
+
+def _built(group: type, values: dict[str, Any], name: str) -> Any:
+    try:
+        return group(**values)
+    except InputError as error:
+        raise ConfigError(f"{name}.{error.field}", error.found, error.expected) from error
+
+
+def _check_type(name: str, value: object, default: object) -> None:
+    wanted = (int, float) if isinstance(default, float) else type(default)
+    if not isinstance(value, wanted) or isinstance(value, bool):
+        raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
+
+
+def _refuse_unknown(prefix: str, values: dict[str, Any], group: type) -> None:
+    known = [f.name for f in fields(group)]
+    for name in values:
+        if name not in known:
+            raise ConfigError(f"{prefix}{name}", "an unknown key", f"one of {', '.join(known)}")

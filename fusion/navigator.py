@@ -1,0 +1,200 @@
+"""The navigator: one recipe for streams and recordings.
+
+Samples become epochs (`intake`), the windows of epochs become displacements (the network), and
+both move the filter (`recipe`). A stream does this sample by sample; a recording lets the network
+see many windows at once. As the intake does not depend on the filter both give the same track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.intake import Epoch, Intake, all_epochs
+from stario.fusion.recipe import FilterRecipe, Measurement
+from stario.fusion.state import Health, NavState, Track, track_from_states
+from stario.sequences.checks import check_units
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import WINDOW_SECONDS
+
+Vector = Sequence[float] | FloatArray
+"""Three numbers."""
+
+Progress = Callable[[float], None]
+"""Called with the share of the work done, 0 to 1."""
+
+
+class Predictor(Protocol):
+    """What a navigator needs of a model; `DisplacementModel` is one."""
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """A recording as the filter sees it: epochs, and the network's word on each window.
+
+    Attributes:
+        epochs: in order.
+        measurements: one for each epoch, None where there is no window.
+        intake: with its counts and the start.
+        seconds_intake: computing time [s].
+        seconds_network: computing time [s].
+    """
+
+    epochs: list[Epoch]
+    measurements: list[Measurement | None]
+    intake: Intake
+    seconds_intake: float
+    seconds_network: float
+
+
+class Navigator:
+    """Inertial navigation with a displacement network.
+
+    Args:
+        model: a `DisplacementModel`, or anything with its `predict`.
+        config: noise, filter, gravity; the defaults are those of handheld devices.
+    """
+
+    def __init__(self, model: Predictor, config: NavigatorConfig | None = None) -> None:
+        self.model = model
+        self.config = config or NavigatorConfig()
+        self._intake = Intake(self.config)
+        self._recipe: FilterRecipe | None = None
+
+    def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
+        """Take in one sample of a stream.
+
+        Samples that are not finite, repeated or late are dropped and counted (`health`); gaps are
+        noticed by themselves. The first state comes one second after the first sample.
+
+        Args:
+            time: [s].
+            gyro: (3,) angular rate in B [rad/s].
+            accel: (3,) specific force in B [m/s^2].
+
+        Returns:
+            The newest state if this sample completed an update period, else None.
+
+        Raises:
+            InputError: gyro or accel does not hold three numbers.
+        """
+        sample = (float(time), *_three("gyro", gyro), *_three("accel", accel))
+        state = None
+        for epoch in self._intake.push(sample):
+            state = self._advance(epoch)
+        return state
+
+    @property
+    def state(self) -> NavState | None:
+        """The newest state of the stream, None before the first second is over."""
+        return None if self._recipe is None else self._recipe.state()
+
+    @property
+    def health(self) -> Health:
+        """The stream's report so far."""
+        if self._recipe is None:
+            counts = self._intake.counts
+            return Health(samples={"used": counts.used, "not_finite": counts.not_finite})
+        return self._recipe.health(self._intake.counts)
+
+    def run(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Track:
+        """The fused track of a recording; its truth is never looked at.
+
+        Does not touch the stream of `push`.
+
+        Args:
+            sequence: the recording.
+            progress: called now and then with the share of the work done.
+
+        Raises:
+            InputError: the recording is shorter than two seconds, or its units or rate are wrong.
+        """
+        return self.track(self.observe(sequence, progress), progress)
+
+    def observe(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Observed:
+        """Prepare a recording and let the network see its windows.
+
+        Raises:
+            InputError: as for `run`.
+        """
+        check_units(sequence)
+        began = perf_counter()
+        epochs, intake = all_epochs(sequence, self.config)
+        if intake.start is None or not any(e.window is not None for e in epochs):
+            raise InputError(
+                f"{sequence.name}: samples",
+                f"{intake.counts.used} usable over {sequence.duration:.2f} s",
+                f"an unbroken stretch of at least {2 * WINDOW_SECONDS:g} s",
+            )
+        seconds_intake = perf_counter() - began
+        progress(0.1)
+        began = perf_counter()
+        measurements = self._measure(epochs, progress)
+        return Observed(epochs, measurements, intake, seconds_intake, perf_counter() - began)
+
+    def track(self, observed: Observed, progress: Progress = lambda share: None) -> Track:
+        """The filter's track of a prepared recording."""
+        began = perf_counter()
+        start = observed.intake.start
+        assert start is not None  # observe() refuses recordings without one
+        recipe = FilterRecipe(self.config, start)
+        states = [recipe.state()]
+        for k, (epoch, measurement) in enumerate(
+            zip(observed.epochs, observed.measurements, strict=True)
+        ):
+            states.append(recipe.step(epoch, measurement))
+            if k % 500 == 0:
+                progress(0.6 + 0.4 * k / len(observed.epochs))
+        progress(1.0)
+        return track_from_states(
+            states,
+            recipe.innovations(),
+            recipe.health(observed.intake.counts),
+            seconds_network=observed.seconds_network,
+            seconds_filter=observed.seconds_intake + perf_counter() - began,
+        )
+
+    def _measure(self, epochs: Sequence[Epoch], progress: Progress) -> list[Measurement | None]:
+        measurements: list[Measurement | None] = [None] * len(epochs)
+        with_window = [k for k, epoch in enumerate(epochs) if epoch.window is not None]
+        for begin in range(0, len(with_window), 512):
+            part = with_window[begin : begin + 512]
+            mean, covariance = self.model.predict(np.stack([_window(epochs[k]) for k in part]))
+            for k, d_N, cov_N in zip(part, mean, covariance, strict=True):
+                measurements[k] = (d_N, cov_N)
+            progress(0.1 + 0.5 * (begin + len(part)) / len(with_window))
+        return measurements
+
+    def _advance(self, epoch: Epoch) -> NavState:
+        if self._recipe is None:
+            assert self._intake.start is not None  # set before the first epoch
+            self._recipe = FilterRecipe(self.config, self._intake.start, keep_innovations=False)
+        measurement = None
+        if epoch.window is not None:
+            mean, covariance = self.model.predict(epoch.window[None])
+            measurement = (mean[0], covariance[0])
+        return self._recipe.step(epoch, measurement)
+
+
+def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    assert epoch.window is not None  # only epochs that have one are asked
+    return epoch.window
+
+
+def _three(name: str, value: Vector) -> tuple[float, float, float]:
+    try:
+        x, y, z = map(float, value)
+    except (TypeError, ValueError):
+        raise InputError(name, repr(value), "three numbers in body axes") from None
+    return x, y, z

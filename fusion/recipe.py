@@ -1,0 +1,244 @@
+"""The filter's recipe for one epoch: propagate, measure, update, clone, report.
+
+Derivation: error, transition and measurement as in `stario.fusion.ekf`; the displacement between
+clones follows TLIO (Liu et al. 2020), on the right-invariant error (Barrau and Bonnabel 2017).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.ekf import StateCloningEkf, UpdateResult
+from stario.fusion.intake import Epoch, IntakeCounts, Start
+from stario.fusion.preintegration import Segment, preintegrate
+from stario.fusion.state import Health, Innovations, NavState
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import WINDOW_SECONDS
+
+STILL_TILT_SIGMA = 0.01
+"""Of the first attitude when the device was at rest [rad]."""
+
+START_POSITION_SIGMA = 1e-3
+"""The start defines the position; a little keeps the covariance positive definite [m]."""
+
+Measurement = tuple[FloatArray, FloatArray]
+"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
+
+
+class FilterRecipe:
+    """The state-cloning EKF driven by epochs.
+
+    Args:
+        config: noise and filter settings.
+        start: time and levelled attitude of the first sample.
+        keep_innovations: False for streams, whose memory must not grow.
+    """
+
+    def __init__(
+        self, config: NavigatorConfig, start: Start, keep_innovations: bool = True
+    ) -> None:
+        self._config = config
+        self._uses_clones = config.filter.measurement == "displacement"
+        self.ekf = StateCloningEkf(
+            slots=config.filter.window_updates if self._uses_clones else 0, gravity=config.gravity
+        )
+        self._slots: deque[int] = deque()
+        self._velocity_steps: deque[FloatArray] = deque(maxlen=config.filter.window_updates)
+        self._gate = float(chi2.ppf(config.filter.gate, 3))
+        self._log = _InnovationLog(keep_innovations)
+        self._initialise(start)
+
+    def step(self, epoch: Epoch, measurement: Measurement | None) -> NavState:
+        """Move to the epoch's end and take in the measurement of the window that ends there."""
+        if epoch.gap:
+            self._forget_window()
+        before = self.ekf.v_W
+        self.ekf.propagate(self._segment(epoch))
+        self._velocity_steps.append(self.ekf.v_W - before)
+        if measurement is not None:
+            self._update(epoch, measurement)
+        if self._uses_clones:
+            self._clone(epoch.stop)
+        return self.state(in_gap=epoch.gap)
+
+    def state(self, in_gap: bool = False) -> NavState:
+        """The estimate now."""
+        ekf = self.ekf
+        return NavState(
+            time=ekf.time,
+            R_WB=ekf.R_WB,
+            v_W=ekf.v_W,
+            p_W=ekf.p_W,
+            b_g=ekf.b_g,
+            b_a=ekf.b_a,
+            covariance=ekf.world_covariance(),
+            in_gap=in_gap,
+        )
+
+    def innovations(self) -> Innovations:
+        """Every innovation so far."""
+        return self._log.stacked()
+
+    def health(self, counts: IntakeCounts) -> Health:
+        """The report so far."""
+        return self._log.health(counts, self.state())
+
+    def _initialise(self, start: Start) -> None:
+        f = self._config.filter
+        tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+        sigma = [tilt, tilt, max(f.yaw_sigma, 1e-6)]
+        sigma += [max(f.velocity_sigma, 1e-6)] * 3 + [START_POSITION_SIGMA] * 3
+        sigma += [max(f.gyro_bias_sigma, 1e-9)] * 3 + [max(f.accel_bias_sigma, 1e-9)] * 3
+        zero = np.zeros(3)
+        covariance = np.diag(np.square(sigma))
+        self.ekf.initialise(start.time, start.R_WB, zero, zero, zero, zero, covariance)
+        if self._uses_clones:
+            self._clone(start.time)
+
+    def _segment(self, epoch: Epoch) -> Segment:
+        config, ekf = self._config, self.ekf
+        if epoch.gap:
+            return self._unseen_segment(epoch)
+        noise = self._noise(epoch)
+        return preintegrate(
+            epoch.time, epoch.gyro, epoch.accel, ekf.b_g, ekf.b_a, noise, config.gravity
+        )
+
+    def _unseen_segment(self, epoch: Epoch) -> Segment:
+        """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
+        config, ekf = self._config, self.ekf
+        hover = ekf.R_WB.T @ [0.0, 0.0, config.gravity] + ekf.b_a
+        noise = replace(
+            config.noise,
+            gyro_noise=config.filter.gap_gyro_noise,
+            accel_noise=config.filter.gap_accel_noise,
+        )
+        gyro, accel = np.tile(ekf.b_g, (2, 1)), np.tile(hover, (2, 1))
+        return preintegrate(epoch.time, gyro, accel, ekf.b_g, ekf.b_a, noise, config.gravity)
+
+    def _noise(self, epoch: Epoch) -> ImuNoise:
+        """White noise that grows with motion: scale and alignment errors act like it."""
+        noise, f = self._config.noise, self._config.filter
+        if f.gyro_motion_noise == 0.0 and f.accel_motion_noise == 0.0:
+            return noise
+        rate = math.sqrt(float(np.square(epoch.gyro).sum() / len(epoch.gyro)))
+        excess = np.linalg.norm(epoch.accel, axis=1) - self._config.gravity
+        motion = math.sqrt(float(np.square(excess).mean()))
+        return replace(
+            noise,
+            gyro_noise=math.hypot(noise.gyro_noise, f.gyro_motion_noise * rate),
+            accel_noise=math.hypot(noise.accel_noise, f.accel_motion_noise * motion),
+        )
+
+    def _update(self, epoch: Epoch, measurement: Measurement) -> None:
+        displacement_N, covariance_N = measurement
+        covariance_N = covariance_N * self._config.filter.overlap_scale
+        if self._uses_clones:
+            slot = self._slots[0]
+            R_WN = _yaw_between(self.ekf.clone_pose(slot)[0], epoch.R_NB_window)
+            result = self.ekf.update_displacement(
+                slot, None, R_WN @ displacement_N, R_WN @ covariance_N @ R_WN.T, self._gate
+            )
+        else:
+            R_WN = _yaw_between(self.ekf.R_WB, epoch.R_NB)
+            mean_W = R_WN @ displacement_N / WINDOW_SECONDS
+            covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
+            result = self.ekf.update_mean_velocity(
+                mean_W + self._velocity_gain(), covariance, self._gate
+            )
+        self._log.add(epoch.stop, self.ekf, result)
+
+    def _velocity_gain(self) -> FloatArray:
+        """Current velocity minus its mean over the window, from the IMU alone (trapezoids)."""
+        gain, n = np.zeros(3), len(self._velocity_steps)
+        for age, step in enumerate(reversed(self._velocity_steps)):
+            gain += step * (n - age - 0.5) / n
+        return gain
+
+    def _clone(self, time: float) -> None:
+        if len(self._slots) == self.ekf.slots:
+            self.ekf.release(self._slots.popleft())
+        self._slots.append(self.ekf.clone(time))
+
+    def _forget_window(self) -> None:
+        """No displacement spans a gap: its clones are of no more use."""
+        while self._slots:
+            self.ekf.release(self._slots.popleft())
+        self._velocity_steps.clear()
+
+
+def _yaw_between(R_WB: FloatArray, R_NB: FloatArray | None) -> FloatArray:
+    """R_WN about the vertical: from the levelled frame's yaw to the estimated world's."""
+    assert R_NB is not None  # a window always comes with the attitude it started at
+    R = R_WB @ R_NB.T
+    sine, cosine = R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]
+    norm = math.hypot(sine, cosine)
+    s, c = (sine / norm, cosine / norm) if norm > 0.0 else (0.0, 1.0)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+class _InnovationLog:
+    """Innovations of the filter's updates and their statistics."""
+
+    def __init__(self, keep_rows: bool) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._offered = self._gated = 0
+        self._refused: dict[str, int] = {}
+        self._nis_sum, self._nis_count = 0.0, 0
+        self._keep_rows = keep_rows
+
+    def add(self, time: float, ekf: StateCloningEkf, result: UpdateResult) -> None:
+        self._offered += 1
+        if not result.accepted:
+            self._refused[result.reason] = self._refused.get(result.reason, 0) + 1
+            return
+        gated = result.scale > 1.0
+        self._gated += gated
+        self._nis_sum += result.nis
+        self._nis_count += 1
+        if self._keep_rows:
+            residual = np.ravel(ekf.y)
+            sigma = np.sqrt(np.diag(ekf.S))
+            self._rows.append((time, *residual, *sigma, result.nis, float(gated)))
+
+    def stacked(self) -> Innovations:
+        table = np.array(self._rows).reshape(-1, 9)
+        return Innovations(
+            time=table[:, 0],
+            residual_W=table[:, 1:4],
+            sigma=table[:, 4:7],
+            nis=table[:, 7],
+            gated=table[:, 8] > 0.5,
+        )
+
+    def health(self, counts: IntakeCounts, state: NavState) -> Health:
+        sigma = np.sqrt(np.diag(state.covariance))
+        groups = {
+            "tilt_rad": sigma[0:2],
+            "yaw_rad": sigma[2:3],
+            "velocity_m_s": sigma[3:6],
+            "position_m": sigma[6:9],
+            "gyro_bias_rad_s": sigma[9:12],
+            "accel_bias_m_s2": sigma[12:15],
+        }
+        return Health(
+            samples={
+                "used": counts.used,
+                "not_finite": counts.not_finite,
+                "duplicate": counts.duplicate,
+                "out_of_order": counts.out_of_order,
+            },
+            gaps=list(counts.gaps),
+            updates=self._offered,
+            gated=self._gated,
+            refused=dict(self._refused),
+            mean_nis=self._nis_sum / self._nis_count if self._nis_count else math.nan,
+            final_sigma={name: float(np.max(values)) for name, values in groups.items()},
+        )

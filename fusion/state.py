@@ -1,0 +1,178 @@
+"""What a navigator gives back: states, tracks, innovations and the health report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class NavState:
+    """The estimate at one time.
+
+    Attributes:
+        time: [s].
+        R_WB: (3, 3) attitude, body to world.
+        v_W: (3,) velocity [m/s].
+        p_W: (3,) position [m], zero at the start.
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        covariance: (15, 15) of rotation about the world's axes [rad], velocity, position, b_g, b_a;
+            each error is true minus estimate.
+        in_gap: True right after a stretch without samples.
+    """
+
+    time: float
+    R_WB: FloatArray
+    v_W: FloatArray
+    p_W: FloatArray
+    b_g: FloatArray
+    b_a: FloatArray
+    covariance: FloatArray
+    in_gap: bool = False
+
+    @property
+    def quat_xyzw(self) -> FloatArray:
+        """Attitude as a unit quaternion (4,), x y z w."""
+        return np.asarray(Rotation.from_matrix(self.R_WB).as_quat())
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Measured minus predicted displacement of every update.
+
+    Attributes:
+        time: (M,) end of the window [s].
+        residual_W: (M, 3) [m] (or [m/s] where mean velocities are measured).
+        sigma: (M, 3) standard deviations the filter expects.
+        nis: (M,) normalised innovation squared, before any inflation.
+        gated: (M,) whether the covariance was inflated.
+    """
+
+    time: FloatArray
+    residual_W: FloatArray
+    sigma: FloatArray
+    nis: FloatArray
+    gated: BoolArray
+
+
+@dataclass
+class Health:
+    """What happened during a run, counted by reason.
+
+    Attributes:
+        samples: used, and dropped by reason.
+        gaps: start and length [s] of each stretch without samples.
+        updates: network measurements offered.
+        gated: of these, how many had their covariance inflated.
+        refused: of these, how many were left out, by reason.
+        mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
+        nis_expected: degrees of freedom of a measurement.
+        final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
+            [m], biases [rad/s], [m/s^2].
+    """
+
+    samples: dict[str, int] = field(default_factory=dict)
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    updates: int = 0
+    gated: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    mean_nis: float = float("nan")
+    nis_expected: int = 3
+    final_sigma: dict[str, float] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """The report for a person."""
+        dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
+        text = [f"samples used {self.samples.get('used', 0)}, dropped {dropped or 'none'}"]
+        longest = max((length for _, length in self.gaps), default=0.0)
+        text.append(f"gaps {len(self.gaps)}, longest {longest:.2f} s")
+        share = self.gated / self.updates if self.updates else 0.0
+        text.append(
+            f"updates {self.updates}, gated {share:.1%}, refused {self.refused or 'none'}, "
+            f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+        )
+        sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
+        return [*text, f"final sigma: {sigma}"]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """An estimated track.
+
+    Attributes:
+        trajectory: poses, velocities and position covariances at the update times.
+        b_g: (N, 3) gyroscope bias [rad/s], None where the track has none.
+        b_a: (N, 3) accelerometer bias [m/s^2], None where the track has none.
+        covariance: (N, 15, 15) as in `NavState`, None where the track has none.
+        innovations: of the network's measurements, None where there is no filter.
+        health: counts and statistics of the run, None where there is no filter.
+        seconds_network: computing time of the network [s].
+        seconds_filter: computing time of everything else [s].
+    """
+
+    trajectory: Trajectory
+    b_g: FloatArray | None = None
+    b_a: FloatArray | None = None
+    covariance: FloatArray | None = None
+    innovations: Innovations | None = None
+    health: Health | None = None
+    seconds_network: float = 0.0
+    seconds_filter: float = 0.0
+
+    @property
+    def time(self) -> FloatArray:
+        """(N,) [s]."""
+        return self.trajectory.time
+
+    @property
+    def nis(self) -> float | None:
+        """Mean NIS, None without a filter."""
+        return None if self.health is None else self.health.mean_nis
+
+    def arrays(self) -> dict[str, Any]:
+        """Everything by name, for an npz file."""
+        known = {
+            "time": self.time,
+            "position_W": self.trajectory.position_W,
+            "quat_xyzw_WB": self.trajectory.quat_xyzw,
+            "velocity_W": self.trajectory.velocity_W,
+            "valid": self.trajectory.valid,
+            "gyro_bias_B": self.b_g,
+            "accel_bias_B": self.b_a,
+            "covariance": self.covariance,
+        }
+        return {name: value for name, value in known.items() if value is not None}
+
+
+def track_from_states(
+    states: list[NavState],
+    innovations: Innovations,
+    health: Health,
+    seconds_network: float,
+    seconds_filter: float,
+) -> Track:
+    """Stack states into a track; the first state behind a gap is marked not valid."""
+    covariance = np.array([s.covariance for s in states])
+    trajectory = Trajectory(
+        time=np.array([s.time for s in states]),
+        position_W=np.array([s.p_W for s in states]),
+        attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
+        velocity_W=np.array([s.v_W for s in states]),
+        position_covariance_W=covariance[:, 6:9, 6:9],
+    )
+    return Track(
+        trajectory=trajectory,
+        b_g=np.array([s.b_g for s in states]),
+        b_a=np.array([s.b_a for s in states]),
+        covariance=covariance,
+        innovations=innovations,
+        health=health,
+        seconds_network=seconds_network,
+        seconds_filter=seconds_filter,
+    )

@@ -1,0 +1,134 @@
+"""Tracks to compare with the filter's: the IMU alone, and the network alone.
+
+The network's displacements become a track by taking each window's mean velocity as the velocity
+at its middle and integrating: every overlapping window counts alike.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.navigator import Observed, Predictor
+from stario.fusion.preintegration import preintegrate
+from stario.fusion.state import Track
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.windows import (
+    MAX_IMU_GAP,
+    WINDOW_RATE,
+    WINDOW_SAMPLES,
+    WINDOW_SECONDS,
+    clean_samples,
+    resample,
+)
+
+
+def inertial_track(observed: Observed, config: NavigatorConfig) -> Track:
+    """Strapdown integration alone, from the levelled start at rest, biases taken as zero."""
+    began = perf_counter()
+    start = observed.intake.start
+    assert start is not None  # observe() refuses recordings without one
+    zero = np.zeros(3)
+    R, v, p = start.R_WB, zero, zero
+    rows = [(start.time, R, v, p)]
+    for epoch in observed.epochs:
+        if epoch.gap:
+            p = p + v * (epoch.stop - epoch.start)
+        else:
+            segment = preintegrate(
+                epoch.time, epoch.gyro, epoch.accel, zero, zero, config.noise, config.gravity
+            )
+            R, v, p = segment.predict(R, v, p, zero, zero)
+        rows.append((epoch.stop, R, v, p))
+    trajectory = Trajectory(
+        time=np.array([row[0] for row in rows]),
+        position_W=np.array([row[3] for row in rows]),
+        attitude_WB=Rotation.from_matrix(np.array([row[1] for row in rows])),
+        velocity_W=np.array([row[2] for row in rows]),
+    )
+    return Track(trajectory, seconds_filter=perf_counter() - began)
+
+
+def network_track(observed: Observed) -> Track:
+    """Displacements chained along the attitude that is levelled from the IMU, without truth."""
+    began = perf_counter()
+    start = observed.intake.start
+    assert start is not None  # observe() refuses recordings without one
+    time = np.array([start.time, *(e.stop for e in observed.epochs)])
+    attitude = np.stack([start.R_WB, *(e.R_NB for e in observed.epochs)])
+    known = [(e, m[0]) for e, m in zip(observed.epochs, observed.measurements, strict=True) if m]
+    middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in known])
+    velocity = np.array([d for _, d in known]) / WINDOW_SECONDS
+    trajectory = _chained(time, Rotation.from_matrix(attitude), middle, velocity)
+    return Track(
+        trajectory,
+        seconds_network=observed.seconds_network,
+        seconds_filter=observed.seconds_intake + perf_counter() - began,
+    )
+
+
+def network_track_true_attitude(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig
+) -> Track:
+    """The papers' protocol: windows rotated by the true attitude, displacements chained.
+
+    Raises:
+        InputError: the recording has no truth, or no second of it with valid truth.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
+    began = perf_counter()
+    time, windows = _true_windows(sequence, config.filter.period)
+    prepared = perf_counter()
+    displacement, _ = model.predict(windows)
+    done = perf_counter()
+    middle = time + 0.5 * WINDOW_SECONDS
+    ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
+    attitude = sequence.truth.at(ticks).attitude_WB
+    trajectory = _chained(ticks, attitude, middle, displacement / WINDOW_SECONDS)
+    return Track(
+        trajectory,
+        seconds_network=done - prepared,
+        seconds_filter=prepared - began + perf_counter() - done,
+    )
+
+
+def _true_windows(
+    sequence: ImuSequence, period: float
+) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
+    """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
+    assert sequence.truth is not None  # checked by the caller
+    time, gyro, accel = clean_samples(sequence)
+    pose = sequence.truth.at(time)
+    imu_W = np.hstack([pose.attitude_WB.apply(gyro), pose.attitude_WB.apply(accel)])
+    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
+    imu_W = resample(time, imu_W, grid)
+    usable = sequence.truth.at(grid).valid & _sampled(time, grid)
+    bad_before = np.concatenate([[0], np.cumsum(~usable)])
+    stride = round(period * WINDOW_RATE)
+    starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)
+    starts = starts[bad_before[starts + WINDOW_SAMPLES] == bad_before[starts]]
+    if len(starts) == 0:
+        raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
+    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
+    return grid[starts], imu_W[rows].transpose(0, 2, 1).astype(np.float32)
+
+
+def _sampled(time: FloatArray, grid: FloatArray) -> BoolArray:
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    return np.asarray(time[right] - time[right - 1] <= MAX_IMU_GAP)
+
+
+def _chained(
+    time: FloatArray, attitude: Rotation, middle: FloatArray, velocity: FloatArray
+) -> Trajectory:
+    """Integrate velocities known at the windows' middles to positions at `time`."""
+    columns = [np.interp(time, middle, velocity[:, k]) for k in range(3)]
+    at_time = np.stack(columns, axis=1)
+    steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return Trajectory(time, position, attitude, velocity_W=at_time)
