@@ -106,9 +106,17 @@ def write_json(path: Path | str, obj: object) -> None:
     Raises:
         InputError: the object holds something else, or the folder does not exist.
     """
-    text = json.dumps(_plain(obj), indent=2, sort_keys=False, allow_nan=False, ensure_ascii=False)
     with atomic_write(path) as file:
-        file.write(text + "\n")
+        file.write(json_text(obj))
+
+
+def json_text(obj: object) -> str:
+    """The text that `write_json` writes.
+
+    Raises:
+        InputError: the object holds something that has no plain counterpart.
+    """
+    return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def write_npz(path: Path | str, **arrays: ArrayLike) -> None:

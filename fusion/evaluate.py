@@ -1,0 +1,56 @@
+"""Summary of many comparisons: one table of recordings by tracks, medians and means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison
+from stario.sequences.sequence import FloatArray
+
+_COLUMNS = (
+    ("network_true_attitude", "ate_m", "network, true attitude"),
+    ("network", "ate_m", "network, own attitude"),
+    ("ekf", "ate_m", "EKF"),
+    ("ekf", "nis", "EKF NIS"),
+    ("ekf", "nees", "EKF NEES"),
+)
+
+
+def summary(comparisons: Sequence[Comparison]) -> dict[str, object]:
+    """Figures of every recording with medians and means over them, as plain values."""
+    recordings = {c.sequence.name: c.as_dict() for c in comparisons}
+    metrics = ("ate_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+    over = {
+        track: {
+            metric: {"median": float(np.nanmedian(values)), "mean": float(np.nanmean(values))}
+            for metric in metrics
+            if np.isfinite(values := _values(comparisons, track, metric)).any()
+        }
+        for track in TRACKS
+    }
+    return {"recordings": recordings, "over_recordings": over, "conventions": METRIC_WORDS}
+
+
+def summary_table(comparisons: Sequence[Comparison]) -> str:
+    """The same for a person: horizontal ATE of each track, consistency of the EKF."""
+    width = max([24, *(len(c.sequence.name) + 2 for c in comparisons)])
+    lines = [f"{'':<{width}}" + "".join(f"{title:>24}" for _, _, title in _COLUMNS)]
+    table = np.array([[_value(c, t, m) for t, m, _ in _COLUMNS] for c in comparisons])
+    rows = [(c.sequence.name, row) for c, row in zip(comparisons, table, strict=True)]
+    rows += [("median", np.nanmedian(table, axis=0)), ("mean", np.nanmean(table, axis=0))]
+    for name, row in rows:
+        lines.append(f"{name:<{width}}" + "".join(f"{value:>24.2f}" for value in row))
+    lines.append(f"ATE in m: {METRIC_WORDS['ate_m']}; NIS: {METRIC_WORDS['nis']}; ")
+    lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
+    return "\n".join(lines)
+
+
+def _values(comparisons: Sequence[Comparison], track: str, metric: str) -> FloatArray:
+    return np.array([_value(c, track, metric) for c in comparisons])
+
+
+def _value(comparison: Comparison, track: str, metric: str) -> float:
+    value = comparison.metrics.get(track, {}).get(metric)
+    return float("nan") if value is None else float(value)

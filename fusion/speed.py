@@ -1,0 +1,69 @@
+"""Speed of the whole: filter, network and run, medians and ratios from one run of the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from stario.fusion.benchmark import filter_speed
+from stario.fusion.compare import demonstration
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.navigator import Navigator
+from stario.network.benchmark import network_speed
+from stario.network.model import DisplacementModel
+
+_RUNS = 5
+
+
+def speed_report(model: DisplacementModel) -> dict[str, Any]:
+    """Seconds per minute of data and milliseconds per window; medians of interleaved runs."""
+    engine = filter_speed()
+    sequence = demonstration()
+    minutes = sequence.duration / 60.0
+    runs: dict[str, list[float]] = {"run": [], "run_network": [], "filter_20_hz": []}
+    default = Navigator(model, NavigatorConfig())
+    fast = Navigator(model, NavigatorConfig(filter=FilterConfig(update_rate=20)))
+    observed = fast.observe(sequence)
+    for _ in range(_RUNS):
+        seconds, track = _timed(lambda: default.run(sequence))
+        runs["run"].append(seconds / minutes)
+        runs["run_network"].append(track.seconds_network / minutes)
+        seconds, _track = _timed(lambda: fast.track(observed))
+        runs["filter_20_hz"].append(seconds / minutes)
+    medians = {name: float(np.median(values)) for name, values in runs.items()}
+    return {
+        "filter_s_per_min_20_hz": medians["filter_20_hz"],
+        "filter_engine_s_per_min_20_hz": engine.structured,
+        "filter_engine_dense_s_per_min_20_hz": engine.dense,
+        "filter_engine_ratio": engine.ratio,
+        "run_s_per_min": medians["run"],
+        "run_network_s_per_min": medians["run_network"],
+        "update_rate_hz": default.config.filter.update_rate,
+        "network": network_speed(model),
+    }
+
+
+def speed_table(report: dict[str, Any]) -> str:
+    """The report for a person."""
+    lines = [
+        f"filter, 20 updates/s, preintegration included: "
+        f"{report['filter_s_per_min_20_hz']:.3f} s/min",
+        f"its engine alone: {report['filter_engine_s_per_min_20_hz']:.3f} s/min, through filterpy's "
+        f"dense algebra {report['filter_engine_dense_s_per_min_20_hz']:.3f} s/min "
+        f"({report['filter_engine_ratio']:.1f} times slower)",
+        f"whole run at {report['update_rate_hz']} updates/s: {report['run_s_per_min']:.3f} s/min, "
+        f"of which network {report['run_network_s_per_min']:.3f} s/min",
+    ]
+    lines += [
+        f"network, {name}: {value:.3f} ms/window" for name, value in report["network"].items()
+    ]
+    return "\n".join(lines)
+
+
+def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    began = perf_counter()
+    result = work()
+    return perf_counter() - began, result
