@@ -51,8 +51,9 @@ def speed_table(report: dict[str, Any]) -> str:
     lines = [
         f"filter, 20 updates/s, preintegration included: "
         f"{report['filter_s_per_min_20_hz']:.3f} s/min",
-        f"its engine alone: {report['filter_engine_s_per_min_20_hz']:.3f} s/min, through filterpy's "
-        f"dense algebra {report['filter_engine_dense_s_per_min_20_hz']:.3f} s/min "
+        f"its engine alone: {report['filter_engine_s_per_min_20_hz']:.3f} s/min",
+        f"the same through filterpy's dense algebra: "
+        f"{report['filter_engine_dense_s_per_min_20_hz']:.3f} s/min "
         f"({report['filter_engine_ratio']:.1f} times slower)",
         f"whole run at {report['update_rate_hz']} updates/s: {report['run_s_per_min']:.3f} s/min, "
         f"of which network {report['run_network_s_per_min']:.3f} s/min",

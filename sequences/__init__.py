@@ -1,23 +1,89 @@
 """What was recorded: sequences, readers, simulation, windows, metrics and figures."""
 
-from stario.sequences.errors import (
-    ConfigError,
-    InputError,
-    ReadError,
-    StarioError,
-    WeightsError,
-)
-from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from typing import TYPE_CHECKING
+
+from stario.sequences.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from stario.sequences.checks import check_units as check_units
+    from stario.sequences.checks import with_units as with_units
+    from stario.sequences.errors import ConfigError as ConfigError
+    from stario.sequences.errors import InputError as InputError
+    from stario.sequences.errors import ReadError as ReadError
+    from stario.sequences.errors import StarioError as StarioError
+    from stario.sequences.errors import WeightsError as WeightsError
+    from stario.sequences.files import read_tum as read_tum
+    from stario.sequences.files import write_tum as write_tum
+    from stario.sequences.metrics import align as align
+    from stario.sequences.metrics import evaluate_track as evaluate_track
+    from stario.sequences.metrics import position_nees as position_nees
+    from stario.sequences.noise import ImuNoise as ImuNoise
+    from stario.sequences.readers import find_recordings as find_recordings
+    from stario.sequences.readers import read_recording as read_recording
+    from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
+    from stario.sequences.sequence import ImuSequence as ImuSequence
+    from stario.sequences.sequence import Trajectory as Trajectory
+    from stario.sequences.simulate import GOOD_IMU as GOOD_IMU
+    from stario.sequences.simulate import PERFECT_IMU as PERFECT_IMU
+    from stario.sequences.simulate import PHONE_IMU as PHONE_IMU
+    from stario.sequences.simulate import ImuErrors as ImuErrors
+    from stario.sequences.simulate import simulate_imu as simulate_imu
+    from stario.sequences.walks import WalkStyle as WalkStyle
+    from stario.sequences.walks import generate_walk as generate_walk
+
+_MODULES = {
+    "ConfigError": "errors",
+    "GOOD_IMU": "simulate",
+    "ImuErrors": "simulate",
+    "ImuNoise": "noise",
+    "ImuSequence": "sequence",
+    "InputError": "errors",
+    "PERFECT_IMU": "simulate",
+    "PHONE_IMU": "simulate",
+    "ReadError": "errors",
+    "STANDARD_GRAVITY": "sequence",
+    "StarioError": "errors",
+    "Trajectory": "sequence",
+    "WalkStyle": "walks",
+    "WeightsError": "errors",
+    "align": "metrics",
+    "check_units": "checks",
+    "evaluate_track": "metrics",
+    "find_recordings": "readers",
+    "generate_walk": "walks",
+    "position_nees": "metrics",
+    "read_recording": "readers",
+    "read_tum": "files",
+    "simulate_imu": "simulate",
+    "with_units": "checks",
+    "write_tum": "files",
+}
 
 __all__ = [
+    "GOOD_IMU",
+    "PERFECT_IMU",
+    "PHONE_IMU",
     "STANDARD_GRAVITY",
     "ConfigError",
+    "ImuErrors",
     "ImuNoise",
     "ImuSequence",
     "InputError",
     "ReadError",
     "StarioError",
     "Trajectory",
+    "WalkStyle",
     "WeightsError",
+    "align",
+    "check_units",
+    "evaluate_track",
+    "find_recordings",
+    "generate_walk",
+    "position_nees",
+    "read_recording",
+    "read_tum",
+    "simulate_imu",
+    "with_units",
+    "write_tum",
 ]
+__getattr__ = lazy_attributes("stario.sequences", _MODULES)
