@@ -1,0 +1,38 @@
+"""Run on a recording: a fused track from one's own CSV, with nothing but IMU columns needed.
+
+    python examples/run_recording.py [RECORDING]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from stario.fusion import Navigator, Track, demonstration
+from stario.network import load_model
+from stario.sequences import read_recording
+from stario.sequences.readers.own_csv import write_csv
+
+
+def fused_track(path: Path) -> Track:
+    """Read a recording of any known format and fuse it."""
+    return Navigator(load_model("default")).run(read_recording(path))
+
+
+def main(path: Path | None = None) -> Track:
+    """Fuse the recording, or a simulated one that is written as a CSV first."""
+    if path is not None:
+        return fused_track(path)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "walk.csv"
+        write_csv(path, demonstration().without_truth())
+        return fused_track(path)
+
+
+if __name__ == "__main__":
+    track = main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    end = track.trajectory.position_W[-1]
+    sigma = track.trajectory.position_covariance_W[-1].diagonal() ** 0.5
+    print(f"after {track.time[-1] - track.time[0]:.0f} s at {end.round(2)} m, sigma {sigma.round(2)}")
+    print("\n".join(track.health.lines()))

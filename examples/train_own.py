@@ -1,0 +1,32 @@
+"""Train on your own recordings: anything `read_recording` reads, as long as it has truth.
+
+A real run takes hours of recordings and many epochs; `stario train` does the same with a progress
+bar. This one is small enough to watch.
+
+    python examples/train_own.py
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from stario.network import DisplacementModel, TrainingConfig, load_model
+from stario.network.train import train
+from stario.sequences import generate_walk, simulate_imu
+from stario.sequences.windows import world_streams
+
+
+def main(folder: Path, epochs: int = 2) -> DisplacementModel:
+    """Train on five simulated recordings, keep one for validation, load the result."""
+    recordings = [simulate_imu(generate_walk(seed, 30.0), 200.0, seed=seed) for seed in range(6)]
+    streams = [stream for recording in recordings for stream in world_streams(recording)]
+    config = TrainingConfig(epochs=epochs, epoch_windows=256, batch=64, seed=0)
+    weights = train(config, streams[:-1], [1.0] * len(streams[:-1]), streams[-1:], folder)
+    return load_model(weights)
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as temporary:
+        model = main(Path(temporary))
+    print(model.card.figures)

@@ -1,0 +1,46 @@
+"""Every example runs and returns what it says."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"examples_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_example_is_tested_here():
+    tested = {"run_recording", "compare_tracks", "streaming", "train_own"}
+    assert {p.stem for p in FOLDER.glob("*.py")} == tested
+
+
+def test_run_recording_gives_a_finite_track_without_truth():
+    track = load("run_recording").main()
+    assert np.isfinite(track.trajectory.position_W).all()
+    assert track.time[-1] - track.time[0] > 100.0
+
+
+def test_compare_tracks_ranks_the_filter_above_the_imu_alone():
+    comparison = load("compare_tracks").main(seconds=30.0)
+    assert comparison.metrics["ekf"]["ate_m"] < 0.2 * comparison.metrics["inertial"]["ate_m"]
+
+
+def test_streaming_yields_states_ten_times_a_second():
+    states = load("streaming").main(seconds=10.0)
+    times = np.array([state.time for state in states])
+    assert len(states) > 40
+    np.testing.assert_allclose(np.diff(times), np.diff(times)[0], atol=1e-6)
+
+
+def test_train_own_leaves_weights_that_predict(tmp_path):
+    model = load("train_own").main(tmp_path, epochs=1)
+    mean, covariance = model.predict(np.zeros((2, 6, 200)))
+    assert mean.shape == (2, 3)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()

@@ -1,0 +1,71 @@
+"""What is installed is what is in the tree."""
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_every_package_of_the_tree_is_listed():
+    found = {
+        "stario." + ".".join(p.parent.relative_to(ROOT).parts)
+        for folder in ("fusion", "network", "sequences")
+        for p in (ROOT / folder).rglob("__init__.py")
+    }
+    assert found == set(PROJECT["tool"]["setuptools"]["packages"])
+
+
+def test_every_folder_with_modules_is_a_package():
+    for folder in ("fusion", "network", "sequences"):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert (path.parent / "__init__.py").exists(), path
+
+
+def test_constraints_pin_what_the_project_depends_on():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert pinned["torch"] == "2.13.0"
+    for requirement in PROJECT["project"]["dependencies"]:
+        assert requirement.split(">=")[0] in pinned
+
+
+def test_sequences_import_neither_network_nor_fusion_and_network_not_fusion():
+    forbidden = {"sequences": ("stario.network", "stario.fusion"), "network": ("stario.fusion",)}
+    for folder, names in forbidden.items():
+        for path in (ROOT / folder).rglob("*.py"):
+            text = path.read_text()
+            assert not any(f"from {name}" in text or f"import {name}" in text for name in names)
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys, stario.fusion.cli\n"
+        "heavy = {'torch', 'gtsam', 'matplotlib', 'scipy', 'numpy'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_wheel_installs_and_runs_outside_the_tree(tmp_path):
+    def call(*command: str) -> str:
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    call(sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT))
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
+    assert sdist.stat().st_size > 1_000_000  # the weights travel in it
+    call(sys.executable, "-m", "venv", "fresh")
+    call("fresh/bin/pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel))
+    out = call("fresh/bin/stario", "compare", "--out", "demo")
+    assert "ekf" in out
+    assert (tmp_path / "demo/metrics.json").exists()
+    assert (tmp_path / "demo/demonstration/plan.png").exists()
