@@ -19,8 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -40,8 +39,7 @@ Block = tuple[int, FloatArray]
 """First column of the error state a Jacobian block stands at, and the block (m, width)."""
 
 
-@dataclass(frozen=True)
-class UpdateResult:
+class UpdateResult(NamedTuple):
     """What became of one measurement.
 
     Attributes:
@@ -330,7 +328,7 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
             definite are refused with a reason; the state stays as it was.
         """
         m = len(residual)
-        if not math.isfinite(residual.sum() + covariance.sum()):
+        if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
             return UpdateResult(math.nan, m, False, reason="value that is not finite")
         if dpotrf(covariance, lower=1)[1] != 0:
             return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
@@ -435,11 +433,11 @@ def displacement_jacobian(
     theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
     column of the first block equals that of [p_j]x; written so, H times yaw is zero to the bit.
     """
-    P_i, P_j = skew(p_i_W), skew(p_j_W)
-    H_i = np.empty((3, CLONE))
-    H_i[:, :2], H_i[:, 2], H_i[:, 3:] = P_i[:, :2], P_j[:, 2], -_EYE
-    H_j = np.zeros((3, 9 if slot_j is None else CLONE))
-    H_j[:, :3], H_j[:, -3:] = -P_j, _EYE
+    P_i, P_j = skew(np.array((p_i_W, p_j_W)))
+    H_i = _LAST_MINUS_EYE.copy()
+    H_i[:, :2], H_i[:, 2] = P_i[:, :2], P_j[:, 2]
+    H_j = (_LAST_EYE_CORE if slot_j is None else _LAST_EYE).copy()
+    H_j[:, :3] -= P_j
     first_j = 0 if slot_j is None else CORE + CLONE * slot_j
     return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
 
@@ -452,6 +450,9 @@ def mean_velocity_jacobian(v_W: FloatArray) -> list[Block]:
 
 
 _EYE = np.eye(3)
+_LAST_EYE = np.eye(3, CLONE, k=3)
+_LAST_MINUS_EYE = -_LAST_EYE
+_LAST_EYE_CORE = np.eye(3, 9, k=6)
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

@@ -22,18 +22,7 @@ _HAT[0, [5, 7]] = -1.0, 1.0
 _HAT[1, [2, 6]] = 1.0, -1.0
 _HAT[2, [1, 3]] = -1.0, 1.0
 
-# Taylor coefficients in t^2 of (1 - cos t)/t^2 and (t - sin t)/t^3.
-_POWERS = np.arange(5.0)
-_SERIES = np.array(
-    [
-        [1.0 / 2.0, 1.0 / 6.0],
-        [-1.0 / 24.0, -1.0 / 120.0],
-        [1.0 / 720.0, 1.0 / 5040.0],
-        [-1.0 / 40320.0, -1.0 / 362880.0],
-        [1.0 / 3628800.0, 1.0 / 39916800.0],
-    ]
-)
-_SERIES_LIMIT = 0.04  # t^2 [rad^2] up to which five terms are exact to rounding
+_SERIES_LIMIT = 1e-3  # t^2 [rad^2] up to which three terms of a series are exact to rounding
 _EYE = np.eye(3)
 _ONES = np.ones(3)
 
@@ -147,12 +136,11 @@ def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
 def _coefficients(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(1 - cos t)/t^2 and (t - sin t)/t^3 (..., 1, 1), accurate down to zero."""
     squared = (theta * theta) @ _ONES
-    if (squared <= _SERIES_LIMIT).all():
-        columns = np.power.outer(squared, _POWERS) @ _SERIES
-        return columns[..., 0, None, None], columns[..., 1, None, None]
-    large = squared > _SERIES_LIMIT
-    t = np.sqrt(np.where(large, squared, 1.0))
-    columns = np.power.outer(np.where(large, 0.0, squared), _POWERS) @ _SERIES
-    b = np.where(large, 2.0 * (np.sin(0.5 * t) / t) ** 2, columns[..., 0])
-    c = np.where(large, (t - np.sin(t)) / t**3, columns[..., 1])
+    b = 0.5 - squared * (1.0 / 24.0 - squared / 720.0)
+    c = 1.0 / 6.0 - squared * (1.0 / 120.0 - squared / 5040.0)
+    if np.vdot(theta, theta) > _SERIES_LIMIT:
+        large = squared > _SERIES_LIMIT
+        t = np.sqrt(np.where(large, squared, 1.0))
+        b = np.where(large, 2.0 * (np.sin(0.5 * t) / t) ** 2, b)
+        c = np.where(large, (t - np.sin(t)) / t**3, c)
     return b[..., None, None], c[..., None, None]

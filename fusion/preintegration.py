@@ -113,7 +113,7 @@ class Segment:
         adjoint[0:3, 0:3] = R
         adjoint[3:6, 6:9] = R
         adjoint[6:9, 3:6] = R
-        adjoint[3:9, 0:3] = (skew(np.stack((v, p))) @ R).reshape(6, 3)
+        adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
         noise = adjoint @ self.pim.residualCovariance() @ adjoint.T
 
         transition = _nav_transition(self.duration, self.gravity)
@@ -181,21 +181,20 @@ def corrected_increments(
         dt (n,) [s], rate (n, 3) [rad/s], force (n, 3) [m/s^2].
     """
     dt = time[1:] - time[:-1]
-    step = dt[:, None]
-    pairs = np.stack((gyro, accel), axis=2)
+    step = dt[:, None, None]
+    pairs = np.empty((len(time), 3, 2))  # columns w and a
+    pairs[:, :, 0], pairs[:, :, 1] = gyro, accel
     W = skew(gyro)
-    forward = W[:-1] @ pairs[1:]  # w0 x w1, w0 x a1
-    backward = W[1:] @ pairs[:-1]  # w1 x w0, w1 x a0
-    W_mean = 0.5 * (W[:-1] + W[1:])
-    mean = 0.5 * (pairs[:-1] + pairs[1:])
-    turned = W_mean @ mean[:, :, 1:]
-    force = mean[:, :, 1] + step * (
-        (0.5 * turned + step[:, None] / 6.0 * (W_mean @ turned))[:, :, 0]
-        + (forward - backward)[:, :, 1] / 12.0
-    )
-    return dt, mean[:, :, 0] + step / 12.0 * forward[:, :, 0], force
+    W0, W1, first, last = W[:-1], W[1:], pairs[:-1], pairs[1:]
+    # w0 x w1 - w1 x w0 counts the coning twice, hence its 1/24.
+    constant = 0.5 * (first + last) + step * _SHARES * (W0 @ last - W1 @ first)
+    force = constant[:, :, 1:]
+    turn = (0.5 * step) * (W0 + W1)
+    force = force + turn @ (0.5 * force + turn @ force / 6.0)
+    return dt, constant[:, :, 0], force[:, :, 0]
 
 
+_SHARES = np.array([1.0 / 24.0, 1.0 / 12.0])
 _IDENTITY = np.eye(CORE)
 _BIAS_SWAP = np.zeros((CORE, CORE))
 _BIAS_SWAP[9:12, 12:15] = np.eye(3)

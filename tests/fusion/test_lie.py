@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion import lie
 
-ANGLES = [0.0, 1e-9, 1e-4, 0.05, 0.2, 0.2001, 1.0, 2.5, np.pi - 1e-6]
+ANGLES = [0.0, 1e-9, 1e-4, 0.0316, 0.0317, 0.2, 1.0, 2.5, np.pi - 1e-6]
 
 
 def rotation_vectors(angle: float) -> np.ndarray:
