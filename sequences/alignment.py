@@ -105,7 +105,7 @@ class _GyroIntegral:
         self.time = time
         steps = np.diff(time)[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
         self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self._quat = _cumulative(Rotation.from_rotvec(steps))
+        self._quat = cumulative_rotations(Rotation.from_rotvec(steps))
         self._rate = gyro
 
     def attitude(self, time: FloatArray) -> Rotation:
@@ -126,7 +126,7 @@ class _GyroIntegral:
         return np.asarray((ends[1] - ends[0]) / (stop - start)[:, None], dtype=np.float64)
 
 
-def _cumulative(steps: Rotation) -> FloatArray:
+def cumulative_rotations(steps: Rotation) -> FloatArray:
     """Products q_0 q_1 ... q_k as (N + 1, 4), in log2(N) vectorised passes."""
     product = Rotation.concatenate([Rotation.identity(), steps])
     shift = 1

@@ -17,7 +17,8 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import first_time_ns, read_lines, read_table
 from stario.sequences.sequence import ImuSequence, Trajectory
 
-TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "leica0", "vicon0", "gt")
+TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
+"""Poses of the IMU. EuRoC's `leica0` (a position alone) and `vicon0` (the markers' pose) are none."""
 
 
 def read_euroc(path: Path) -> ImuSequence:
@@ -38,6 +39,11 @@ def read_euroc(path: Path) -> ImuSequence:
         accel=table[:, 4:7],
         truth=None if truth_file is None else _truth(truth_file, first_time_ns(imu)),
     )
+
+
+def is_euroc(path: Path) -> bool:
+    """Whether a path leads to an `imu0/data.csv`."""
+    return imu_file(path) is not None
 
 
 def imu_file(path: Path) -> Path | None:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.alignment import align_tracked_body
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import read_table
+from stario.sequences.readers.text import first_numbers, read_table
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 
 RATE = 100.0
@@ -43,6 +43,12 @@ def read_oxiod(path: Path) -> ImuSequence:
     vicon = path.with_name(path.name.replace("imu", "vi", 1))
     truth = _truth(vicon, time, gyro, accel) if vicon.exists() else None
     return ImuSequence(name=_name(path), time=time, gyro=gyro, accel=accel, truth=truth)
+
+
+def is_oxiod(path: Path) -> bool:
+    """Whether a file starts with 16 numbers whose gravity is one g long; there is no header."""
+    row = first_numbers(path)
+    return len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
 
 
 def _name(path: Path) -> str:

@@ -1,0 +1,118 @@
+"""The header of a CSV of one's own: which column holds what, in which unit."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from stario.sequences.errors import ReadError
+from stario.sequences.units import unit_named
+
+HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+"""What a header looks like."""
+
+TRUTH_HEADER = "px [m],py [m],pz [m],qx,qy,qz,qw"
+"""What may follow it."""
+
+_log = logging.getLogger(__name__)
+
+Factor = TypeVar("Factor")
+
+IMU = ("gx", "gy", "gz", "ax", "ay", "az")
+POSITION, QUAT = ("px", "py", "pz"), ("qx", "qy", "qz", "qw")
+TRUTH = POSITION + QUAT
+
+_STEMS = {
+    "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
+    "a": ("acc", "acce", "accel", "accelerometer", "a_rs_s"),
+    "p": ("pos", "position"),
+    "q": ("quat", "quaternion", "ori", "orientation"),
+}
+_ALIASES = dict.fromkeys(("t", "time", "times", "timestamp"), "t") | {
+    stem + joint + axis: letter + axis
+    for letter, stems in _STEMS.items()
+    for stem in (letter, *stems)
+    for joint in ("", "_")
+    for axis in ("xyzw" if letter == "q" else "xyz")
+}
+_CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]\)]*)[\]\)])?\W*$")
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a quantity stands in a row, the header's words for it, and its unit."""
+
+    index: int
+    title: str
+    unit: str
+
+
+def read_header(path: Path, lines: list[str]) -> tuple[int, dict[str, Column]]:
+    """How many lines end with the header, and its columns by their canonical name."""
+    for start, line in enumerate(lines, 1):
+        if not line.strip() or (line.lstrip().startswith("#") and not names_columns(line)):
+            continue
+        if not names_columns(line):
+            found = repr(line.strip()[:60])
+            raise ReadError(path, f"line {start}, header", found, HEADER, "put it above the rows")
+        return start, _columns(path, start, line)
+    raise ReadError(path, "header", "only comments", HEADER)
+
+
+def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    ignored = []
+    for index, text in enumerate(_titles(line)):
+        title, unit = _cell(text)
+        name = _ALIASES.get(title.lower())
+        if name is None:
+            ignored.append(title)
+        elif name in columns:
+            found = f"{title} beside {columns[name].title}"
+            raise ReadError(path, f"line {number}, {name}", found, "one column")
+        else:
+            columns[name] = Column(index, title, unit)
+    missing = [name for name in ("t", *IMU) if name not in columns]
+    if not set(POSITION) & set(columns):  # an attitude alone is no track
+        ignored += [columns.pop(name).title for name in QUAT if name in columns]
+    truth = [name for name in TRUTH if name in columns]
+    if truth:
+        missing += [name for name in TRUTH if name not in columns]
+    if missing:
+        fix = "or leave truth out" if truth and not set(missing) & {"t", *IMU} else ""
+        expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER
+        raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
+    if ignored:
+        _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
+    for name in truth:
+        unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
+    return columns
+
+
+def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
+    """Factor of a column's unit; the table's first where the header names none."""
+    unit = unit_named(column.unit) or next(iter(known))
+    if unit not in known:
+        names = ", ".join(filter(None, known)) or "no unit"
+        raise ReadError(path, f"header, {column.title}", f"unit {column.unit!r}", names)
+    return known[unit]
+
+
+def names_columns(line: str) -> bool:
+    """Whether a line names any column of the IMU that this format knows."""
+    names = {_ALIASES.get(_cell(text)[0].lower(), "") for text in _titles(line)}
+    return bool(names & set(IMU))
+
+
+def _titles(line: str) -> list[str]:
+    return line.lstrip().lstrip("#").split(",")
+
+
+def _cell(text: str) -> tuple[str, str]:
+    """Name and unit of a header's cell, `gx [deg/s]` or `gx (deg/s)`."""
+    match = _CELL.match(text)
+    return (match["name"], match["unit"] or "") if match else (text.strip(), "")

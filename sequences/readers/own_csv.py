@@ -1,0 +1,227 @@
+"""A CSV of one's own: `t,gx,gy,gz,ax,ay,az` with units in the header, truth columns optional.
+
+The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order:
+
+- `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
+  IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
+  (-m/s^2 or -g where the device reports gravity, as Apple's do). Without a unit: s, rad/s, m/s^2.
+- truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may leave
+  truth blank (slower truth), or gyroscope and accelerometer (truth at times of its own).
+
+A sample written as `nan` is kept as such; other columns are ignored.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.files import atomic_write
+from stario.sequences.readers.columns import (
+    HEADER,
+    IMU,
+    TRUTH,
+    TRUTH_HEADER,
+    Column,
+    names_columns,
+    read_header,
+    unit_factor,
+)
+from stario.sequences.readers.text import first_line, read_lines
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, TIME_UNITS
+
+_log = logging.getLogger(__name__)
+
+_BLANK = re.compile(r"(?<=,)\s*(?=,|$)|^\s*(?=,)", flags=re.MULTILINE)
+_NORM_TOLERANCE = 1e-2
+
+
+def read_own_csv(path: Path) -> ImuSequence:
+    """Read a CSV of one's own, see the module's first lines.
+
+    Raises:
+        ReadError: header, unit, row or number does not fit; it names line and column.
+    """
+    lines = read_lines(path)
+    start, columns = read_header(path, lines)
+    numbered = [(k, line) for k, line in enumerate(lines[start:], start + 1) if _is_row(line)]
+    if not numbered:
+        raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    used = [name for name in (*IMU, *TRUTH) if name in columns]
+    values = _numbers(path, numbered, [columns[name] for name in used])
+    table = {name: values[:, k] for k, name in enumerate(used)}
+    is_imu = _imu_rows(numbered, columns, values[:, : len(IMU)])
+    if not is_imu.any():
+        raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
+    time = _seconds(path, numbered, columns["t"], int(np.argmax(is_imu)))
+    return ImuSequence(
+        name=path.stem,
+        time=time[is_imu],
+        gyro=_triple(path, table, columns, "g", GYRO_UNITS)[is_imu],
+        accel=_triple(path, table, columns, "a", ACCEL_UNITS)[is_imu],
+        truth=_truth(path, numbered, time, table) if "px" in table else None,
+    )
+
+
+def is_own_csv(path: Path) -> bool:
+    """Whether a file starts with a header that names columns of this format."""
+    line = first_line(path, comments=True)
+    return line is not None and names_columns(line)
+
+
+def write_csv(path: Path | str, sequence: ImuSequence) -> None:
+    """Write a recording so that `read_own_csv` returns the same numbers, whole or not at all.
+
+    Truth's valid poses go to the IMU's rows where their times are the same and to rows of their
+    own elsewhere; its velocity and covariance have no column. Reading counts time from the first
+    IMU sample.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    truth = sequence.truth
+    table = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
+    rows = [",".join(map(repr, row)) for row in table.tolist()]
+    header = HEADER
+    if truth is not None:
+        header = f"{HEADER},{TRUTH_HEADER}"
+        rows = _with_truth(sequence.time, rows, truth)
+    with atomic_write(path) as file:
+        file.write("\n".join([header, *rows]) + "\n")
+
+
+def _with_truth(time: FloatArray, rows: list[str], truth: Trajectory) -> list[str]:
+    poses = np.column_stack([truth.position_W, truth.quat_xyzw])[truth.valid]
+    texts = [",".join(map(repr, row)) for row in poses.tolist()]
+    times = truth.time[truth.valid]
+    shared: dict[float, int] = dict(zip(time.tolist(), range(len(time)), strict=True))
+    empty = "," * len(TRUTH)
+    tails = [empty] * len(rows)
+    own: list[tuple[float, str]] = []
+    for t, text in zip(times.tolist(), texts, strict=True):
+        if t in shared:
+            tails[shared[t]] = "," + text
+        else:
+            own.append((t, f"{t!r}{',' * len(IMU)},{text}"))
+    whole = [row + tail for row, tail in zip(rows, tails, strict=True)]
+    # Rows of truth go before the first IMU row that is later; the IMU's own order stays.
+    newest = np.maximum.accumulate(np.nan_to_num(time, nan=-np.inf))
+    places = np.searchsorted(newest, [t for t, _ in own]).tolist()
+    merged: list[str] = []
+    taken = 0
+    for place, (_, text) in zip(places, own, strict=True):
+        merged += [*whole[taken:place], text]
+        taken = place
+    return merged + whole[taken:]
+
+
+def _is_row(line: str) -> bool:
+    text = line.strip()
+    return bool(text) and not text.startswith("#")
+
+
+def _triple(
+    path: Path,
+    table: dict[str, FloatArray],
+    columns: dict[str, Column],
+    letter: str,
+    known: dict[str, float],
+) -> FloatArray:
+    scaled = [
+        table[letter + axis] * unit_factor(path, columns[letter + axis], known) for axis in "xyz"
+    ]
+    return np.stack(scaled, axis=1)
+
+
+def _numbers(path: Path, numbered: list[tuple[int, str]], columns: list[Column]) -> FloatArray:
+    """The columns asked for as (N, K), blank cells as NaN."""
+    text = "\n".join(line for _, line in numbered)
+    if ",," in text or ",\n" in text or text[0] == "," or text[-1] == "," or ", " in text:
+        text = _BLANK.sub("nan", text)
+    try:
+        return np.loadtxt(
+            text.split("\n"), delimiter=",", ndmin=2, usecols=[column.index for column in columns]
+        )
+    except (ValueError, IndexError):
+        return np.array([_row(path, number, line, columns) for number, line in numbered])
+
+
+def _row(path: Path, number: int, line: str, columns: list[Column]) -> list[float]:
+    """One row the slow way, for the error that names its line and column."""
+    cells = line.split(",")
+    needed = 1 + max(column.index for column in columns)
+    if len(cells) < needed:
+        raise ReadError(
+            path, f"line {number}", f"{len(cells)} values", f"{needed}", "is the file cut short?"
+        )
+    row = []
+    for column in columns:
+        cell = cells[column.index].strip()
+        try:
+            row.append(float(cell) if cell else float("nan"))
+        except ValueError:
+            where = f"line {number}, {column.title}"
+            raise ReadError(path, where, repr(cell), "a number") from None
+    return row
+
+
+def _imu_rows(
+    numbered: list[tuple[int, str]], columns: dict[str, Column], values: FloatArray
+) -> BoolArray:
+    """Rows that are IMU samples: not those with truth alone, whose IMU cells are all blank."""
+    is_imu = np.ones(len(values), dtype=np.bool_)
+    indices = [columns[name].index for name in IMU]
+    for k in np.flatnonzero(np.isnan(values).all(axis=1)):
+        cells = numbered[k][1].split(",")
+        is_imu[k] = any(cells[index].strip() for index in indices)
+    return is_imu
+
+
+def _seconds(
+    path: Path, numbered: list[tuple[int, str]], column: Column, origin: int
+) -> FloatArray:
+    """Seconds since the row `origin`, from the digits as they are written."""
+    per_second = unit_factor(path, column, TIME_UNITS)
+    stamps = []
+    for number, line in numbered:
+        cell = line.split(",", column.index + 1)[column.index].strip()
+        try:
+            stamps.append(Decimal(cell))
+        except InvalidOperation:
+            where = f"line {number}, {column.title}"
+            raise ReadError(path, where, repr(cell), "a time") from None
+    start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
+    return np.array([float((stamp - start) / per_second) for stamp in stamps])
+
+
+def _truth(
+    path: Path, numbered: list[tuple[int, str]], time: FloatArray, table: dict[str, FloatArray]
+) -> Trajectory | None:
+    """The track of the rows that hold truth; None if none does."""
+    poses = np.stack([table[name] for name in TRUTH], axis=1)
+    kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
+    newest = np.maximum.accumulate(time[kept])
+    kept = kept[np.append(True, newest[1:] > newest[:-1])] if len(kept) else kept
+    if not len(kept):
+        _log.warning("%s: no row holds truth", path)
+        return None
+    norm = np.linalg.norm(poses[kept, 3:], axis=1)
+    bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
+    if bad.any():
+        k = int(np.argmax(bad))
+        where = f"line {numbered[kept[k]][0]}, qx qy qz qw"
+        raise ReadError(
+            path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "leave the row's truth blank"
+        )
+    return Trajectory(
+        time=time[kept],
+        position_W=poses[kept, :3],
+        attitude_WB=Rotation.from_quat(poses[kept, 3:]),
+    )
