@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.errors import InputError
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -69,13 +70,20 @@ def align_tracked_body(
         attitude_WV: M rotations of the tracked body.
         valid: (M,) samples to be trusted at all.
         max_lag: largest lag looked for, either way [s].
+
+    Raises:
+        InputError: less than 10 s without a break in which both saw the same rotations.
     """
+    _check_length("recording", imu_time)
+    _check_length("capture", truth_time[valid])
     gyro_B = _GyroIntegral(imu_time, gyro)
     lag = _lag(gyro_B, truth_time, attitude_WV, valid, max_lag)
     time = truth_time + lag
     attitude_B = gyro_B.attitude(time)
     valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
     pieces = _pieces(time, attitude_WV, attitude_B, valid)
+    start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
+    _check_length("capture that agrees with the gyroscope", time[start:stop])
     mounts = _mounts(time, attitude_WV, attitude_B, pieces)
     quat_WB = attitude_WV.as_quat()
     kept = np.zeros_like(valid)
@@ -96,6 +104,12 @@ def align_tracked_body(
             for (start, stop), mount in zip(pieces, mounts, strict=True)
         ),
     )
+
+
+def _check_length(what: str, time: FloatArray) -> None:
+    length = float(time[-1] - time[0]) if len(time) else 0.0
+    if length < _MIN_FIT_S:
+        raise InputError(what, f"{length:.1f} s", f"{_MIN_FIT_S:.0f} s to find the mount in")
 
 
 class _GyroIntegral:
@@ -210,8 +224,6 @@ def _mounts(
     pieces: list[tuple[int, int]],
 ) -> list[Rotation]:
     """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not."""
-    if not pieces:
-        return []
     fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
     longest = int(np.argmax([stop - start for start, stop in pieces]))
     mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}

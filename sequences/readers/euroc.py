@@ -18,7 +18,7 @@ from stario.sequences.readers.text import first_time_ns, read_lines, read_table
 from stario.sequences.sequence import ImuSequence, Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
-"""Poses of the IMU. EuRoC's `leica0` (a position alone) and `vicon0` (the markers' pose) are none."""
+"""Poses of the IMU; EuRoC's `leica0` is a position alone and `vicon0` the markers' pose."""
 
 
 def read_euroc(path: Path) -> ImuSequence:

@@ -10,6 +10,7 @@ world is not quite level: see `stario.sequences.alignment`.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,13 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.alignment import align_tracked_body
-from stario.sequences.errors import ReadError
+from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.text import first_numbers, read_table
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 
 RATE = 100.0
+_log = logging.getLogger(__name__)
+
 _G = 9.81
 _JUMP_M = 0.04
 """A tracked body that moves further than this within one row (4 m/s) is a glitch."""
@@ -33,6 +36,8 @@ _SPIKE_M = 0.1
 def read_oxiod(path: Path) -> ImuSequence:
     """Read `syn/imuN.csv` and, where it lies beside it, `syn/viN.csv`.
 
+    Truth is None, with a warning logged, where too little of it agrees with the gyroscope.
+
     Raises:
         ReadError: a file is missing, cut short, or the two do not have the same number of rows.
     """
@@ -41,7 +46,8 @@ def read_oxiod(path: Path) -> ImuSequence:
     gyro = table[:, 4:7]
     accel = -_G * (table[:, 7:10] + table[:, 10:13])
     vicon = path.with_name(path.name.replace("imu", "vi", 1))
-    truth = _truth(vicon, time, gyro, accel) if vicon.exists() else None
+    has_truth = vicon != path and vicon.exists()
+    truth = _truth(vicon, time, gyro, accel) if has_truth else None
     return ImuSequence(name=_name(path), time=time, gyro=gyro, accel=accel, truth=truth)
 
 
@@ -57,7 +63,7 @@ def _name(path: Path) -> str:
     return "-".join(p for p in parts if p not in ("/", "..", "."))
 
 
-def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Trajectory:
+def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Trajectory | None:
     table = read_table(path, columns=9)
     if len(table) != len(time):
         raise ReadError(path, "rows", str(len(table)), f"{len(time)} as in the IMU's file")
@@ -66,7 +72,13 @@ def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     valid = np.isfinite(table[:, 2:9]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
     valid &= ~_position_glitches(position)
     quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
-    aligned = align_tracked_body(time, gyro, accel, time, Rotation.from_quat(quat_xyzw), valid)
+    known = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
+    imu = (time[known], gyro[known], accel[known])
+    try:
+        aligned = align_tracked_body(*imu, time, Rotation.from_quat(quat_xyzw), valid)
+    except InputError as error:
+        _log.warning("%s: left out: %s", path, error)
+        return None
     return Trajectory(
         time=time + aligned.lag,
         position_W=aligned.leveling_WW.apply(position),
