@@ -101,7 +101,10 @@ def _with_truth(time: FloatArray, rows: list[str], truth: Trajectory) -> list[st
     poses = np.column_stack([truth.position_W, truth.quat_xyzw])[truth.valid]
     texts = [",".join(map(repr, row)) for row in poses.tolist()]
     times = truth.time[truth.valid]
-    shared: dict[float, int] = dict(zip(time.tolist(), range(len(time)), strict=True))
+    # Truth must stay in order: it shares rows of the IMU that are newer than all before them.
+    newest = np.maximum.accumulate(np.nan_to_num(time, nan=-np.inf))
+    advances = np.diff(newest, prepend=-np.inf) > 0
+    shared: dict[float, int] = {float(time[k]): int(k) for k in np.flatnonzero(advances)}
     empty = "," * len(TRUTH)
     tails = [empty] * len(rows)
     own: list[tuple[float, str]] = []
@@ -112,7 +115,6 @@ def _with_truth(time: FloatArray, rows: list[str], truth: Trajectory) -> list[st
             own.append((t, f"{t!r}{',' * len(IMU)},{text}"))
     whole = [row + tail for row, tail in zip(rows, tails, strict=True)]
     # Rows of truth go before the first IMU row that is later; the IMU's own order stays.
-    newest = np.maximum.accumulate(np.nan_to_num(time, nan=-np.inf))
     places = np.searchsorted(newest, [t for t, _ in own]).tolist()
     merged: list[str] = []
     taken = 0

@@ -1,0 +1,156 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.checks import check_units, with_units
+from stario.sequences.errors import InputError
+from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.walks import CARRY_WAYS, WalkStyle, generate_walk
+
+DATA = Path(
+    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+)
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(4, 30.0, style=WalkStyle()), rate=200.0)
+
+
+def in_degrees(sequence: ImuSequence) -> ImuSequence:
+    return replace(sequence, gyro=np.degrees(sequence.gyro))
+
+
+def without_gravity(sequence: ImuSequence) -> ImuSequence:
+    assert sequence.truth is not None
+    return replace(sequence, accel=sequence.accel - sequence.truth.attitude_WB.apply(UP, True))
+
+
+def refused(sequence: ImuSequence) -> str:
+    with pytest.raises(InputError) as caught:
+        check_units(sequence)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(sequence.name)
+    return text
+
+
+@pytest.mark.parametrize("carry", CARRY_WAYS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
+    """Swinging arms and pockets turn fast and press the device outward: still rad/s and m/s^2."""
+    style = WalkStyle(carry=carry, preferred_speed=1.4, vigor=1.5)
+    walk = simulate_imu(generate_walk(seed, 30.0, style=style), 100.0, PHONE_IMU, seed)
+    check_units(walk)
+    check_units(walk.without_truth())
+    assert "--gyro-unit deg/s" in refused(in_degrees(walk).without_truth())
+    assert "--accel-unit g" in refused(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
+    assert "not linear or user acceleration" in refused(without_gravity(walk))
+
+
+def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
+    """In deg/s even a bias of 0.01 rad/s turns gravity away within seconds."""
+    t = np.arange(2001) / 100.0
+    rest = Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
+    still = simulate_imu(rest, 100.0, PHONE_IMU).without_truth()
+    biased = replace(still, gyro=still.gyro + np.array([0.01, -0.004, 0.002]))
+    check_units(still)
+    check_units(biased)
+    assert "accelerometer does not see" in refused(in_degrees(biased))
+    assert "accelerometer" in refused(replace(still, accel=still.accel - UP))
+
+
+def test_both_wrong_are_told_one_after_the_other(walk: ImuSequence) -> None:
+    both = in_degrees(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
+    assert "--gyro-unit deg/s" in refused(both)
+    half = with_units(both, gyro_unit="deg/s")
+    assert "--accel-unit g" in refused(half)
+    check_units(with_units(half, accel_unit="g"))
+
+
+def test_force_in_a_unit_nobody_knows_is_refused(walk: ImuSequence) -> None:
+    for factor in (1000.0 / STANDARD_GRAVITY, 100.0, 0.5, STANDARD_GRAVITY):
+        assert "accelerometer" in refused(replace(walk, accel=factor * walk.accel))
+    assert "accelerometer" in refused(replace(walk, accel=0.0 * walk.accel))
+
+
+def test_a_turned_sign_is_seen_in_a_true_attitude_only(walk: ImuSequence) -> None:
+    apple = replace(walk, accel=-walk.accel)
+    assert "--accel-unit=-m/s^2" in refused(apple)
+    check_units(with_units(apple, accel_unit="-m/s^2"))
+    check_units(apple.without_truth())
+
+
+def test_a_truth_with_its_quaternion_in_another_order_is_refused(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    shuffled = Rotation.from_quat(walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
+    text = refused(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
+    assert "x y z w" in text
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_time_in_another_unit_is_named(walk: ImuSequence, unit: str) -> None:
+    factor = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+    alone = walk.without_truth()
+    assert f"`t [{unit}]`" in refused(replace(alone, time=factor * alone.time))
+    assert "`t [s]`" in refused(replace(alone, time=alone.time / factor))
+
+
+def test_a_rate_out_of_range_is_told(walk: ImuSequence) -> None:
+    slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
+    assert "found 10 samples/s, expected 50 to 1000" in refused(slow)
+
+
+def test_too_short_and_empty_of_numbers(walk: ImuSequence) -> None:
+    assert "duration" in refused(walk.without_truth().slice(0.0, 1.2))
+    check_units(walk.without_truth().slice(0.0, 1.6))
+    one = ImuSequence("one", walk.time[:1], walk.gyro[:1], walk.accel[:1])
+    assert "samples: found 1" in refused(one)
+    for field in ("time", "gyro", "accel"):
+        void = replace(walk.without_truth(), **{field: np.nan * getattr(walk, field)})
+        assert f"{field}: found no finite sample" in refused(void)
+    never = ImuSequence("never", walk.time, walk.gyro.copy(), walk.accel.copy())
+    never.gyro[::2], never.accel[1::2] = np.nan, np.nan
+    assert "usable" in refused(never)
+
+
+def test_bad_samples_do_not_disturb_the_check(walk: ImuSequence) -> None:
+    rng = np.random.default_rng(0)
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    gyro[rng.integers(0, len(gyro), 200)] = np.nan
+    accel[rng.integers(0, len(gyro), 200), 1] = np.inf
+    time[500], time[700] = time[499], time[600]
+    keep = rng.random(len(time)) > 0.2
+    dirty = ImuSequence("dirty", time[keep], gyro[keep], accel[keep])
+    check_units(dirty)
+    assert "--gyro-unit" in refused(in_degrees(dirty))
+
+
+def test_units_by_name(walk: ImuSequence) -> None:
+    assert np.array_equal(with_units(walk).gyro, walk.gyro)
+    assert np.allclose(with_units(in_degrees(walk), "deg/s").gyro, walk.gyro)
+    assert np.allclose(with_units(walk, accel_unit="g").accel, STANDARD_GRAVITY * walk.accel)
+    assert with_units(walk).truth is walk.truth
+    with pytest.raises(InputError, match="gyro_unit: found 'rpm', expected one of rad/s, deg/s"):
+        with_units(walk, gyro_unit="rpm")
+    with pytest.raises(InputError, match="accel_unit: found 'mg'"):
+        with_units(walk, accel_unit="mg")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
+def test_recordings_pass_and_their_units_are_told() -> None:
+    for path in find_recordings(DATA)[::3]:
+        recording = read_recording(path)
+        check_units(recording)
+        assert "--gyro-unit deg/s" in refused(in_degrees(recording))
+        alone = recording.without_truth()
+        in_g = replace(alone, accel=alone.accel / STANDARD_GRAVITY)
+        assert "--accel-unit g" in refused(in_g)
+        assert "points down" in refused(replace(recording, accel=-recording.accel))

@@ -1,0 +1,209 @@
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
+from stario.sequences.readers.own_csv import read_own_csv
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulate import simulate_imu
+from stario.sequences.walks import WalkStyle, generate_walk
+
+ROW = "0.1,0.2,0.3,1.0,2.0,9.0"
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(4, 10.0, style=WalkStyle()), rate=200.0)
+
+
+def written(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_what_is_written_comes_back_to_the_last_bit(tmp_path: Path, walk: ImuSequence) -> None:
+    write_csv(tmp_path / "walk.csv", walk)
+    read = read_recording(tmp_path / "walk.csv")
+    assert read.name == "walk"
+    assert np.array_equal(read.time, walk.time)
+    assert np.array_equal(read.gyro, walk.gyro)
+    assert np.array_equal(read.accel, walk.accel)
+    assert read.truth is not None
+    assert walk.truth is not None
+    assert np.array_equal(read.truth.time, walk.truth.time)
+    assert np.array_equal(read.truth.position_W, walk.truth.position_W)
+    off = (read.truth.attitude_WB.inv() * walk.truth.attitude_WB).magnitude()
+    assert off.max() < 1e-15
+
+
+def test_without_truth_there_is_none(tmp_path: Path, walk: ImuSequence) -> None:
+    write_csv(tmp_path / "walk.csv", walk.without_truth())
+    assert (tmp_path / "walk.csv").read_text().startswith(HEADER + "\n0.0,")
+    read = read_own_csv(tmp_path / "walk.csv")
+    assert read.truth is None
+    assert np.array_equal(read.accel, walk.accel)
+
+
+def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence) -> None:
+    """As motion capture gives it: other times, before and after the IMU, some not valid."""
+    time = np.arange(-1.003, 11.0, 1.0 / 120.0)
+    valid = np.ones(len(time), dtype=np.bool_)
+    valid[300:400] = False
+    spin = Rotation.from_rotvec(np.outer(time, [0.1, 0.2, 0.3]))
+    position = np.stack([time, np.sin(time), 0.1 * time], axis=1)
+    truth = Trajectory(time, position, spin, valid=valid)
+    shifted = ImuSequence("walk", walk.time + 5e-4, walk.gyro, walk.accel, truth)
+    write_csv(tmp_path / "walk.csv", shifted)
+    read = read_own_csv(tmp_path / "walk.csv")
+    assert np.array_equal(read.gyro, walk.gyro)
+    assert np.abs(read.time - walk.time).max() < 1e-15
+    assert read.truth is not None
+    assert np.abs(read.truth.time - (time[valid] - 5e-4)).max() < 1e-14
+    assert np.array_equal(read.truth.position_W, position[valid])
+    assert read.truth.valid.all()
+    assert not read.truth.at(np.array([time[350]])).valid.any()
+
+
+def test_bad_samples_and_their_order_survive(tmp_path: Path, walk: ImuSequence) -> None:
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    time[5], time[7] = time[4], time[3]
+    gyro[9], accel[11, 1] = np.nan, np.inf
+    gyro[12], accel[12] = np.nan, np.nan
+    bad = ImuSequence("bad", time, gyro, accel, walk.truth)
+    write_csv(tmp_path / "bad.csv", bad)
+    read = read_own_csv(tmp_path / "bad.csv")
+    assert np.array_equal(read.time, time)
+    assert np.array_equal(read.gyro, gyro, equal_nan=True)
+    assert np.array_equal(read.accel, accel, equal_nan=True)
+    assert read.truth is not None
+    assert walk.truth is not None
+    assert np.array_equal(read.truth.position_W, walk.truth.position_W)
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_second"), [("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9), ("µs", 10**6)]
+)
+def test_time_is_read_exactly_from_any_epoch(tmp_path: Path, unit: str, per_second: int) -> None:
+    start_ns = 1520531124153717567
+    steps = np.cumsum([0, 5000001, 4999998, 5000013])
+    digits = len(str(per_second)) - 1
+    rows = []
+    for step in steps.tolist():
+        whole = str(start_ns + step)
+        cut = len(whole) - 9 + digits
+        rows.append(f"{whole[:cut]}.{whole[cut:]}".rstrip(".") + f",{ROW}")
+    header = f"timestamp [{unit}],gx,gy,gz,ax,ay,az"
+    read = read_own_csv(written(tmp_path / "epoch.csv", header, *rows))
+    assert read.time.tolist() == [step / 1e9 for step in steps.tolist()]
+
+
+def test_units_are_brought_to_si(tmp_path: Path) -> None:
+    def read(header: str) -> tuple[FloatArray, FloatArray]:
+        imu = read_own_csv(written(tmp_path / "units.csv", header, f"0,{ROW}"))
+        return imu.gyro[0], imu.accel[0]
+
+    gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.0])
+    for header in (HEADER, "t,gx,gy,gz,ax,ay,az", "#t [s], gx [rad s^-1],gy (rad/s),gz,ax,ay,az"):
+        assert np.allclose(read(header), (gyro, accel), rtol=1e-15)
+    header = "t,gx [deg/s],gy [dps],gz [°/s],ax [g],ay [G],az (g)"
+    assert np.allclose(read(header), (np.radians(gyro), STANDARD_GRAVITY * accel))
+    header = "t,gx,gy,gz,ax [-g],ay [-g],az [-g]"
+    assert np.allclose(read(header), (gyro, -STANDARD_GRAVITY * accel))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z",
+        "Timestamp [s],wx,wy,wz,accel_x,accel_y,accel_z",
+        '"t","gyroscope_x","gyroscope_y","gyroscope_z","acce_x","acce_y","acce_z"',
+        "#timestamp,w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z,a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z",
+    ],
+)
+def test_common_names_are_understood(tmp_path: Path, header: str) -> None:
+    read = read_recording(written(tmp_path / "names.csv", header, f"0,{ROW}", f"0.01,{ROW}"))
+    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
+    assert np.allclose(read.accel, [1.0, 2.0, 9.0])
+
+
+def test_order_is_free_and_unknown_columns_are_ignored(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = written(
+        tmp_path / "order.csv",
+        "# phone in the left hand",
+        "",
+        "activity,az,ay,ax,temperature [C],gz,gy,gx,qw,t [ms]",
+        "walk,9.0,2.0,1.0,30,0.3,0.2,0.1,1,1000",
+        "stand, 9.0, 2.0 ,1.0,,0.3,0.2,0.1,1,1010",
+    )
+    with caplog.at_level(logging.INFO):
+        read = read_own_csv(path)
+    assert "activity, temperature, qw" in caplog.text
+    assert read.time.tolist() == [0.0, 0.01]
+    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
+    assert np.allclose(read.accel, [1.0, 2.0, 9.0])
+
+
+def test_slower_truth_is_valid_on_its_rows_only(tmp_path: Path) -> None:
+    rows = [
+        f"{0.01 * k},{ROW}," + (f"{k},0,1,0,0,0,1" if k % 5 == 0 else ",,,,,,") for k in range(21)
+    ]
+    rows[20] = rows[20].replace("20,0,1", "20,,nan")
+    path = written(tmp_path / "slow.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+    read = read_own_csv(path)
+    assert len(read) == 21
+    assert read.truth is not None
+    assert np.allclose(read.truth.time, [0.0, 0.05, 0.1, 0.15])
+    assert np.allclose(read.truth.position_W[:, 0], [0, 5, 10, 15])
+    none = [row.rsplit(",", 7)[0] + ",,,,,,," for row in rows]
+    assert read_own_csv(written(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
+
+
+GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        (GOOD[1:], "line 1, header: found '0,0.1,0.2"),
+        ([HEADER.replace("gz", "yaw"), *GOOD[1:]], "header: found no gz, expected t [s],gx"),
+        ([HEADER.replace("gx [rad/s]", "gx [rpm]"), *GOOD[1:]], "gx: found unit 'rpm', expected"),
+        ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "t: found unit 'min', expected s, ms"),
+        ([HEADER.replace("ax [m/s^2]", "ax [deg/s]"), *GOOD[1:]], "ax: found unit 'deg/s'"),
+        ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found wx beside gx"),
+        ([HEADER + ",px,py,pz,qx", *GOOD[1:]], "found no qy, qz, qw"),
+        ([HEADER + ",px [mm],py,pz,qx,qy,qz,qw", *GOOD[1:]], "px: found unit 'mm', expected m"),
+        ([HEADER.replace(",", ";"), *GOOD[1:]], "header: found 't [s];gx"),
+        ([*GOOD[:3], "0.02,0.1,0.2"], "line 4: found 3 values, expected 7; is the file cut short?"),
+        ([*GOOD[:3], "0.02,0.1,0.2,x,1,2,9"], "line 4, gz: found 'x', expected a number"),
+        ([*GOOD[:3], "noon,0.1,0.2,0.3,1,2,9"], "line 4, t: found 'noon', expected a time"),
+        ([*GOOD[:3], f",{ROW}"], "line 4, t: found '', expected a time"),
+        (GOOD[:1], "rows: found none below the header"),
+        (["# nothing else"], "header: found only comments"),
+        ([""], "file: found no line"),
+        (
+            [f"{HEADER},{TRUTH_HEADER}", f"0,{ROW},1,2,3,0,0,0,1", f"1,{ROW},1,2,3,0,0,0,0"],
+            "line 3, qx qy qz qw: found norm 0, expected a unit quaternion",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, lines: list[str], told: str) -> None:
+    path = written(tmp_path / "own.csv", *lines)
+    with pytest.raises(ReadError) as caught:
+        read_own_csv(path)
+    assert "own.csv" in str(caught.value)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, walk: ImuSequence) -> None:
+    with pytest.raises(InputError, match="existing folder"):
+        write_csv(tmp_path / "missing" / "walk.csv", walk)
+    write_csv(tmp_path / "walk.csv", walk)
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.csv"]
