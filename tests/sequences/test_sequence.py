@@ -1,0 +1,175 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z, tilt_aligning, wrap_angle, yaw_of
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+
+def screw(time: FloatArray) -> Trajectory:
+    """Constant velocity and constant body rate: linear interpolation and slerp are exact."""
+    position = np.outer(time, [1.0, -2.0, 0.5])
+    spin = Rotation.from_rotvec(np.outer(time, [0.3, 0.4, -0.5]))
+    covariance = np.outer(1.0 + time, np.eye(3)).reshape(-1, 3, 3)
+    velocity = np.tile([1.0, -2.0, 0.5], (len(time), 1))
+    return Trajectory(time, position, spin, velocity, covariance)
+
+
+def marked(track: Trajectory, lost: slice) -> Trajectory:
+    """The track with nonsense where it is marked as not valid."""
+    valid = np.ones(len(track), dtype=np.bool_)
+    valid[lost] = False
+    position = np.where(valid[:, None], track.position_W, np.nan)
+    return Trajectory(track.time, position, track.attitude_WB, valid=valid)
+
+
+GRID = np.arange(101) / 50.0
+
+
+def test_interpolation_follows_a_screw_motion_exactly() -> None:
+    time = np.sort(np.random.default_rng(0).uniform(0.0, 2.0, 300))
+    read, true = screw(GRID).at(time), screw(time)
+    assert read.valid.all()
+    assert np.abs(read.position_W - true.position_W).max() < 1e-12
+    assert (read.attitude_WB.inv() * true.attitude_WB).magnitude().max() < 1e-7
+    assert read.velocity_W is not None
+    assert np.allclose(read.velocity_W, [1.0, -2.0, 0.5])
+    assert read.position_covariance_W is not None
+    assert np.allclose(read.position_covariance_W, np.einsum("n,ij->nij", 1 + time, np.eye(3)))
+
+
+def test_interpolation_at_its_own_samples_changes_nothing() -> None:
+    track = screw(GRID)
+    again = track.at(track.time)
+    assert np.array_equal(again.position_W, track.position_W)
+    assert again.valid.all()
+
+
+def test_nothing_is_valid_outside_a_track() -> None:
+    read = screw(GRID).at(np.array([-0.01, 0.0, 2.0, 2.01]))
+    assert read.valid.tolist() == [False, True, True, False]
+
+
+@pytest.mark.parametrize("missing", [False, True], ids=["marked", "missing"])
+def test_interpolation_never_crosses_a_gap(missing: bool) -> None:
+    """Rows 40 to 54 are lost: 0.8 to 1.08 s; both neighbours (0.78 and 1.1 s) stay valid."""
+    kept = np.delete(np.arange(len(GRID)), np.arange(40, 55))
+    track = screw(GRID[kept]) if missing else marked(screw(GRID), slice(40, 55))
+    time = np.array([0.77, 0.78, 0.781, 0.9, 1.099, 1.1, 1.11])
+    read = track.at(time)
+    assert read.valid.tolist() == [True, True, False, False, False, True, True]
+    assert np.isfinite(read.position_W).all()
+    wider = track.at(time, max_gap=0.5)
+    assert wider.valid.all()
+    assert np.allclose(wider.position_W, screw(time).position_W)
+
+
+def test_short_losses_are_bridged_by_valid_neighbours_alone() -> None:
+    read = marked(screw(GRID), slice(40, 43)).at(GRID)
+    assert read.valid.all()
+    assert np.allclose(read.position_W, screw(GRID).position_W)
+
+
+def test_interpolation_needs_two_valid_samples() -> None:
+    with pytest.raises(InputError, match="0 valid samples"):
+        marked(screw(GRID), slice(None)).at(GRID)
+
+
+def test_a_slice_keeps_both_ends() -> None:
+    part = screw(GRID).slice(0.5, 1.0)
+    assert part.time[0] == 0.5
+    assert part.time[-1] == 1.0
+    assert part.velocity_W is not None
+    assert len(part) == len(part.attitude_WB) == len(part.velocity_W) == 26
+
+
+def test_path_length_is_of_the_way_and_not_of_the_noise() -> None:
+    time = np.arange(1001) / 100.0
+    circle = np.stack([np.cos(0.5 * time), np.sin(0.5 * time), 0 * time], axis=1)
+    rest = Rotation.identity(len(time))
+    assert Trajectory(time, circle, rest).path_length() == pytest.approx(5.0, rel=0.02)
+    noisy = circle + 0.01 * np.random.default_rng(0).standard_normal(circle.shape)
+    assert Trajectory(time, noisy, rest).path_length() == pytest.approx(5.0, rel=0.03)
+    assert marked(Trajectory(time, circle, rest), slice(1, None)).path_length() == 0.0
+
+
+def test_a_trajectory_is_checked_at_the_edge() -> None:
+    track = screw(GRID)
+    back, bad = GRID.copy(), track.position_W.copy()
+    back[7] = back[6]
+    bad[5, 1] = np.nan
+    with pytest.raises(InputError, match=r"time: found .* at row 7, expected strictly increasing"):
+        Trajectory(back, track.position_W, track.attitude_WB)
+    with pytest.raises(InputError, match="time: found a value that is not finite"):
+        Trajectory(np.where(GRID > 1.0, np.nan, GRID), track.position_W, track.attitude_WB)
+    with pytest.raises(InputError, match="position_W: found a value that is not finite at row 5"):
+        Trajectory(GRID, bad, track.attitude_WB)
+    with pytest.raises(InputError, match=r"position_W: found shape \(101, 2\)"):
+        Trajectory(GRID, track.position_W[:, :2], track.attitude_WB)
+    with pytest.raises(InputError, match="attitude_WB: found 100 rotations, expected 101"):
+        Trajectory(GRID, track.position_W, track.attitude_WB[1:])
+    with pytest.raises(InputError, match="valid: found shape"):
+        Trajectory(GRID, track.position_W, track.attitude_WB, valid=np.ones(3, dtype=np.bool_))
+    with pytest.raises(InputError, match="time"):
+        screw(np.empty(0))
+
+
+def test_an_imu_sequence_is_checked_for_shape_alone() -> None:
+    """Bad samples are the navigator's to drop and count."""
+    time, zeros = np.array([0.0, 0.01, 0.01, np.nan]), np.zeros((4, 3))
+    sequence = ImuSequence("odd", time, np.nan * zeros, zeros)
+    assert len(sequence) == 4
+    assert sequence.rate == pytest.approx(100.0)
+    assert sequence.duration == pytest.approx(0.01)
+    with pytest.raises(InputError, match=r"gyro: found shape \(3, 3\), expected \(4, 3\) as time"):
+        ImuSequence("odd", time, zeros[1:], zeros)
+    with pytest.raises(InputError, match="accel"):
+        ImuSequence("odd", time, zeros, zeros[:, :2])
+    with pytest.raises(InputError, match="time"):
+        ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+
+
+def test_a_sequence_is_cut_with_its_truth() -> None:
+    zeros = np.zeros((len(GRID), 3))
+    sequence = ImuSequence("cut", GRID, zeros, zeros, screw(GRID))
+    part = sequence.slice(0.5, 1.0)
+    assert part.truth is not None
+    assert np.array_equal(part.time, part.truth.time)
+    assert part.duration == 0.5
+    assert sequence.rate == pytest.approx(50.0)
+    assert sequence.without_truth().truth is None
+
+
+def test_about_z_and_yaw_are_each_others_inverse() -> None:
+    yaw = np.linspace(-3.1, 3.1, 63)
+    assert np.allclose(yaw_of(about_z(yaw)), yaw)
+    assert np.allclose(about_z(0.5 * np.pi).apply([1.0, 0.0, 0.0]), [0.0, 1.0, 0.0])
+
+
+def test_turning_the_world_adds_to_the_yaw_at_any_tilt() -> None:
+    attitudes = Rotation.random(200, rng=np.random.default_rng(1))
+    for yaw in (-2.0, 0.3, 3.0):
+        turned = yaw_of(about_z(yaw) * attitudes)
+        assert np.allclose(wrap_angle(turned - yaw_of(attitudes) - yaw), 0.0, atol=1e-9)
+
+
+def test_wrapped_angles_lie_in_half_open_turn() -> None:
+    angle = np.linspace(-20.0, 20.0, 1001)
+    wrapped = wrap_angle(angle)
+    assert (wrapped > -np.pi).all()
+    assert (wrapped <= np.pi).all()
+    assert np.allclose(np.exp(1j * wrapped), np.exp(1j * angle))
+    assert wrap_angle(np.array([-np.pi]))[0] == pytest.approx(np.pi)
+
+
+def test_tilt_aligning_takes_up_to_z_by_the_shortest_way() -> None:
+    rng = np.random.default_rng(2)
+    for up in rng.standard_normal((100, 3)):
+        R_WB = tilt_aligning(9.8 * up)
+        assert np.allclose(R_WB.apply(up / np.linalg.norm(up)), [0.0, 0.0, 1.0])
+        angle = np.arccos(up[2] / np.linalg.norm(up))
+        assert R_WB.magnitude() == pytest.approx(angle, abs=1e-7)
+        assert yaw_of(R_WB)[0] == pytest.approx(0.0, abs=1e-9)
+    for up in ([0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [1e-9, 0.0, -1.0]):
+        assert np.allclose(tilt_aligning(np.array(up)).apply(up)[2], np.linalg.norm(up))

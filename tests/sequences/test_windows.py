@@ -1,0 +1,169 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulate import PERFECT_IMU, simulate_imu
+from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.windows import clean_samples, resample, windows_of, world_streams
+
+
+@pytest.fixture(scope="module")
+def track() -> Trajectory:
+    return generate_walk(5, 20.0, rate=200.0, style=WalkStyle(carry="handheld"))
+
+
+@pytest.fixture(scope="module")
+def walk(track: Trajectory) -> ImuSequence:
+    return simulate_imu(track, rate=200.0, errors=PERFECT_IMU)
+
+
+def truth_of(sequence: ImuSequence) -> Trajectory:
+    assert sequence.truth is not None
+    return sequence.truth
+
+
+def smooth(time: FloatArray) -> FloatArray:
+    return np.stack([np.sin(2 * np.pi * f * time + f) for f in (0.5, 1.0, 2.0)], axis=1)
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 199.36, 200.0, 500.0, 1000.0])
+def test_resampling_reproduces_a_smooth_signal(rate: float) -> None:
+    time = np.arange(0.0, 4.0, 1.0 / rate)
+    grid = np.arange(time[0], time[-1], 1.0 / 200.0)
+    # A chord of a sine at f is off by (pi f / rate)^2 / 2; averaging over a step by less.
+    bound = 1.1 * (np.pi * 2.0 / min(rate, 200.0)) ** 2 / 2.0
+    assert np.abs(resample(time, smooth(time), grid) - smooth(grid))[1:-1].max() < bound
+
+
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+def test_resampling_stands_jitter_and_drops(rate: float) -> None:
+    rng = np.random.default_rng(0)
+    time = np.arange(0.0, 4.0, 1.0 / rate) + rng.uniform(-0.3, 0.3, round(4 * rate)) / rate
+    time = time[rng.random(len(time)) > 0.1]
+    grid = np.arange(time[0], time[-1], 1.0 / 200.0)
+    # A chord over the longest hole, of a sine at 2 Hz; uneven steps leave some of their own.
+    bound = (2.0 * np.pi * 2.0 * max(np.diff(time).max(), 1.0 / 200.0)) ** 2 / 8.0
+    assert np.abs(resample(time, smooth(time), grid) - smooth(grid))[1:-1].max() < bound + 0.005
+
+
+def test_faster_sensors_are_averaged_and_do_not_alias() -> None:
+    time = np.arange(0.0, 4.0, 1e-3)
+    grid = np.arange(0.0, 3.9, 1.0 / 200.0)
+    buzz = np.sin(2 * np.pi * 200.0 * time + 0.5)[:, None]  # picked out, it would be constant
+    assert np.abs(resample(time, buzz, grid)[1:-1]).max() < 0.05
+    noise = np.random.default_rng(0).standard_normal((len(time), 1))
+    assert resample(time, noise, grid).std() < 0.6
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 199.36, 500.0, 1000.0])
+def test_streams_of_any_rate_show_the_same_walk(
+    track: Trajectory, walk: ImuSequence, rate: float
+) -> None:
+    (true,) = world_streams(walk)
+    (stream,) = world_streams(simulate_imu(track, rate=rate, errors=PERFECT_IMU))
+    n = min(len(true), len(stream))
+    off = np.abs(stream.imu_W[:n] - true.imu_W[:n])[2:-2]
+    assert off[:, :3].mean() < (0.05 if rate < 200.0 else 0.01)
+    assert off[:, 3:].mean() < (0.1 if rate < 200.0 else 0.02)
+    assert np.abs(stream.position_W[:n] - true.position_W[:n]).max() < 2e-3
+
+
+def test_the_target_is_the_displacement_of_the_windows_second(walk: ImuSequence) -> None:
+    (stream,) = world_streams(walk)
+    windows, targets = windows_of(stream, stride=50)
+    assert windows.shape == (len(targets), 6, 200)
+    truth = truth_of(walk)
+    for k in range(len(targets)):
+        start, stop = truth.time[50 * k], truth.time[50 * k] + 1.0
+        ends = truth.at(np.array([start, stop])).position_W
+        assert np.abs(targets[k] - (ends[1] - ends[0])).max() < 1e-5
+        part = slice(50 * k, 50 * k + 200)
+        force = truth.attitude_WB[part].apply(walk.accel[part])
+        assert np.abs(windows[k, 3:].T - force).max() < 1e-4
+        rate = truth.attitude_WB[part].apply(walk.gyro[part])
+        assert np.abs(windows[k, :3].T - rate).max() < 1e-5
+
+
+def test_a_window_holds_the_motion_of_its_target(walk: ImuSequence) -> None:
+    """Force integrated twice from the true first velocity gives the target: no shift in time."""
+    (stream,) = world_streams(walk)
+    velocity = truth_of(walk).velocity_W
+    assert velocity is not None
+    windows, targets = windows_of(stream, stride=100)
+    for k, (window, target) in enumerate(zip(windows, targets, strict=True)):
+        accel = window[3:].T.astype(np.float64) - [0.0, 0.0, 9.80665]
+        lasting = 1.0 - np.arange(200) / 200.0
+        lasting[0] = 0.5  # the trapezoidal rule
+        moved = velocity[100 * k] + (accel * lasting[:, None]).sum(axis=0) / 200.0
+        assert np.abs(moved - target).max() < 0.004
+
+
+def test_no_window_spans_a_gap_of_the_truth(walk: ImuSequence) -> None:
+    truth = truth_of(walk)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    valid[1600:1700] = False
+    streams = world_streams(replace(walk, truth=replace(truth, valid=valid)))
+    assert len(streams) == 2
+    assert len(streams[0]) == pytest.approx(1600, abs=1)
+    assert len(streams[1]) == pytest.approx(len(truth) - 1700, abs=2)
+    ends = truth.position_W[1700], truth.position_W[1900]
+    assert np.allclose(windows_of(streams[1], 200)[1][0], ends[1] - ends[0], atol=0.01)
+
+
+def test_no_window_spans_a_gap_of_the_imu(walk: ImuSequence) -> None:
+    kept = (walk.time < 8.0) | (walk.time > 8.3)
+    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    first, second = world_streams(holed)
+    assert len(first) / 200.0 == pytest.approx(8.0, abs=0.011)
+    assert len(second) / 200.0 == pytest.approx(11.7, abs=0.011)
+
+
+def test_short_gaps_are_bridged_and_short_stretches_dropped(walk: ImuSequence) -> None:
+    kept = (walk.time < 8.0) | (walk.time > 8.05)
+    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    assert len(world_streams(holed)) == 1
+    truth = truth_of(walk)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    valid[1000:1100] = valid[1300:1400] = False
+    assert len(world_streams(replace(walk, truth=replace(truth, valid=valid)))) == 2
+
+
+def test_turning_the_world_turns_window_and_target_alike(walk: ImuSequence) -> None:
+    truth, turn = truth_of(walk), about_z(2.1)
+    turned = replace(
+        walk,
+        truth=Trajectory(truth.time, turn.apply(truth.position_W), turn * truth.attitude_WB),
+    )
+    (stream,), (other,) = world_streams(walk), world_streams(turned)
+    windows, targets = windows_of(stream, 100)
+    turned_windows, turned_targets = windows_of(other, 100)
+    assert np.abs(turn.apply(targets) - turned_targets).max() < 1e-5
+    for k in (slice(0, 3), slice(3, 6)):
+        rows = turn.apply(windows[:, k].transpose(0, 2, 1).reshape(-1, 3))
+        assert np.abs(rows - turned_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
+
+
+def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    time[10], time[20], time[30] = time[9], time[5], np.nan
+    gyro[40], accel[50, 2] = np.nan, np.inf
+    kept, _, _ = clean_samples(ImuSequence("bad", time, gyro, accel))
+    expected = np.delete(walk.time, [10, 20, 30, 40, 50])
+    assert np.array_equal(kept, expected)
+    (stream,) = world_streams(ImuSequence("bad", time, gyro, accel, walk.truth))
+    (true,) = world_streams(walk)
+    assert np.isfinite(stream.imu_W).all()
+    assert np.abs(stream.position_W - true.position_W).max() < 1e-4
+
+
+def test_what_gives_no_windows_is_refused(walk: ImuSequence) -> None:
+    with pytest.raises(InputError, match="truth: found none"):
+        world_streams(walk.without_truth())
+    with pytest.raises(InputError, match="is the time column in seconds"):
+        world_streams(replace(walk, time=1e3 * walk.time))
+    with pytest.raises(InputError, match="0 usable"):
+        clean_samples(replace(walk, gyro=np.nan * walk.gyro))
