@@ -17,7 +17,7 @@ from torch.nn import functional as F
 WIDTHS = (64, 128, 192, 256)
 BLOCKS = (2, 2, 2, 2)
 _LENGTH_AT_HEAD = 3
-_EPSILON = 1e-5
+EPSILON = 1e-5
 
 
 def moments(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
@@ -28,7 +28,7 @@ def moments(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """
     mean = x.mean(dim, keepdim=True)
     square = (x * x).mean(dim, keepdim=True)
-    return mean, torch.sqrt(torch.clamp(square - mean * mean, min=0.0) + _EPSILON)
+    return mean, torch.sqrt(torch.clamp(square - mean * mean, min=0.0) + EPSILON)
 
 
 class Wing(nn.Module):
@@ -100,7 +100,7 @@ def rms_normalised(x: Tensor) -> Tensor:
     Star products have heavy tails and a softmax gate averages 1/C: without this the blocks start
     almost silent and single batches explode later. It has no parameter, so the counts stay.
     """
-    return x * torch.rsqrt((x * x).mean(dim=(1, 2), keepdim=True) + _EPSILON)
+    return x * torch.rsqrt((x * x).mean(dim=(1, 2), keepdim=True) + EPSILON)
 
 
 class Block(nn.Module):
