@@ -7,12 +7,14 @@ TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
 
@@ -49,6 +51,9 @@ class WindowSampler:
         weights: relative frequency of each stream per second of it.
         augmentation: how far windows are varied.
         seed: of all randomness.
+
+    Raises:
+        InputError: a stream is too short.
     """
 
     def __init__(
@@ -59,12 +64,17 @@ class WindowSampler:
         seed: int,
     ) -> None:
         self.augmentation = augmentation
-        reach = int(WINDOW_SAMPLES * augmentation.speeds[1]) + 2
+        # Windows that are not replayed keep speed 1.
+        reach = math.ceil(WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
+        for stream in streams:
+            if len(stream) < reach:
+                found = f"a stretch of {len(stream)} samples"
+                raise InputError(stream.name, found, f"at least {reach}, the fastest replay's")
         self._imu = torch.cat([torch.from_numpy(s.imu_W) for s in streams])
         self._position = torch.cat([torch.from_numpy(s.position_W) for s in streams])
         first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
         self._first = first
-        self._starts = torch.tensor([max(len(s) - reach, 1) for s in streams])
+        self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
         share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
         self._cumulative = (share / share.sum()).cumsum(0)
         self.generator = torch.Generator().manual_seed(seed)
@@ -73,7 +83,8 @@ class WindowSampler:
         """Windows (size, 6, 200) and displacements (size, 3) [m], augmented."""
         uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
         stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._first) - 1)
-        offset = self._uniform(size).double() * (self._starts[stream] - 1)
+        # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
+        offset = (self._uniform(size).double() * self._starts[stream]).floor()
         speed = self._speeds(size)
         start = self._first[stream].double() + offset
         steps = torch.arange(WINDOW_SAMPLES + 1, dtype=torch.float64)
