@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,7 @@ def read_card(weights: Path) -> Card:
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
         card = Card(calibration=calibration, **content)
+        _check_values(card)
     except (ValueError, TypeError, KeyError, AttributeError, UnicodeDecodeError) as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
     _check(card, path)
@@ -109,6 +111,15 @@ def read_card(weights: Path) -> Card:
             "the file is cut short or belongs to another card",
         )
     return card
+
+
+def _check_values(card: Card) -> None:
+    for name in ("architecture", "sha256"):
+        if not isinstance(getattr(card, name), str):
+            raise ValueError(f"{name} is {getattr(card, name)!r}")
+    for name, factors in asdict(card.calibration).items():
+        if len(factors) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in factors):
+            raise ValueError(f"calibration.{name} is {factors!r}")
 
 
 def _check(card: Card, path: Path) -> None:

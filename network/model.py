@@ -147,13 +147,18 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
         folder = importlib.resources.files("stario.network.weights")
         path = Path(str(folder.joinpath("default.safetensors")))
     card = read_card(path)
+    if card.architecture not in ARCHITECTURES:
+        known = f"one of {', '.join(ARCHITECTURES)}"
+        raise WeightsError(card_path(path), "architecture", repr(card.architecture), known)
     network = DisplacementNetwork(build_network(card.architecture))
     try:
-        state = safetensors.torch.load_file(path)
-        network.network.load_state_dict(state)
+        network.network.load_state_dict(safetensors.torch.load_file(path))
     except (safetensors.SafetensorError, RuntimeError) as error:
-        found = str(error).splitlines()[0]
-        raise WeightsError(path, "weights", found, f"tensors of {card.architecture}") from error
+        # PyTorch lists what does not fit below a headline that says nothing.
+        lines = [line.strip() for line in str(error).splitlines()]
+        raise WeightsError(
+            path, "weights", lines[min(1, len(lines) - 1)], f"tensors of {card.architecture}"
+        ) from error
     return DisplacementModel(network, card)
 
 
