@@ -83,13 +83,12 @@ class GatedUnit(nn.Module):
         self.value = nn.Conv1d(channels, channels, 3, padding=1, groups=channels)
         self.squeeze = nn.Linear(channels, channels // 2, bias=False)
         self.excite = nn.Linear(channels // 2, channels, bias=False)
-        self.softmax = nn.Softmax(dim=1)
         self.project = nn.Conv1d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, L) to (B, C, L)."""
         x = self.norm(x)
-        gate = self.softmax(self.excite(F.relu(self.squeeze(x.mean(dim=2)))))
+        gate = F.softmax(self.excite(F.relu(self.squeeze(x.mean(dim=2)))), dim=1)
         gated: Tensor = self.project(rms_normalised(self.value(x) * gate.unsqueeze(2)))
         return gated
 

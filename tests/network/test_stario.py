@@ -1,0 +1,100 @@
+import warnings
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from stario.network.stario import StarIO, moments, rms_normalised
+
+
+def counted(network: nn.Module) -> tuple[int, int]:
+    """Parameters and FLOPs for one window under the rules of the published table (NETWORKS.md)."""
+    operations, parameters = [], []
+
+    def count(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        if isinstance(module, nn.Conv1d):
+            per_output = module.in_channels // module.groups * module.kernel_size[0]
+            operations.append(output.numel() * per_output)
+        elif isinstance(module, nn.Linear):
+            operations.append(module.in_features * output.numel())
+        elif isinstance(module, nn.BatchNorm1d):
+            operations.append(4 * inputs[0].numel())
+        elif isinstance(module, nn.Softmax):
+            operations.append(3 * output.numel() - 1)
+        else:
+            return
+        parameters.append(sum(p.numel() for p in module.parameters()))
+
+    hooks = [m.register_forward_hook(count) for m in network.modules()]
+    with torch.inference_mode():
+        network.eval()(torch.zeros(1, 6, 200))
+    for hook in hooks:
+        hook.remove()
+    return sum(parameters), sum(operations)
+
+
+TABLE = [(True, 2_761_650, 25_124_210), (False, 2_261_170, 21_584_626)]
+
+
+@pytest.mark.parametrize(("gated_unit", "parameters", "operations"), TABLE)
+def test_counts_are_those_of_the_table(gated_unit: bool, parameters: int, operations: int) -> None:
+    network = StarIO(outputs=2, gated_unit=gated_unit)
+    assert counted(network) == (parameters, operations)
+    # The mixtures mu and xi of two wings in eight blocks are in no rule of the table.
+    assert sum(p.numel() for p in network.parameters()) == parameters + 8 * 2 * 2
+
+
+@pytest.mark.parametrize(("gated_unit", "parameters", "operations"), TABLE)
+def test_counts_agree_with_thop(gated_unit: bool, parameters: int, operations: int) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        thop = pytest.importorskip("thop", exc_type=ImportError)
+        found = thop.profile(
+            StarIO(outputs=2, gated_unit=gated_unit), (torch.zeros(1, 6, 200),), verbose=False
+        )
+    assert found == (operations, parameters)
+
+
+@pytest.mark.parametrize("batch", [1, 5])
+@pytest.mark.parametrize("outputs", [2, 6])
+def test_one_row_of_outputs_per_window(batch: int, outputs: int) -> None:
+    assert StarIO(outputs).eval()(torch.randn(batch, 6, 200)).shape == (batch, outputs)
+
+
+def test_gradients_stay_finite_where_nothing_varies() -> None:
+    network = StarIO()
+    network(torch.zeros(4, 6, 200)).square().sum().backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+
+
+def test_gradient_of_the_deviation_of_a_constant_is_finite() -> None:
+    x = torch.full((2, 3, 5), 7.0, requires_grad=True)
+    moments(x, dim=2)[1].sum().backward()
+    assert x.grad is not None
+    assert torch.isfinite(x.grad).all()
+
+
+def test_moments_are_mean_and_deviation() -> None:
+    x = torch.randn(4, 8, 50, generator=torch.Generator().manual_seed(0)) * 3.0 + 1.0
+    mean, deviation = moments(x, dim=2)
+    torch.testing.assert_close(mean, x.mean(2, keepdim=True))
+    expected = x.std(2, correction=0, keepdim=True)
+    torch.testing.assert_close(deviation, expected, rtol=1e-4, atol=0.0)
+
+
+def test_normalised_windows_have_unit_mean_square_at_any_scale() -> None:
+    x = torch.randn(3, 8, 50) * torch.tensor([0.1, 1.0, 1e4]).view(3, 1, 1)
+    square = rms_normalised(x).square().mean(dim=(1, 2))
+    torch.testing.assert_close(square, torch.ones(3), rtol=2e-3, atol=0.0)
+
+
+def test_a_window_does_not_feel_the_others_of_its_batch() -> None:
+    torch.manual_seed(0)
+    network = StarIO().eval()
+    window = torch.randn(1, 6, 200)
+    with torch.inference_mode():
+        alone = network(window)
+        together = network(torch.cat([1e3 * torch.randn(3, 6, 200), window]))[3:]
+    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-6)
