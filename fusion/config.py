@@ -18,8 +18,11 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SECONDS
 
+OUTPUT_RATE = 20
+"""States per second: the IMU is folded and the state reported this often [Hz]."""
+
 UPDATE_RATES = (1, 2, 4, 5, 10, 20)
-"""Updates per second for which the window's start falls on an earlier update."""
+"""Network updates per second; each divides the output rate."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,9 @@ class FilterConfig:
                 raise ConfigError(item.name, repr(value), "a finite value >= 0")
 
     @property
-    def period(self) -> float:
-        """Time between updates [s]."""
-        return 1.0 / self.update_rate
+    def epochs_per_update(self) -> int:
+        """States from one network update to the next."""
+        return OUTPUT_RATE // self.update_rate
 
     @property
     def window_updates(self) -> int:

@@ -1,9 +1,10 @@
 """From raw samples to epochs: what stands before network and filter, alike in stream and batch.
 
-Samples are checked, brought into strictly increasing time and cut at the update times t_k, with
+Samples are checked, brought into strictly increasing time and cut at an even grid of times, with
 the IMU interpolated exactly there (so that nothing is integrated twice or left out). Each epoch
-carries its samples, and the network's window that ends with it once a second of unbroken samples
-is there. Nothing here depends on the filter: batch runs may therefore hand all windows to the
+carries its samples; at the times of a network update also the window that ends there, once a
+second of unbroken samples is there.
+Nothing here depends on the filter: batch runs may therefore hand all windows to the
 network at once and still give the streamed track.
 """
 
@@ -17,16 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.attitude import LevelledAttitude, start_from_gravity
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import OUTPUT_RATE, NavigatorConfig
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     MAX_IMU_GAP,
     WINDOW_RATE,
+    WINDOW_SECONDS,
     resample,
 )
 
 START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
+
+_BLOCKS = round(OUTPUT_RATE * WINDOW_SECONDS)
+"""Epochs in a window."""
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -34,16 +39,17 @@ Sample = tuple[float, float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Epoch:
-    """The stretch between two update times.
+    """The stretch between two times of the grid.
 
     Attributes:
-        time: (n + 1,) sample times, first and last are the update times [s].
+        time: (n + 1,) sample times, first and last are the grid's [s].
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
-        window: (6, 200) the network's input that ends here, None while there is none.
+        update: whether windows begin and end at this epoch's end.
+        window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
     """
 
@@ -53,17 +59,18 @@ class Epoch:
     gap: bool
     attitudes: FloatArray
     R_NB: FloatArray
+    update: bool = False
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
 
     @property
     def start(self) -> float:
-        """First update time [s]."""
+        """Its first time [s]."""
         return float(self.time[0])
 
     @property
     def stop(self) -> float:
-        """Second update time [s]."""
+        """Its last time [s]."""
         return float(self.time[-1])
 
 
@@ -104,14 +111,14 @@ class Intake:
 
     def __init__(self, config: NavigatorConfig) -> None:
         self._config = config
-        self._period = config.filter.period
+        self._period = 1.0 / OUTPUT_RATE
         self._samples: list[Sample] = []
         self._attitude: LevelledAttitude | None = None
         self._origin, self._index = 0.0, 0
         self._next = -math.inf
         self._newest = -math.inf
-        self._window: deque[NDArray[np.float32]] = deque(maxlen=config.filter.window_updates)
-        self._starts: deque[FloatArray] = deque(maxlen=config.filter.window_updates)
+        self._window: deque[NDArray[np.float32]] = deque(maxlen=_BLOCKS)
+        self._starts: deque[FloatArray] = deque(maxlen=_BLOCKS)
         self.counts = IntakeCounts()
         self.start: Start | None = None
 
@@ -193,11 +200,13 @@ class Intake:
         attitude = self._attitude
         assert attitude is not None  # no epoch is cut before the start
         self._starts.append(attitude.R_NB)
-        epoch = _epoch(table, attitude)
+        # _cut() has counted this epoch already.
+        update = (self._index - 1) % self._config.filter.epochs_per_update == 0
+        epoch = replace(_epoch(table, attitude), update=update)
         imu_N = np.hstack([_turned(epoch.attitudes, v) for v in (epoch.gyro, epoch.accel)])
         grid = epoch.start + np.arange(round(self._period * WINDOW_RATE)) / WINDOW_RATE
         self._window.append(resample(epoch.time, imu_N, grid).astype(np.float32).T)
-        if len(self._window) < self._config.filter.window_updates:
+        if not update or len(self._window) < _BLOCKS:
             return epoch
         window = np.concatenate(self._window, axis=1)
         return replace(epoch, window=window, R_NB_window=self._starts[0])

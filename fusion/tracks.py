@@ -82,7 +82,7 @@ def network_track_true_attitude(
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
     began = perf_counter()
-    time, windows = _true_windows(sequence, config.filter.period)
+    time, windows = _true_windows(sequence, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
     displacement, _ = model.predict(windows)
     done = perf_counter()
