@@ -5,6 +5,10 @@ device's offset in H [m] and its turn against a neutral attitude as a rotation v
 A gait repeats with the stride (two steps); with phase phi the step's angle, so that phi / 2 is
 the stride's, the trunk rises and falls with phi, sways with phi / 2, surges with phi, and each
 heel strike rings at 5 to 12 Hz through the body.
+
+The phases between these are those of people, with some spread, never arbitrary: they are what
+tells forward from backward. The trunk is highest at mid-stance (phi = 0), slowest there as well
+(kinetic energy has become potential), and every heel strike brakes it (Cavagna et al., 1976).
 """
 
 from __future__ import annotations
@@ -65,7 +69,8 @@ def trunk(gait: Gait) -> FloatArray:
     rng, phi = gait.rng, gait.phase
     bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
     rise = 0.5 * bounce * gait.effort * step_length(gait) ** 2 / (8.0 * 0.53 * gait.height)
-    shift = rng.uniform(-np.pi, np.pi, 6)
+    shift = rng.uniform(-np.pi, np.pi, 4)
+    shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest where highest
     z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
     x = 0.012 * surge * gait.effort * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
@@ -86,7 +91,7 @@ def heel_strikes(gait: Gait, strength: float) -> FloatArray:
     """
     rng = gait.rng
     resonance, damping = rng.uniform([4.5, 0.15], [9.0, 0.45])
-    tilt = np.array([*rng.normal(0.0, 0.35, 2), 1.0])
+    tilt = np.array([rng.normal(-0.4, 0.15), rng.normal(0.0, 0.2), 1.0])  # strikes brake
     typical = float(np.median(gait.step_rate))
     n = np.arange(2, _STRIKE_HARMONICS + 1)
     ratio = n * typical / resonance
@@ -96,8 +101,9 @@ def heel_strikes(gait: Gait, strength: float) -> FloatArray:
     ring = np.zeros((len(gait), 3))
     for k, gain in zip(n, response, strict=True):
         amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
-        angle = k * gait.phase + np.angle(gain)
-        stray = rng.uniform(-0.8, 0.8, 3)
+        # The strike comes half a step after mid-stance.
+        angle = k * (gait.phase - np.pi) + np.angle(gain)
+        stray = rng.uniform(-0.4, 0.4, 3)
         ring += (amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray) * tilt
     return gait.vigor * ring
 
@@ -113,7 +119,7 @@ def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMot
     turn = 0.08 * drift(rng, n, gait.rate, 0.7, 3)
     turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
-    shift, size = rng.uniform(-np.pi, np.pi, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
+    shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
     for k, order in enumerate((0.5, 1.0)):
         swing = np.cos(order * gait.phase[:, None] + shift[k]) * size[k]
         turn += wobble * gait.effort[:, None] * swing
@@ -165,7 +171,7 @@ def _pocket(gait: Gait) -> CarryMotion:
     hip = np.array([0.0, rng.choice([-1.0, 1.0]) * 0.1, 0.52 * gait.height])
     offset = hip + _about(1, -angle, thigh) + trunk(gait)
     offset += heel_strikes(gait, rng.uniform(1.0, 2.2))
-    shift = rng.uniform(-np.pi, np.pi, 2)
+    shift = rng.uniform(-0.7, 0.7, 2)
     yaw = 0.1 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
     roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
     turn = np.stack([roll, -angle, yaw], axis=1)
@@ -176,7 +182,7 @@ def _pocket(gait: Gait) -> CarryMotion:
 def _bag(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
     hang, sway = rng.uniform([0.0, 0.02], [0.4, 0.1])
-    shift = rng.uniform(-np.pi, np.pi, 3)
+    shift = rng.uniform(-0.7, 0.7, 3)
     stride = np.cos(gait.phase[:, None] / 2.0 + shift)
     turn = sway * gait.effort[:, None] * stride * np.array([1.0, 0.5, 0.8])
     turn += 0.02 * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
@@ -246,7 +252,7 @@ def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> 
     rng, n = gait.rng, len(gait)
     size = amplitude * np.minimum(gait.effort, 1.2) * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
     stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
-    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-np.pi, np.pi))
+    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-0.5, 0.5))
     restless = 0.03 * drift(rng, n, gait.rate, 0.6)
     return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
 
