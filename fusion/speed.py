@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -42,7 +43,7 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         "run_s_per_min": medians["run"],
         "run_network_s_per_min": medians["run_network"],
         "update_rate_hz": default.config.filter.update_rate,
-        "network": network_speed(model),
+        "network": [asdict(speed) for speed in network_speed(model.training_form)],
     }
 
 
