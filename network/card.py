@@ -92,12 +92,14 @@ def read_card(weights: Path) -> Card:
             raise WeightsError(needed, "file", "nothing there", "weights and card side by side")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        calibration = Calibration(**{k: tuple(v) for k, v in content.pop("calibration").items()})
+        calibration = _calibration(content.pop("calibration"))
         unknown = set(content) - {f.name for f in fields(Card)}
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
         card = Card(calibration=calibration, **content)
-        _check_values(card)
+        for name in ("architecture", "sha256"):
+            if not isinstance(getattr(card, name), str):
+                raise ValueError(f"{name} {getattr(card, name)!r}")
     except (ValueError, TypeError, KeyError, AttributeError, UnicodeDecodeError) as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
     _check(card, path)
@@ -113,13 +115,16 @@ def read_card(weights: Path) -> Card:
     return card
 
 
-def _check_values(card: Card) -> None:
-    for name in ("architecture", "sha256"):
-        if not isinstance(getattr(card, name), str):
-            raise ValueError(f"{name} is {getattr(card, name)!r}")
-    for name, factors in asdict(card.calibration).items():
-        if len(factors) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in factors):
-            raise ValueError(f"calibration.{name} is {factors!r}")
+def _calibration(content: dict[str, list[float]]) -> Calibration:
+    names = [f.name for f in fields(Calibration)]
+    if not isinstance(content, dict) or sorted(content) != sorted(names):
+        raise ValueError(f"calibration {content!r}")
+    for name, values in content.items():
+        if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
+            raise ValueError(f"calibration.{name} {values!r}")
+    x, y, z = content["scale"]
+    floor_x, floor_y, floor_z = content["floor"]
+    return Calibration(scale=(x, y, z), floor=(floor_x, floor_y, floor_z))
 
 
 def _check(card: Card, path: Path) -> None:
