@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from stario.fusion.config import read_config as read_config
     from stario.fusion.ekf import StateCloningEkf as StateCloningEkf
     from stario.fusion.navigator import Navigator as Navigator
+    from stario.fusion.recipe import PriorPose as PriorPose
     from stario.fusion.state import Health as Health
     from stario.fusion.state import NavState as NavState
     from stario.fusion.state import Track as Track
@@ -21,6 +22,7 @@ _MODULES = {
     "NavState": "state",
     "Navigator": "navigator",
     "NavigatorConfig": "config",
+    "PriorPose": "recipe",
     "StateCloningEkf": "ekf",
     "Track": "state",
     "demonstration": "compare",
@@ -33,6 +35,7 @@ __all__ = [
     "NavState",
     "Navigator",
     "NavigatorConfig",
+    "PriorPose",
     "StateCloningEkf",
     "Track",
     "demonstration",

@@ -28,6 +28,9 @@ STILL_ACCEL = 0.3
 STILL_GYRO = 0.1
 """Root mean square rate [rad/s] below which a device counts as held still."""
 
+_LEAST_FORCE = 1.0
+"""Mean specific force [m/s^2] below which it shows no vertical: free fall, a dead sensor."""
+
 _START_UP = 3.0
 """Time constant [s] from which the loop's rate falls to its final one."""
 
@@ -39,11 +42,12 @@ class GravityStart:
     Attributes:
         R_WB: (3, 3) at the first sample, yaw zero.
         still: whether the device was at rest, so that the tilt can be trusted.
-        b_g: (3,) mean rate while still [rad/s]; None when moving.
+        force: size of the mean specific force [m/s^2]; gravity, if the units are right.
     """
 
     R_WB: FloatArray
     still: bool
+    force: float
 
 
 def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> GravityStart:
@@ -63,7 +67,10 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
         np.linalg.norm(force_0.std(axis=0)) < STILL_ACCEL
         and math.sqrt(float((gyro**2).sum(axis=1).mean())) < STILL_GYRO
     )
-    return GravityStart(tilt_aligning(force_0.mean(axis=0)).as_matrix(), still)
+    up = force_0.mean(axis=0)
+    force = float(np.linalg.norm(up))
+    R_WB = tilt_aligning(up).as_matrix() if force > _LEAST_FORCE else np.eye(3)
+    return GravityStart(R_WB, still, force)
 
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
@@ -122,9 +129,8 @@ class LevelledAttitude:
     def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
-        weights = np.gradient(time)
-        up = weights @ force_N
-        up /= np.linalg.norm(up)
+        up = np.asarray(np.trapezoid(force_N, time, axis=0)) / dt
+        up /= max(float(np.linalg.norm(up)), _LEAST_FORCE)
         self._since_start += dt
         loop = max(self._rate, 1.0 / (_START_UP + self._since_start))
         # The smallest turn that takes `up` to the vertical, to first order; none about it.

@@ -24,6 +24,18 @@ DEMONSTRATION_SEED = 2**31 + 2026
 
 Metrics = dict[str, float | None]
 
+METRICS = (
+    "ate_m",
+    "rte_m",
+    "pde",
+    "aye_rad",
+    "nees",
+    "nis",
+    "seconds_network",
+    "seconds_filter",
+)
+"""Figures of a track, null where they are not known."""
+
 METRIC_WORDS = {
     **CONVENTIONS,
     "nees": "median over time of the 3-D position's NEES, aligned at the start (expected: 3)",
@@ -58,7 +70,8 @@ class Comparison:
 
     def as_dict(self) -> dict[str, object]:
         """The recording's entry in `metrics.json`."""
-        tracks = {name: self.metrics.get(name) for name in TRACKS}
+        unknown: Metrics = dict.fromkeys(METRICS)
+        tracks = {name: self.metrics.get(name, unknown) for name in TRACKS}
         return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
 
     def aligned(self) -> dict[str, Trajectory]:
@@ -99,7 +112,7 @@ def compare(
 
 def measure(track: Track, truth: Trajectory | None) -> Metrics:
     """Figures of one track; null where there is no truth, or no covariance."""
-    figures: Metrics = dict.fromkeys(("ate_m", "rte_m", "pde", "aye_rad", "nees"))
+    figures: Metrics = dict.fromkeys(METRICS)
     if truth is not None:
         result = evaluate_track(track.trajectory, truth)
         figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}

@@ -73,6 +73,8 @@ class FilterConfig:
             value = getattr(self, item.name)
             if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
                 raise ConfigError(item.name, repr(value), "a finite value >= 0")
+        if self.covariance_scale == 0.0:
+            raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
 
     @property
     def epochs_per_update(self) -> int:
@@ -155,7 +157,10 @@ def read_config(path: Path | str) -> NavigatorConfig:
         values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(str(path), "nothing there", "a TOML or JSON file") from None
-    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
+    except OSError as error:
+        found = error.strerror or "an error"
+        raise ConfigError(str(path), found, "a TOML or JSON file") from error
+    except ValueError as error:
         raise ConfigError(str(path), str(error), "a TOML or JSON file") from error
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of values")

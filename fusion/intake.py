@@ -76,11 +76,12 @@ class Epoch:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the filter begins: the first sample's time and its levelled attitude."""
+    """Where the filter begins: the first sample's time, and what `GravityStart` knows of it."""
 
     time: float
     R_WB: FloatArray
     still: bool
+    force: float
 
 
 @dataclass
@@ -100,6 +101,10 @@ class IntakeCounts:
     duplicate: int = 0
     out_of_order: int = 0
     gaps: list[tuple[float, float]] = field(default_factory=list)
+
+    def samples(self) -> dict[str, int]:
+        """Samples by what became of them."""
+        return {k: v for k, v in vars(self).items() if k != "gaps"}
 
 
 class Intake:
@@ -152,7 +157,7 @@ class Intake:
             return []
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
-        self.start = Start(first, gravity.R_WB, gravity.still)
+        self.start = Start(first, gravity.R_WB, gravity.still, gravity.force)
         self._attitude = LevelledAttitude(gravity.R_WB, self._config.levelling_rate)
         self._restart_grid(first)
         return self._complete()

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.intake import Epoch, Intake, all_epochs
-from stario.fusion.recipe import FilterRecipe, Measurement
+from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.state import Health, NavState, Track, track_from_states
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
@@ -64,10 +64,17 @@ class Navigator:
     Args:
         model: a `DisplacementModel`, or anything with its `predict`.
         config: noise, filter, gravity; the defaults are those of handheld devices.
+        prior: what is known of the first pose; None starts level by gravity, yaw and position zero.
     """
 
-    def __init__(self, model: Predictor, config: NavigatorConfig | None = None) -> None:
+    def __init__(
+        self,
+        model: Predictor,
+        config: NavigatorConfig | None = None,
+        prior: PriorPose | None = None,
+    ) -> None:
         self.model = model
+        self.prior = prior
         self.config = config or NavigatorConfig()
         self._intake = Intake(self.config)
         self._recipe: FilterRecipe | None = None
@@ -148,7 +155,7 @@ class Navigator:
         began = perf_counter()
         start = observed.intake.start
         assert start is not None  # observe() refuses recordings without one
-        recipe = FilterRecipe(self.config, start)
+        recipe = FilterRecipe(self.config, start, self.prior)
         states = [recipe.state()]
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
@@ -179,7 +186,9 @@ class Navigator:
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
             assert self._intake.start is not None  # set before the first epoch
-            self._recipe = FilterRecipe(self.config, self._intake.start, keep_innovations=False)
+            self._recipe = FilterRecipe(
+                self.config, self._intake.start, self.prior, keep_innovations=False
+            )
         measurement = None
         if epoch.window is not None:
             mean, covariance = self.model.predict(epoch.window[None])

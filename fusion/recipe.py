@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -25,11 +25,34 @@ from stario.sequences.windows import WINDOW_SECONDS
 STILL_TILT_SIGMA = 0.01
 """Of the first attitude when the device was at rest [rad]."""
 
-START_POSITION_SIGMA = 1e-3
-"""The start defines the position; a little keeps the covariance positive definite [m]."""
+SMALLEST_SIGMA = 1e-6
+"""What is known exactly is given this much, so that the covariance stays positive definite."""
 
 Measurement = tuple[FloatArray, FloatArray]
 """Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
+
+
+@dataclass(frozen=True, eq=False)
+class PriorPose:
+    """What is known of the first pose, at the time of the first sample.
+
+    Attributes:
+        R_WB: (3, 3) attitude.
+        v_W: (3,) velocity [m/s].
+        p_W: (3,) position [m].
+        tilt_sigma: [rad].
+        yaw_sigma: [rad].
+        velocity_sigma: per axis [m/s].
+        position_sigma: per axis [m].
+    """
+
+    R_WB: FloatArray
+    v_W: FloatArray
+    p_W: FloatArray
+    tilt_sigma: float = 0.02
+    yaw_sigma: float = 0.02
+    velocity_sigma: float = 0.1
+    position_sigma: float = 1e-3
 
 
 class FilterRecipe:
@@ -38,11 +61,16 @@ class FilterRecipe:
     Args:
         config: noise and filter settings.
         start: time and levelled attitude of the first sample.
+        prior: what is known of the first pose; None starts level, at rest, at the origin.
         keep_innovations: False for streams, whose memory must not grow.
     """
 
     def __init__(
-        self, config: NavigatorConfig, start: Start, keep_innovations: bool = True
+        self,
+        config: NavigatorConfig,
+        start: Start,
+        prior: PriorPose | None = None,
+        keep_innovations: bool = True,
     ) -> None:
         self._config = config
         self._uses_clones = config.filter.measurement == "displacement"
@@ -53,7 +81,7 @@ class FilterRecipe:
         self._velocity_steps: deque[FloatArray] = deque(maxlen=round(OUTPUT_RATE * WINDOW_SECONDS))
         self._gate = float(chi2.ppf(config.filter.gate, 3))
         self._log = _InnovationLog(keep_innovations)
-        self._initialise(start)
+        self._initialise(start, prior)
 
     def step(self, epoch: Epoch, measurement: Measurement | None) -> NavState:
         """Move to the epoch's end and take in the measurement of the window that ends there."""
@@ -90,15 +118,17 @@ class FilterRecipe:
         """The report so far."""
         return self._log.health(counts, self.state())
 
-    def _initialise(self, start: Start) -> None:
+    def _initialise(self, start: Start, prior: PriorPose | None) -> None:
         f = self._config.filter
         tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
-        sigma = [tilt, tilt, max(f.yaw_sigma, 1e-6)]
-        sigma += [max(f.velocity_sigma, 1e-6)] * 3 + [START_POSITION_SIGMA] * 3
-        sigma += [max(f.gyro_bias_sigma, 1e-9)] * 3 + [max(f.accel_bias_sigma, 1e-9)] * 3
+        level = PriorPose(start.R_WB, np.zeros(3), np.zeros(3), tilt, f.yaw_sigma, f.velocity_sigma)
+        pose = prior or level
+        sigma = [pose.tilt_sigma] * 2 + [pose.yaw_sigma]
+        sigma += [pose.velocity_sigma] * 3 + [pose.position_sigma] * 3
+        sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
+        covariance = np.diag(np.square(np.maximum(sigma, SMALLEST_SIGMA)))
         zero = np.zeros(3)
-        covariance = np.diag(np.square(sigma))
-        self.ekf.initialise(start.time, start.R_WB, zero, zero, zero, zero, covariance)
+        self.ekf.initialise(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
         if self._uses_clones:
             self._clone(start.time)
 
@@ -229,12 +259,7 @@ class _InnovationLog:
             "accel_bias_m_s2": sigma[12:15],
         }
         return Health(
-            samples={
-                "used": counts.used,
-                "not_finite": counts.not_finite,
-                "duplicate": counts.duplicate,
-                "out_of_order": counts.out_of_order,
-            },
+            samples=counts.samples(),
             gaps=list(counts.gaps),
             updates=self._offered,
             gated=self._gated,

@@ -35,12 +35,12 @@ class Augmentation:
     """
 
     speeds: tuple[float, float] = (0.6, 1.8)
-    replayed: float = 0.5
-    tilt: float = 0.087
-    gyro_bias: float = 0.05
-    accel_bias: float = 0.2
-    gyro_noise: float = 0.02
-    accel_noise: float = 0.15
+    replayed: float = 0.4
+    tilt: float = 0.05
+    gyro_bias: float = 0.03
+    accel_bias: float = 0.15
+    gyro_noise: float = 0.01
+    accel_noise: float = 0.08
 
 
 class WindowSampler:
