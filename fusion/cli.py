@@ -6,6 +6,7 @@ done, 1 a known error in one line on stderr, 2 wrong usage; a bug gives a traceb
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import sys
@@ -49,7 +50,9 @@ ModelOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
 GyroUnit = Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s or deg/s.")]
-AccelUnit = Annotated[str, typer.Option(help="Unit of the accelerometer: m/s^2 or g.")]
+AccelUnit = Annotated[
+    str, typer.Option(help="Unit of the accelerometer: m/s^2 or g; -m/s^2 or -g if it shows gravity.")
+]
 
 
 def main() -> None:
@@ -175,13 +178,13 @@ def evaluate(
 @app.command()
 def simulate(
     path: Annotated[Path, typer.Argument(help="CSV file to write.")],
-    seconds: Annotated[float, typer.Option(help="Duration [s].")] = 60.0,
-    rate: Annotated[float, typer.Option(help="Sampling rate [Hz].")] = 200.0,
+    seconds: Annotated[float, typer.Option(help="Duration in s.")] = 60.0,
+    rate: Annotated[float, typer.Option(help="Sampling rate in Hz.")] = 200.0,
     carry: Annotated[
         str, typer.Option(help="How the device is carried; random draws person and carry.")
     ] = "random",
     imu: Annotated[str, typer.Option(help="Sensor: phone, good or perfect.")] = "phone",
-    seed: Annotated[int, typer.Option(help="Of walk and sensor.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of walk and sensor.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Write a simulated walk with its truth as a CSV recording."""
@@ -227,12 +230,12 @@ def train(
     captured: Annotated[
         Path | None, typer.Option(help="Captured trajectories (npz) to drive a simulated IMU.")
     ] = None,
-    generated: Annotated[int, typer.Option(help="Number of generated walks of 60 s.")] = 150,
+    generated: Annotated[int, typer.Option(min=0, help="Number of generated walks of 60 s.")] = 150,
     config: Annotated[
         Path | None, typer.Option("--config", help="JSON file with settings of the recipe.")
     ] = None,
-    epochs: Annotated[int | None, typer.Option(help="Epochs, over the file's.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed, over the file's.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs, over the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, over the file's.")] = None,
 ) -> None:
     """Train a network on recordings with truth and on simulated walks; resumes by itself."""
     from stario.network.data import captured_streams, gather, generated_streams
@@ -301,6 +304,8 @@ def _recipe(path: Path | None, **over: int | None) -> TrainingConfig:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise ConfigError(str(path), str(error), "a JSON file with settings") from error
+        if not isinstance(values, dict):
+            raise ConfigError(str(path), type(values).__name__, "a table of settings")
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
@@ -321,13 +326,12 @@ def _distinct(sequences: Iterable[ImuSequence]) -> list[ImuSequence]:
     """Recordings under names of their own, since a name is a folder of the results."""
     from dataclasses import replace
 
-    seen: dict[str, int] = {}
-    result = []
+    result: dict[str, ImuSequence] = {}
     for sequence in sequences:
-        count = seen[sequence.name] = seen.get(sequence.name, 0) + 1
-        name = sequence.name if count == 1 else f"{sequence.name}-{count}"
-        result.append(replace(sequence, name=name))
-    return result
+        names = (f"{sequence.name}-{k}" if k > 1 else sequence.name for k in itertools.count(1))
+        name = next(name for name in names if name not in result)
+        result[name] = replace(sequence, name=name)
+    return list(result.values())
 
 
 def _training_recordings(

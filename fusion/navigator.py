@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.intake import Epoch, Intake, all_epochs
+from stario.fusion.intake import Epoch, Intake, Start, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.state import Health, NavState, Track, track_from_states
 from stario.sequences.checks import check_units
@@ -26,6 +26,9 @@ from stario.sequences.windows import WINDOW_SECONDS
 
 Vector = Sequence[float] | FloatArray
 """Three numbers."""
+
+_START_FORCE = (5.0, 15.0)
+"""Average force [m/s^2] of a first second that may hold a jump, but neither g nor deg/s."""
 
 Progress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
@@ -94,7 +97,8 @@ class Navigator:
             The newest state if this sample completed an update period, else None.
 
         Raises:
-            InputError: gyro or accel does not hold three numbers.
+            InputError: gyro or accel does not hold three numbers, or the first second's average
+                force cannot be gravity in m/s^2. The stream then begins anew.
         """
         sample = (float(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
@@ -112,7 +116,7 @@ class Navigator:
         """The stream's report so far."""
         if self._recipe is None:
             counts = self._intake.counts
-            return Health(samples={"used": counts.used, "not_finite": counts.not_finite})
+            return Health(samples=counts.samples(), gaps=list(counts.gaps))
         return self._recipe.health(self._intake.counts)
 
     def run(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Track:
@@ -185,15 +189,27 @@ class Navigator:
 
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
-            assert self._intake.start is not None  # set before the first epoch
-            self._recipe = FilterRecipe(
-                self.config, self._intake.start, self.prior, keep_innovations=False
-            )
+            start = self._checked_start()
+            self._recipe = FilterRecipe(self.config, start, self.prior, keep_innovations=False)
         measurement = None
         if epoch.window is not None:
             mean, covariance = self.model.predict(epoch.window[None])
             measurement = (mean[0], covariance[0])
         return self._recipe.step(epoch, measurement)
+
+    def _checked_start(self) -> Start:
+        """A stream cannot be checked as a whole before it runs: its first second is."""
+        start = self._intake.start
+        assert start is not None  # set before the first epoch
+        if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
+            self._intake = Intake(self.config)
+            raise InputError(
+                "accel",
+                f"an average of {start.force:.3g} over the first second",
+                f"about {self.config.gravity:.2f} m/s^2",
+                "give specific force in m/s^2 with gravity left in, and rates in rad/s",
+            )
+        return start
 
 
 def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

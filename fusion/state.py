@@ -165,6 +165,7 @@ def track_from_states(
         attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
         velocity_W=np.array([s.v_W for s in states]),
         position_covariance_W=covariance[:, 6:9, 6:9],
+        valid=np.array([not s.in_gap for s in states]),
     )
     return Track(
         trajectory=trajectory,

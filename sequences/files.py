@@ -35,13 +35,15 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
         mode: "w" for text (UTF-8, Unix line ends), "wb" for bytes.
 
     Raises:
-        InputError: another mode, or the folder does not exist.
+        InputError: another mode, the folder does not exist, or `path` is a folder.
     """
     path = Path(path)
     if mode not in ("w", "wb"):
         raise InputError("mode", repr(mode), "'w' or 'wb'")
     if not path.parent.is_dir():
         raise InputError("path", str(path), "a file in an existing folder", "create the folder")
+    if path.is_dir():
+        raise InputError("path", f"the folder {path}", "a file")
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     text: dict[str, str] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
     try:
