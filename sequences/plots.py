@@ -355,7 +355,9 @@ def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour
 
 def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
     axes.plot(time[~gated], value[~gated], ".", color=_BLUE, ms=3, label="used")
-    axes.plot(time[gated], value[gated], "x", color=_RED, ms=5, label="gated", clip_on=False)
+    # An empty line has no extent; unclipped, it would leave the layout without any bounds.
+    clipped = not gated.any()
+    axes.plot(time[gated], value[gated], "x", color=_RED, ms=5, label="gated", clip_on=clipped)
 
 
 def _draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
