@@ -51,7 +51,7 @@ ModelOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
 GyroUnit = Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s or deg/s.")]
 AccelUnit = Annotated[
-    str, typer.Option(help="Unit of the accelerometer: m/s^2 or g; -m/s^2 or -g if it shows gravity.")
+    str, typer.Option(help="Unit of the accelerometer: m/s^2 or g, or either with a minus.")
 ]
 
 

@@ -168,22 +168,25 @@ class FilterRecipe:
         )
 
     def _update(self, epoch: Epoch, measurement: Measurement) -> None:
-        displacement_N, covariance_N = measurement
+        # What is not finite is the filter's to refuse and count.
+        with np.errstate(invalid="ignore"):
+            result = self._offer(epoch, *measurement)
+        self._log.add(epoch.stop, self.ekf, result)
+
+    def _offer(
+        self, epoch: Epoch, displacement_N: FloatArray, covariance_N: FloatArray
+    ) -> UpdateResult:
         covariance_N = covariance_N * self._config.filter.overlap_scale
         if self._uses_clones:
             slot = self._slots[0]
             R_WN = _yaw_between(self.ekf.clone_pose(slot)[0], epoch.R_NB_window)
-            result = self.ekf.update_displacement(
+            return self.ekf.update_displacement(
                 slot, None, R_WN @ displacement_N, R_WN @ covariance_N @ R_WN.T, self._gate
             )
-        else:
-            R_WN = _yaw_between(self.ekf.R_WB, epoch.R_NB)
-            mean_W = R_WN @ displacement_N / WINDOW_SECONDS
-            covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
-            result = self.ekf.update_mean_velocity(
-                mean_W + self._velocity_gain(), covariance, self._gate
-            )
-        self._log.add(epoch.stop, self.ekf, result)
+        R_WN = _yaw_between(self.ekf.R_WB, epoch.R_NB)
+        mean_W = R_WN @ displacement_N / WINDOW_SECONDS
+        covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
+        return self.ekf.update_mean_velocity(mean_W + self._velocity_gain(), covariance, self._gate)
 
     def _velocity_gain(self) -> FloatArray:
         """Current velocity minus its mean over the window, from the IMU alone (trapezoids)."""
