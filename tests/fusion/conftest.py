@@ -1,0 +1,111 @@
+"""Simulated walks and a predictor that knows the truth, for every test of the navigator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.intake import all_epochs
+from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulate import ImuErrors, simulate_imu
+from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.windows import WINDOW_SECONDS
+
+
+class Oracle:
+    """Tells the true displacement of every window of one recording, with white noise if asked.
+
+    It knows a window by its content, so that it answers alike in streams and in batches. Like a
+    network it answers in the window's frame: off from the truth's by the yaw of the attitude that
+    the window was prepared with.
+    """
+
+    def __init__(
+        self,
+        sequence: ImuSequence,
+        truth: Trajectory,
+        config: NavigatorConfig,
+        noise: float = 0.0,
+        sigma: float = 0.02,
+        seed: int = 0,
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        epochs, _ = all_epochs(sequence, config)
+        known = [e for e in epochs if e.window is not None]
+        stop = np.array([e.stop for e in known])
+        first, last = truth.at(stop - WINDOW_SECONDS), truth.at(stop)
+        R_NB = Rotation.from_matrix(np.stack([e.R_NB_window for e in known]))
+        turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
+        displacement = turn.apply(last.position_W - first.position_W)
+        displacement += noise * rng.standard_normal(displacement.shape)
+        keys = [e.window.tobytes() for e in known]
+        self._known = dict(zip(keys, displacement, strict=True))
+        self._covariance = sigma**2 * np.eye(3)
+        self.calls = 0
+
+    def predict(self, windows):
+        self.calls += 1
+        mean = np.array([self._known[w.tobytes()] for w in np.asarray(windows)])
+        return mean, np.tile(self._covariance, (len(mean), 1, 1))
+
+
+class Still:
+    """Says of every window that nothing moved, without any certainty."""
+
+    def predict(self, windows):
+        n = len(windows)
+        return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+
+
+NOISY = ImuErrors(gyro_turn_on=3e-3, accel_turn_on=0.03)
+
+
+def simulated_walk(
+    seed: int = 1, seconds: float = 20.0, rate: float = 100.0, errors: ImuErrors = NOISY, **style
+) -> ImuSequence:
+    style = {"carry": "handheld", "mount_rotvec": (0.4, -0.7, 1.1), **style}
+    walk = generate_walk(seed, seconds, style=WalkStyle(**style))
+    return simulate_imu(walk, rate, errors, seed, name=f"walk-{seed}")
+
+
+@pytest.fixture(scope="session")
+def make_walk() -> Callable[..., ImuSequence]:
+    return simulated_walk
+
+
+@pytest.fixture(scope="session")
+def make_oracle() -> type[Oracle]:
+    return Oracle
+
+
+@pytest.fixture(scope="session")
+def still_model() -> Still:
+    return Still()
+
+
+@pytest.fixture(scope="session")
+def walk() -> ImuSequence:
+    """Twenty seconds in the hand, 100 Hz, an IMU with noise and biases."""
+    return simulated_walk()
+
+
+@pytest.fixture(scope="session")
+def without() -> Callable[[ImuSequence, np.ndarray], ImuSequence]:
+    """A recording without the samples marked; its truth stays whole."""
+
+    def drop(sequence: ImuSequence, gone: np.ndarray) -> ImuSequence:
+        keep = ~gone
+        return replace(
+            sequence,
+            time=sequence.time[keep],
+            gyro=sequence.gyro[keep],
+            accel=sequence.accel[keep],
+        )
+
+    return drop

@@ -1,0 +1,124 @@
+"""Configuration files: read, refused, saved and read back."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from stario.fusion.config import (
+    OUTPUT_RATE,
+    UPDATE_RATES,
+    FilterConfig,
+    NavigatorConfig,
+    config_from_dict,
+    read_config,
+)
+from stario.sequences.errors import ConfigError, StarioError
+from stario.sequences.files import write_json
+from stario.sequences.noise import ImuNoise
+
+TOML = """
+gravity = 9.81
+[filter]
+update_rate = 5
+covariance_scale = 2      # an integer where a number is meant
+measurement = "velocity"
+[noise]
+gyro_noise = 1e-3
+"""
+
+
+def test_toml_sets_what_it_names_and_leaves_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "slow.toml"
+    path.write_text(TOML)
+    default, config = NavigatorConfig(), read_config(path)
+    assert config == replace(
+        default,
+        gravity=9.81,
+        noise=replace(default.noise, gyro_noise=1e-3),
+        filter=replace(default.filter, update_rate=5, covariance_scale=2.0, measurement="velocity"),
+    )
+
+
+def test_json_and_toml_mean_the_same(tmp_path: Path) -> None:
+    values = {"gravity": 9.8, "filter": {"gate": 0.99}}
+    (tmp_path / "a.json").write_text(json.dumps(values))
+    (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
+    assert read_config(tmp_path / "a.json") == read_config(tmp_path / "a.toml")
+
+
+def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
+    (tmp_path / "empty.toml").write_text("")
+    assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
+
+
+def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
+    config = NavigatorConfig(
+        noise=ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3),
+        filter=FilterConfig(update_rate=20, measurement="velocity", gate=0.99),
+        levelling_rate=0.1,
+    )
+    write_json(tmp_path / "config.json", asdict(config))
+    assert read_config(tmp_path / "config.json") == config
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"speed": 1.0}, "speed"),
+        ({"filter": {"updaterate": 10}}, "filter.updaterate"),
+        ({"noise": {"gyro": 1e-3}}, "noise.gyro"),
+        ({"filter": 3}, "filter"),
+        ({"gravity": "9.81"}, "gravity"),
+        ({"gravity": True}, "gravity"),
+        ({"filter": {"update_rate": 10.0}}, "filter.update_rate"),
+        ({"filter": {"measurement": 1}}, "filter.measurement"),
+        ({"filter": {"update_rate": 7}}, "filter.update_rate"),
+        ({"filter": {"measurement": "speed"}}, "filter.measurement"),
+        ({"filter": {"gate": 1.0}}, "filter.gate"),
+        ({"filter": {"covariance_scale": 0.0}}, "filter.covariance_scale"),
+        ({"filter": {"yaw_sigma": -1.0}}, "filter.yaw_sigma"),
+        ({"filter": {"yaw_sigma": float("nan")}}, "filter.yaw_sigma"),
+        ({"noise": {"accel_noise": -0.1}}, "noise.accel_noise"),
+        ({"noise": {"accel_noise": float("inf")}}, "noise.accel_noise"),
+        ({"gravity": 0.98}, "gravity"),
+        ({"gravity": float("nan")}, "gravity"),
+        ({"levelling_rate": 0.0}, "levelling_rate"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        config_from_dict(values)
+    assert caught.value.field == named
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("broken.toml", b"[filter\n"),
+        ("broken.json", b"{"),
+        ("list.json", b"[1, 2]"),
+        ("binary.toml", b"\xff\xfe\x00"),
+    ],
+)
+def test_a_malformed_file_is_named_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=name) as caught:
+        read_config(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_or_a_folder_is_a_known_error(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.toml", tmp_path):
+        with pytest.raises(StarioError):
+            read_config(path)
+
+
+@pytest.mark.parametrize("rate", UPDATE_RATES)
+def test_updates_fall_on_states_and_overlap_is_paid_for(rate: int) -> None:
+    config = FilterConfig(update_rate=rate)
+    assert config.epochs_per_update * rate == OUTPUT_RATE
+    assert config.window_updates == rate
+    assert config.overlap_scale == pytest.approx(rate)
