@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from stario.sequences.errors import InputError
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
 
@@ -41,6 +41,15 @@ class Augmentation:
     accel_bias: float = 0.15
     gyro_noise: float = 0.01
     accel_noise: float = 0.08
+
+    def __post_init__(self) -> None:
+        slow, fast = self.speeds
+        if not 0.0 < slow <= fast <= 10.0:
+            raise ConfigError("speeds", repr(self.speeds), "two factors, slow then fast, above 0")
+        for item in fields(self)[1:]:
+            value = getattr(self, item.name)
+            if not (isinstance(value, int | float) and 0.0 <= value < 100.0):
+                raise ConfigError(item.name, repr(value), "a finite number >= 0")
 
 
 class WindowSampler:

@@ -18,7 +18,7 @@ _CLIP = 25.0
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
     """Fit factors to errors (M, 3) [m] and log sigmas (M, 3); x and y share theirs."""
-    normalised = error**2 / (np.exp(2.0 * log_sigma) + _FLOOR_M**2)
+    normalised = np.maximum(error**2 - _FLOOR_M**2, 0.0) / np.exp(2.0 * log_sigma)
     horizontal = _factor(normalised[:, :2].ravel())
     vertical = _factor(normalised[:, 2])
     return Calibration(scale=(horizontal, horizontal, vertical), floor=(_FLOOR_M,) * 3)

@@ -35,6 +35,15 @@ from stario.sequences.windows import WorldStream, windows_of
 log = logging.getLogger(__name__)
 
 VALIDATION_STRIDE = 20
+
+_RANGES = (
+    ("rate", 1e-8, 1.0),
+    ("warm_up", 0.0, 1.0),
+    ("weight_decay", 0.0, 1.0),
+    ("likelihood_from", 0.0, 1.0),
+    ("clip", 1e-6, 1e6),
+    ("average", 0.0, 1.0),
+)
 _CHECKPOINT = "checkpoint.safetensors"
 
 
@@ -81,8 +90,13 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("epochs", "epoch_windows", "batch", "patience"):
-            if getattr(self, name) < 1:
-                raise ConfigError(name, repr(getattr(self, name)), "a count of at least 1")
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= 1):
+                raise ConfigError(name, repr(value), "a count of at least 1")
+        for name, low, high in _RANGES:
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and low <= value <= high):
+                raise ConfigError(name, repr(value), f"a number from {low} to {high}")
         if self.precision not in ("float32", "bfloat16"):
             raise ConfigError("precision", repr(self.precision), "float32 or bfloat16")
         if self.device not in ("auto", "cpu", "cuda"):
@@ -214,21 +228,19 @@ class _Run:
                 value.copy_(current[name])
 
     def epochs_since_best(self) -> int:
+        """Epochs since the smallest validation error.
+
+        Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
+        with it count.
+        """
+        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
         errors = [r.validation_error for r in self.history]
+        if len(errors) >= first:
+            errors = errors[first - 1 :]
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
 
     def record(self, report: EpochReport) -> None:
-        """Keep the best weights and write checkpoint and log.
-
-        Until the likelihood has begun sigma means nothing, so weights from before are not kept
-        once it has.
-        """
-        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
-        if report.epoch == first:
-            self.history = [
-                EpochReport(r.epoch, r.training_error, math.inf, r.validation_by_recording)
-                for r in self.history
-            ]
+        """Keep the best weights and write checkpoint and log."""
         self.history.append(report)
         if self.epochs_since_best() == 0:
             self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
@@ -269,6 +281,8 @@ class _Run:
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         except safetensors.SafetensorError as error:
             raise ReadError(path, "checkpoint", str(error), "a whole checkpoint") from error
+        if not metadata or "config" not in metadata:
+            raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of this command")
         config = json.loads(json.dumps(asdict(self.config)))
         found = json.loads(metadata["config"])
         for name in config:
@@ -320,6 +334,8 @@ class _ValidationSet:
 
     def __init__(self, streams: Sequence[WorldStream], device: torch.device) -> None:
         cut = [windows_of(stream, VALIDATION_STRIDE) for stream in streams]
+        if not sum(len(windows) for windows, _ in cut):
+            raise InputError("validation", "no window", "stretches longer than a second")
         self.windows = torch.from_numpy(np.concatenate([w for w, _ in cut])).to(device)
         self.target = torch.from_numpy(np.concatenate([d for _, d in cut]))
         self.names = np.concatenate(
