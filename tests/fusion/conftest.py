@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -66,6 +67,7 @@ class Still:
 NOISY = ImuErrors(gyro_turn_on=3e-3, accel_turn_on=0.03)
 
 
+@lru_cache(maxsize=64)
 def simulated_walk(
     seed: int = 1, seconds: float = 20.0, rate: float = 100.0, errors: ImuErrors = NOISY, **style
 ) -> ImuSequence:

@@ -1,0 +1,75 @@
+"""The navigator on real recordings, where they are at hand."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavState
+from stario.fusion.compare import compare
+from stario.fusion.config import NavigatorConfig
+from stario.network import DisplacementModel, load_model
+from stario.sequences import ImuSequence, read_recording
+
+DATA = Path(
+    os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "data"
+)
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
+
+OXIOD = "oxiod/handheld/data1/syn/imu7.csv"
+TUMVI = "tumvi/dataset-room1_512_16"
+EUROC = "euroc/V1_02_medium"
+
+
+@pytest.fixture(scope="module")
+def model() -> DisplacementModel:
+    return load_model("default")
+
+
+def stretch(name: str, seconds: float) -> ImuSequence:
+    """Some seconds from five seconds into a recording."""
+    if not (DATA / name).exists():
+        pytest.skip(f"no {name} at {DATA}")
+    recording = read_recording(DATA / name)
+    start = recording.time[0] + 5.0
+    return recording.slice(start, start + seconds)
+
+
+@pytest.mark.parametrize("name", [OXIOD, TUMVI, EUROC])
+def test_recordings_of_every_format_run_through(model: DisplacementModel, name: str) -> None:
+    recording = stretch(name, 20.0)
+    result = compare(model, recording, NavigatorConfig())
+    track = result.tracks["ekf"]
+    for values in track.arrays().values():
+        assert np.isfinite(values).all()
+    assert track.health.samples["used"] == len(recording)
+    assert track.time[-1] - track.time[0] == pytest.approx(recording.duration, abs=0.06)
+    for name_, figures in result.metrics.items():
+        assert np.isfinite(figures["ate_m"]), name_
+    sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
+    assert (sigma > 0.0).all()
+    # A platform in flight is not for a network of walks; it too must not run away.
+    assert result.metrics["ekf"]["ate_m"] < max(5.0, result.metrics["inertial"]["ate_m"])
+
+
+@pytest.mark.parametrize("name", [OXIOD, TUMVI])
+def test_truth_removed_gives_the_identical_track(model: DisplacementModel, name: str) -> None:
+    recording = stretch(name, 15.0)
+    seen, blind = (Navigator(model).run(r) for r in (recording, recording.without_truth()))
+    for key, values in seen.arrays().items():
+        np.testing.assert_array_equal(blind.arrays()[key], values, err_msg=key)
+
+
+def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> None:
+    recording = stretch(TUMVI, 40.0)
+    track, navigator = Navigator(model).run(recording), Navigator(model)
+    rows = zip(recording.time, recording.gyro, recording.accel, strict=True)
+    states: list[NavState] = [s for row in rows if (s := navigator.push(*row)) is not None]
+    assert len(states) > 750
+    at = np.searchsorted(track.time, [s.time for s in states])
+    off = track.trajectory.position_W[at] - np.array([s.p_W for s in states])
+    assert np.linalg.norm(off, axis=1).max() < 1e-3
+    assert navigator.health.gated == track.health.gated
