@@ -15,10 +15,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.lie import exp_so3
-from stario.fusion.preintegration import corrected_increments
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import FloatArray
 
@@ -75,24 +73,14 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
     """Attitudes (n + 1, 3, 3) at the samples from the one at the first sample."""
-    dt, rate, _ = corrected_increments(time, gyro, np.zeros_like(gyro))
-    w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    quaternions = [(x, y, z, w)]
-    for (rx, ry, rz), step in zip(rate.tolist(), dt.tolist(), strict=True):
-        hx, hy, hz = 0.5 * step * rx, 0.5 * step * ry, 0.5 * step * rz
-        half = math.sqrt(hx * hx + hy * hy + hz * hz)
-        s = math.sin(half) / half if half > 1e-12 else 1.0
-        c = math.cos(half)
-        hx, hy, hz = s * hx, s * hy, s * hz
-        w, x, y, z = (
-            w * c - x * hx - y * hy - z * hz,
-            w * hx + x * c + y * hz - z * hy,
-            w * hy - x * hz + y * c + z * hx,
-            w * hz + x * hy - y * hx + z * c,
-        )
-        quaternions.append((x, y, z, w))
-    matrices: FloatArray = R_NB @ Rotation.from_quat(quaternions).as_matrix()
-    return matrices
+    dt = np.diff(time)[:, None]
+    # Mean rate and coning: the rotation vectors of `corrected_increments`, without its force.
+    turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * np.cross(gyro[:-1], gyro[1:]))
+    attitudes = np.empty((len(time), 3, 3))
+    attitudes[0] = R_NB
+    for k, turn in enumerate(exp_so3(turns)):
+        np.matmul(attitudes[k], turn, out=attitudes[k + 1])
+    return attitudes
 
 
 class LevelledAttitude:
@@ -129,7 +117,7 @@ class LevelledAttitude:
     def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
-        up = np.asarray(np.trapezoid(force_N, time, axis=0)) / dt
+        up = (0.5 * np.diff(time)) @ (force_N[1:] + force_N[:-1]) / dt
         up /= max(float(np.linalg.norm(up)), _LEAST_FORCE)
         self._since_start += dt
         loop = max(self._rate, 1.0 / (_START_UP + self._since_start))

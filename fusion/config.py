@@ -18,11 +18,11 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SECONDS
 
-OUTPUT_RATE = 20
-"""States per second: the IMU is folded and the state reported this often [Hz]."""
+UPDATE_RATES = (1, 2, 5, 10, 20)
+"""Network updates per second that may be asked for."""
 
-UPDATE_RATES = (1, 2, 4, 5, 10, 20)
-"""Network updates per second; each divides the output rate."""
+LEAST_OUTPUT_RATE = 10
+"""States per second where the network is asked less often [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,14 @@ class FilterConfig:
             raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
 
     @property
+    def output_rate(self) -> int:
+        """States per second: the IMU is folded and the state reported this often [Hz]."""
+        return max(LEAST_OUTPUT_RATE, self.update_rate)
+
+    @property
     def epochs_per_update(self) -> int:
         """States from one network update to the next."""
-        return OUTPUT_RATE // self.update_rate
+        return self.output_rate // self.update_rate
 
     @property
     def window_updates(self) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.attitude import LevelledAttitude, start_from_gravity
-from stario.fusion.config import OUTPUT_RATE, NavigatorConfig
+from stario.fusion.config import NavigatorConfig
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     MAX_IMU_GAP,
@@ -29,9 +29,6 @@ from stario.sequences.windows import (
 
 START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
-
-_BLOCKS = round(OUTPUT_RATE * WINDOW_SECONDS)
-"""Epochs in a window."""
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -116,14 +113,17 @@ class Intake:
 
     def __init__(self, config: NavigatorConfig) -> None:
         self._config = config
-        self._period = 1.0 / OUTPUT_RATE
+        rate = config.filter.output_rate
+        self._period = 1.0 / rate
+        self._blocks = round(rate * WINDOW_SECONDS)  # epochs in a window
+        self._block_grid = np.arange(round(WINDOW_RATE / rate)) / WINDOW_RATE
         self._samples: list[Sample] = []
         self._attitude: LevelledAttitude | None = None
         self._origin, self._index = 0.0, 0
         self._next = -math.inf
         self._newest = -math.inf
-        self._window: deque[NDArray[np.float32]] = deque(maxlen=_BLOCKS)
-        self._starts: deque[FloatArray] = deque(maxlen=_BLOCKS)
+        self._window: deque[NDArray[np.float32]] = deque(maxlen=self._blocks)
+        self._starts: deque[FloatArray] = deque(maxlen=self._blocks)
         self.counts = IntakeCounts()
         self.start: Start | None = None
 
@@ -208,10 +208,10 @@ class Intake:
         # _cut() has counted this epoch already.
         update = (self._index - 1) % self._config.filter.epochs_per_update == 0
         epoch = replace(_epoch(table, attitude), update=update)
-        imu_N = np.hstack([_turned(epoch.attitudes, v) for v in (epoch.gyro, epoch.accel)])
-        grid = epoch.start + np.arange(round(self._period * WINDOW_RATE)) / WINDOW_RATE
+        imu_N = _turned(epoch.attitudes, epoch.gyro, epoch.accel)
+        grid = epoch.start + self._block_grid
         self._window.append(resample(epoch.time, imu_N, grid).astype(np.float32).T)
-        if not update or len(self._window) < _BLOCKS:
+        if not update or len(self._window) < self._blocks:
             return epoch
         window = np.concatenate(self._window, axis=1)
         return replace(epoch, window=window, R_NB_window=self._starts[0])
@@ -235,9 +235,10 @@ def _epoch(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) -> 
     return Epoch(time, gyro, accel, gap, attitudes, attitude.R_NB)
 
 
-def _turned(R: FloatArray, vectors: FloatArray) -> FloatArray:
-    turned: FloatArray = (R @ vectors[:, :, None])[:, :, 0]
-    return turned
+def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+    """Both vectors of each sample (n, 3) turned by R (n, 3, 3), side by side (n, 6)."""
+    rows: FloatArray = np.stack([gyro, accel], axis=1) @ R.transpose(0, 2, 1)
+    return rows.reshape(-1, 6)
 
 
 def _interpolated(before: Sample, after: Sample, time: float) -> Sample:

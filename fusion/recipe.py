@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from stario.fusion.config import OUTPUT_RATE, NavigatorConfig
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf, UpdateResult
 from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.preintegration import Segment, preintegrate
@@ -78,7 +78,9 @@ class FilterRecipe:
             slots=config.filter.window_updates if self._uses_clones else 0, gravity=config.gravity
         )
         self._slots: deque[int] = deque()
-        self._velocity_steps: deque[FloatArray] = deque(maxlen=round(OUTPUT_RATE * WINDOW_SECONDS))
+        self._velocity_steps: deque[FloatArray] = deque(
+            maxlen=round(config.filter.output_rate * WINDOW_SECONDS)
+        )
         self._gate = float(chi2.ppf(config.filter.gate, 3))
         self._log = _InnovationLog(keep_innovations)
         self._initialise(start, prior)

@@ -60,7 +60,9 @@ def speed_table(report: dict[str, Any]) -> str:
         f"of which network {report['run_network_s_per_min']:.3f} s/min",
     ]
     lines += [
-        f"network, {name}: {value:.3f} ms/window" for name, value in report["network"].items()
+        f"network, batch {n['batch']}: {n['inference_form']:.3f} ms/window "
+        f"(as trained: {n['training_form']:.3f}), {n['threads']} threads"
+        for n in report["network"]
     ]
     return "\n".join(lines)
 
