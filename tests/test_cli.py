@@ -151,7 +151,7 @@ def test_run_leaves_a_track_and_says_so(stario, recording: Path, tmp_path: Path)
     for words in ("walk: 12.0 s", "ATE [m]", "samples used 1201", "updates", "8 files in out"):
         assert words in done.out
     track = read_tum(tmp_path / "out" / "ekf.tum")
-    assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.05)
+    assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
     assert len(list((tmp_path / "out").iterdir())) == 8
 
 

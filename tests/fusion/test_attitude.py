@@ -19,11 +19,11 @@ def tilt_error(R_NB: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def levelled(sequence, gyro, rate=0.06, seconds=0.05):
+def levelled(sequence, gyro, rate=0.06, seconds=0.1):
     """Attitudes at every sample, advanced over periods as the intake does."""
     time, accel = sequence.time, sequence.accel
     step = round(seconds * sequence.rate)
-    start = start_from_gravity(time[: step * 20 + 1], gyro[: step * 20 + 1], accel[: step * 20 + 1])
+    start = start_from_gravity(time[: step * 10 + 1], gyro[: step * 10 + 1], accel[: step * 10 + 1])
     attitude = LevelledAttitude(start.R_WB, rate)
     rows = []
     for k in range(0, len(time) - step, step):

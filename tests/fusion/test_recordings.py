@@ -46,7 +46,7 @@ def test_recordings_of_every_format_run_through(model: DisplacementModel, name: 
     for values in track.arrays().values():
         assert np.isfinite(values).all()
     assert track.health.samples["used"] == len(recording)
-    assert track.time[-1] - track.time[0] == pytest.approx(recording.duration, abs=0.06)
+    assert track.time[-1] - track.time[0] == pytest.approx(recording.duration, abs=0.11)
     for name_, figures in result.metrics.items():
         assert np.isfinite(figures["ate_m"]), name_
     sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
@@ -68,7 +68,7 @@ def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> No
     track, navigator = Navigator(model).run(recording), Navigator(model)
     rows = zip(recording.time, recording.gyro, recording.accel, strict=True)
     states: list[NavState] = [s for row in rows if (s := navigator.push(*row)) is not None]
-    assert len(states) > 750
+    assert len(states) == len(track.time) - navigator.config.filter.output_rate
     at = np.searchsorted(track.time, [s.time for s in states])
     off = track.trajectory.position_W[at] - np.array([s.p_W for s in states])
     assert np.linalg.norm(off, axis=1).max() < 1e-3
