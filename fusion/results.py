@@ -42,7 +42,7 @@ def write_run(
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    return written + _figures(folder, name, {"ekf": aligned}, truth, track.innovations)
+    return written + _figures(folder, name, {"ekf": aligned}, truth, track.innovations, config)
 
 
 def write_comparison(
@@ -68,7 +68,7 @@ def write_comparison(
             write_tum(inner / "truth.tum", truth)
             written.append(inner / "truth.tum")
         filtered = comparison.tracks["ekf"].innovations
-        written += _figures(inner, name, comparison.aligned(), truth, filtered)
+        written += _figures(inner, name, comparison.aligned(), truth, filtered, config)
     return written
 
 
@@ -105,6 +105,7 @@ def _figures(
     tracks: dict[str, Trajectory],
     truth: Trajectory | None,
     filtered: Innovations | None,
+    config: NavigatorConfig,
 ) -> list[Path]:
     figures = {"plan.png": plan_view(tracks, truth, name)}
     if truth is not None:
@@ -119,6 +120,7 @@ def _figures(
             3,
             filtered.gated,
             title=f"{name}: innovations",
+            unit="m" if config.filter.measurement == "displacement" else "m/s",
         )
     for file, figure in figures.items():
         save_figure(figure, folder / file)

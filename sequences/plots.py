@@ -158,17 +158,19 @@ def innovations(
     dof: int,
     gated: BoolArray,
     title: str = "Innovations of the filter",
+    unit: str = "m",
 ) -> Figure:
     """What the filter's measurements said beyond its prediction, against what it expected.
 
     Args:
         time: (M,) of the updates [s].
-        residual: (M, 3) innovation, x y z [m].
-        sigma: (M, 3) its standard deviation as the filter states it [m].
+        residual: (M, 3) innovation, x y z [unit].
+        sigma: (M, 3) its standard deviation as the filter states it [unit].
         nis: (M,) normalised innovation squared.
         dof: expectation of the NIS.
         gated: (M,) True where the gate refused or weakened the update.
         title: of the figure.
+        unit: of what was measured.
 
     Raises:
         InputError: shapes do not agree or there is no update.
@@ -187,7 +189,7 @@ def innovations(
         reach = _reach(residual[~gated, k], 3 * sigma[:, k])
         # A gated residual can be huge: marked at the edge, it leaves the others their room.
         _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
-        axes.set(ylabel=f"{axis} [m]", ylim=(-reach, reach))
+        axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
     panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
     _draw_nis(panels[3], time, nis, dof, gated)
     panels[3].set_xlabel("time [s]")
