@@ -1,13 +1,15 @@
 """Calibration of predicted standard deviations on recordings kept from training.
 
-With sigma from the network, the factor s per axis that makes the mean of e^2 / (s sigma)^2 equal
-to one is the root of that mean. Windows whose error is beyond what any sigma explains would rule
-a plain mean, so normalised errors are clipped at a generous quantile first.
+A network knows better which windows are hard than how hard they are: its log sigma is stretched
+and shifted, sigma = scale * exp(exponent * log_sigma), by the pair of highest likelihood on the
+errors of validation windows. A few windows are wrong beyond what any sigma explains; the squared
+normalised error counts up to a limit, so that these do not rule.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import minimize
 
 from stario.network.card import Calibration
 from stario.sequences.sequence import FloatArray
@@ -17,15 +19,24 @@ _CLIP = 25.0
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
-    """Fit factors to errors (M, 3) [m] and log sigmas (M, 3); x and y share theirs."""
-    normalised = np.maximum(error**2 - _FLOOR_M**2, 0.0) / np.exp(2.0 * log_sigma)
-    horizontal = _factor(normalised[:, :2].ravel())
-    vertical = _factor(normalised[:, 2])
-    return Calibration(scale=(horizontal, horizontal, vertical), floor=(_FLOOR_M,) * 3)
+    """Fit to errors (M, 3) [m] and log sigmas (M, 3); x and y share their pair."""
+    scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
+    scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
+    return Calibration(
+        scale=(scale_h, scale_h, scale_z),
+        exponent=(exponent_h, exponent_h, exponent_z),
+        floor=(_FLOOR_M,) * 3,
+    )
 
 
-def _factor(normalised: FloatArray) -> float:
-    scale = float(np.mean(normalised))
-    for _ in range(20):
-        scale = float(np.mean(np.minimum(normalised, _CLIP * scale)))
-    return float(np.sqrt(scale))
+def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
+    """Scale and exponent of least clipped negative log-likelihood."""
+
+    def cost(parameters: FloatArray) -> float:
+        log_scale, exponent = parameters
+        variance = np.exp(2.0 * (log_scale + exponent * log_sigma)) + _FLOOR_M**2
+        normalised = np.minimum(error**2 / variance, _CLIP)
+        return float(np.mean(normalised + np.log(variance)))
+
+    log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead").x
+    return float(np.exp(log_scale)), float(exponent)

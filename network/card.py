@@ -13,11 +13,17 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stario.sequences.errors import WeightsError
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 
 FORMAT = 1
 FRAME = "gravity-aligned, z up, yaw arbitrary"
+MAX_SIGMA = 5.0
+"""Nobody walks further in a second: a larger sigma [m] says nothing more."""
+
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 
 
@@ -25,16 +31,23 @@ CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 class Calibration:
     """How log standard deviations become honest ones, fitted on validation recordings.
 
-    sigma = sqrt((scale * exp(log_sigma))^2 + floor^2), each per axis x, y, z of the window's frame
-    (x and y share theirs: the frame's yaw is arbitrary).
+    sigma = sqrt((scale * exp(exponent * log_sigma))^2 + floor^2), each per axis x, y, z of the
+    window's frame (x and y share theirs: the frame's yaw is arbitrary).
 
     Attributes:
         scale: factors on the network's sigma.
+        exponent: powers of the network's sigma.
         floor: smallest sigma [m].
     """
 
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    exponent: tuple[float, float, float] = (1.0, 1.0, 1.0)
     floor: tuple[float, float, float] = (0.005, 0.005, 0.005)
+
+    def variance(self, log_sigma: FloatArray) -> FloatArray:
+        """Calibrated variances (M, 3) [m^2] of log sigmas (M, 3)."""
+        sigma = np.array(self.scale) * np.exp(np.array(self.exponent) * log_sigma)
+        return np.asarray(np.minimum(sigma, MAX_SIGMA) ** 2 + np.square(self.floor))
 
 
 @dataclass(frozen=True)
@@ -122,9 +135,7 @@ def _calibration(content: dict[str, list[float]]) -> Calibration:
     for name, values in content.items():
         if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
             raise ValueError(f"calibration.{name} {values!r}")
-    x, y, z = content["scale"]
-    floor_x, floor_y, floor_z = content["floor"]
-    return Calibration(scale=(x, y, z), floor=(floor_x, floor_y, floor_z))
+    return Calibration(**{name: (x, y, z) for name, (x, y, z) in content.items()})
 
 
 def _check(card: Card, path: Path) -> None:

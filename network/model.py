@@ -97,9 +97,7 @@ class DisplacementModel:
         """
         batch = _checked_windows(windows)
         mean, log_sigma = self._run(batch)
-        scale = np.array(self.card.calibration.scale)
-        floor = np.array(self.card.calibration.floor)
-        variance = (scale * np.exp(log_sigma)) ** 2 + floor**2
+        variance = self.card.calibration.variance(log_sigma)
         return mean, variance[:, :, None] * np.eye(3)
 
     def predict_velocity(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -21,8 +21,18 @@ def test_recovers_a_known_scale() -> None:
 def test_calibrated_errors_are_chi_square_on_average() -> None:
     error, log_sigma = errors_and_log_sigmas()
     calibration = calibrate(error, log_sigma)
-    sigma2 = (calibration.scale * np.exp(log_sigma)) ** 2 + np.square(calibration.floor)
-    assert np.mean(error**2 / sigma2, axis=0) == pytest.approx([1.0] * 3, rel=0.03)
+    assert np.mean(error**2 / calibration.variance(log_sigma), axis=0) == pytest.approx(
+        [1.0] * 3, rel=0.03
+    )
+
+
+def test_recovers_a_network_that_understates_contrasts() -> None:
+    rng = np.random.default_rng(1)
+    log_sigma = rng.uniform(np.log(0.1), np.log(0.5), (20_000, 3))
+    error = np.exp(1.5 * log_sigma) * rng.standard_normal(log_sigma.shape)
+    calibration = calibrate(error, log_sigma)
+    np.testing.assert_allclose(calibration.exponent, 1.5, atol=0.05)
+    np.testing.assert_allclose(calibration.scale, 1.0, rtol=0.08)
 
 
 def test_horizontal_axes_share_their_factor() -> None:
