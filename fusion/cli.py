@@ -236,6 +236,16 @@ def train(
     ] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs, over the file's.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, over the file's.")] = None,
+    start_from: Annotated[
+        str | None, typer.Option(help="Weights to start from: default, or a safetensors file.")
+    ] = None,
+    last_stage: Annotated[
+        bool,
+        typer.Option(
+            "--last-stage",
+            help="Learn from the validation recordings too, keep the calibration of --start-from.",
+        ),
+    ] = False,
 ) -> None:
     """Train a network on recordings with truth and on simulated walks; resumes by itself."""
     from stario.network.data import captured_streams, gather, generated_streams
@@ -243,10 +253,12 @@ def train(
     from stario.sequences.vicon import read_vicon_walks
 
     recipe = _recipe(config, epochs=epochs, seed=seed)
+    if last_stage and start_from is None:
+        raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     recorded, held_out = _training_recordings(paths or [], validation or [], data)
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
     material = gather(
-        recorded,
+        recorded + held_out if last_stage else recorded,
         captured_streams(read_vicon_walks(walks), recipe.seed) if walks else [],
         generated_streams(generated, 60.0, recipe.seed),
     )
@@ -267,6 +279,8 @@ def train(
                 err=True,
             ),
             trained_on=material.words,
+            start_from=_model(start_from) if start_from else None,
+            keep_calibration=last_stage,
         )
     typer.echo(str(path))
 

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from stario.network.augment import Augmentation, WindowSampler
 from stario.network.calibrate import calibrate
-from stario.network.card import Card
-from stario.network.model import DisplacementNetwork, build_network, save_model
+from stario.network.card import Calibration, Card
+from stario.network.model import DisplacementModel, DisplacementNetwork, build_network, save_model
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WorldStream, windows_of
@@ -132,6 +132,8 @@ def train(
     on_step: Callable[[int, float], None] = lambda step, loss: None,
     on_epoch: Callable[[EpochReport], None] = lambda report: None,
     trained_on: Sequence[str] = (),
+    start_from: DisplacementModel | None = None,
+    keep_calibration: bool = False,
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
@@ -144,6 +146,9 @@ def train(
         on_step: called after each step with the step and its loss, for a progress bar.
         on_epoch: called after each validation.
         trained_on: words for the card.
+        start_from: a model whose weights are the first ones.
+        keep_calibration: keep that model's calibration, for a last stage that learns from the
+            validation recordings as well: their errors then say nothing any more.
 
     Returns:
         Path of the model's weights.
@@ -155,6 +160,8 @@ def train(
     if not streams or not validation:
         raise InputError("streams", "none", "stretches of at least 2 s with truth")
     run = _Run(config, WindowSampler(streams, weights, config.augmentation, config.seed), folder)
+    if start_from is not None:
+        run.start_from(start_from)
     run.resume()
     held_out = _ValidationSet(validation, run.device)
     while run.step < config.steps and run.epochs_since_best() < config.patience:
@@ -168,7 +175,8 @@ def train(
         )
         run.record(report)
         on_epoch(report)
-    return run.finish(held_out, list(trained_on))
+    calibration = start_from.card.calibration if start_from and keep_calibration else None
+    return run.finish(held_out, list(trained_on), calibration)
 
 
 class _Run:
@@ -188,6 +196,21 @@ class _Run:
         self.step = 0
         self.history: list[EpochReport] = []
         folder.mkdir(parents=True, exist_ok=True)
+
+    def start_from(self, model: DisplacementModel) -> None:
+        """Begin with a model's weights.
+
+        Raises:
+            ConfigError: it is of another architecture.
+        """
+        if model.card.architecture != self.config.architecture:
+            raise ConfigError(
+                "architecture", model.card.architecture, f"{self.config.architecture} as trained"
+            )
+        state = model.training_form.state_dict()
+        self.network.load_state_dict(state)
+        self.averaged.load_state_dict(state)
+        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
 
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
         """One epoch; returns the mean squared error on its (augmented) windows."""
@@ -314,12 +337,14 @@ class _Run:
         self.sampler.generator.set_state(tensors["random.sampler"])
         torch.set_rng_state(tensors["random.torch"])
 
-    def finish(self, held_out: _ValidationSet, trained_on: list[str]) -> Path:
-        """Calibrate the best weights and write the model."""
+    def finish(
+        self, held_out: _ValidationSet, trained_on: list[str], kept: Calibration | None
+    ) -> Path:
+        """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
         self.averaged.load_state_dict(self.best)
         card = Card(
             architecture=self.config.architecture,
-            calibration=calibrate(*held_out.residuals(self.averaged)),
+            calibration=kept or calibrate(*held_out.residuals(self.averaged)),
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
             figures={"validation_mse_m2": held_out.errors(self.averaged)},

@@ -309,3 +309,15 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
     with_state(model, state if change != "none" else {})
     found = {"unknown": "another.weight", "missing": "head.7.bias", "shape": "head.7.bias"}
     assert found.get(change, "Missing") in refused(model)
+
+
+def test_a_last_stage_starts_from_weights_and_keeps_their_calibration(
+    model: Path, tmp_path: Path
+) -> None:
+    first = load_model(model)
+    slow = replace(TINY, rate=1e-8, epochs=1)
+    last = load_model(run(tmp_path / "last", slow, start_from=first, keep_calibration=True))
+    assert last.card.calibration == first.card.calibration
+    before = dict(first.training_form.named_parameters())
+    for name, value in last.training_form.named_parameters():
+        torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)
