@@ -30,6 +30,9 @@ from stario.sequences.windows import (
 START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
 
+_ABSURD = 1e5
+"""No sensor reads this much in any unit used here; also catches infinities."""
+
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
@@ -87,7 +90,7 @@ class IntakeCounts:
 
     Attributes:
         used: samples taken in.
-        not_finite: dropped for a value that is not a number or infinite.
+        not_finite: dropped for a value that is not a number, infinite or absurdly large.
         duplicate: dropped for repeating the newest time.
         out_of_order: dropped for a time before the newest.
         gaps: (start, length) [s] of the stretches without samples that were not bridged.
@@ -130,7 +133,7 @@ class Intake:
     def push(self, sample: Sample) -> list[Epoch]:
         """Take one sample in; returns the epochs it completes (mostly none, seldom several)."""
         time = sample[0]
-        if not math.isfinite(sum(sample)):
+        if not (math.isfinite(time) and sum(map(abs, sample[1:])) < _ABSURD):
             self.counts.not_finite += 1
             return []
         if time <= self._newest:

@@ -231,3 +231,12 @@ def test_it_takes_samples_one_by_one_and_holds_no_more_than_a_second(walk: ImuSe
         intake.push(tuple(row))
         held = max(held, len(intake._samples))
     assert held <= 1.0 * walk.rate + 2
+
+
+def test_absurd_values_are_dropped_and_counted() -> None:
+    intake = Intake(CONFIG)
+    for k in range(300):
+        value = 1e300 if k == 150 else 0.0
+        intake.push((k * 0.005, value, 0.0, 0.0, 0.0, 0.0, 9.81))
+    assert intake.counts.not_finite == 1
+    assert intake.counts.used == 299
