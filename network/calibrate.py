@@ -16,6 +16,7 @@ from stario.sequences.sequence import FloatArray
 
 _FLOOR_M = 0.01
 _CLIP = 25.0
+_STEEPEST = 4.0
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
@@ -38,5 +39,7 @@ def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
         normalised = np.minimum(error**2 / variance, _CLIP)
         return float(np.mean(normalised + np.log(variance)))
 
-    log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead").x
+    # A sigma that says nothing is ignored (exponent 0), never believed the wrong way round.
+    bounds = [(-10.0, 10.0), (0.0, _STEEPEST)]
+    log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead", bounds=bounds).x
     return float(np.exp(log_scale)), float(exponent)

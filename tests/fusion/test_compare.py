@@ -11,7 +11,7 @@ import pytest
 
 from stario.fusion import compare as compare_module
 from stario.fusion.compare import TRACKS, Comparison, compare, demonstration
-from stario.fusion.config import NavigatorConfig, read_config
+from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
 from stario.fusion.evaluate import summary, summary_table
 from stario.fusion.results import write_comparison, write_run
 from stario.sequences.errors import StarioError
@@ -19,7 +19,7 @@ from stario.sequences.files import read_tum
 from stario.sequences.metrics import align, evaluate_track
 from stario.sequences.sequence import ImuSequence
 
-CONFIG = NavigatorConfig()
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 KEYS = {"ate_m", "rte_m", "pde", "aye_rad", "nees", "nis", "seconds_network", "seconds_filter"}
 
 Make = Callable[..., Any]

@@ -117,7 +117,7 @@ def test_a_missing_file_or_a_folder_is_a_known_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rate", UPDATE_RATES)
 def test_updates_fall_on_states_and_overlap_is_paid_for(rate: int) -> None:
-    config = FilterConfig(update_rate=rate)
+    config = FilterConfig(update_rate=rate, covariance_scale=1.0)
     assert config.epochs_per_update * rate == config.output_rate >= 10
     assert config.window_updates == rate
     assert config.overlap_scale == pytest.approx(rate)

@@ -14,7 +14,7 @@ from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulate import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SECONDS, windows_of, world_streams
 
-CONFIG = NavigatorConfig()
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10))
 
 
 def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -217,7 +217,9 @@ def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence
 
 def test_what_the_filter_is_told_does_not_reach_the_windows(walk: ImuSequence) -> None:
     other = NavigatorConfig(
-        filter=FilterConfig(measurement="velocity", covariance_scale=9.0, gyro_bias_sigma=1.0)
+        filter=FilterConfig(
+            update_rate=10, measurement="velocity", covariance_scale=9.0, gyro_bias_sigma=1.0
+        )
     )
     for ours, theirs in zip(all_epochs(walk, CONFIG)[0], all_epochs(walk, other)[0], strict=True):
         np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)

@@ -19,8 +19,17 @@ from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulate import PERFECT_IMU, ImuErrors
 
-CONFIG = NavigatorConfig()
-VELOCITY = NavigatorConfig(filter=FilterConfig(measurement="velocity"))
+# Settings that fit the oracle and the simulated phone; the defaults fit networks and real ones.
+FILTER = FilterConfig(
+    update_rate=10,
+    covariance_scale=1.0,
+    gyro_bias_sigma=3e-3,
+    accel_bias_sigma=0.05,
+    accel_motion_noise=0.0,
+)
+NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
+CONFIG = NavigatorConfig(NOISE, FILTER)
+VELOCITY = NavigatorConfig(NOISE, replace(FILTER, measurement="velocity"))
 
 Make = Callable[..., Any]
 
@@ -325,9 +334,9 @@ def test_measurements_without_meaning_are_refused_and_counted(
 
 def test_outliers_are_gated_and_do_little_harm(walk: ImuSequence, make_oracle: Make) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG), 5.0, 0.02**2)
-    track = Navigator(model).run(walk)
+    track = Navigator(model, CONFIG).run(walk)
     assert 0.5 * track.health.updates / 3 < track.health.gated
-    open_gate = NavigatorConfig(filter=FilterConfig(gate=1.0 - 1e-16))
+    open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16))
     model = Broken(make_oracle(walk, walk.truth, open_gate), 5.0, 0.02**2)
     assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate).run(walk), walk)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.navigator import Navigator
 from stario.fusion.tracks import inertial_track, network_track, network_track_true_attitude
 from stario.sequences.errors import InputError
@@ -18,7 +18,7 @@ from stario.sequences.simulate import PERFECT_IMU, simulate_imu
 from stario.sequences.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS, clean_samples
 
-CONFIG = NavigatorConfig()
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 
 Make = Callable[..., Any]
 
