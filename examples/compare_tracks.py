@@ -1,6 +1,6 @@
 """Compare tracks of one recording: IMU alone, network alone, filter, against the truth.
 
-    python examples/compare_tracks.py
+python examples/compare_tracks.py
 """
 
 from __future__ import annotations

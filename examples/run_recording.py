@@ -1,6 +1,6 @@
 """Run on a recording: a fused track from one's own CSV, with nothing but IMU columns needed.
 
-    python examples/run_recording.py [RECORDING]
+python examples/run_recording.py [RECORDING]
 """
 
 from __future__ import annotations
@@ -34,5 +34,6 @@ if __name__ == "__main__":
     track = main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
     end = track.trajectory.position_W[-1]
     sigma = track.trajectory.position_covariance_W[-1].diagonal() ** 0.5
-    print(f"after {track.time[-1] - track.time[0]:.0f} s at {end.round(2)} m, sigma {sigma.round(2)}")
+    seconds = track.time[-1] - track.time[0]
+    print(f"after {seconds:.0f} s at {end.round(2)} m, sigma {sigma.round(2)} m")
     print("\n".join(track.health.lines()))

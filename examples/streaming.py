@@ -1,6 +1,6 @@
 """Call StarIO from navigation code: push samples as they come, read the state when there is one.
 
-    python examples/streaming.py
+python examples/streaming.py
 """
 
 from __future__ import annotations
