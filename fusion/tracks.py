@@ -16,14 +16,12 @@ from stario.fusion.navigator import Observed, Predictor
 from stario.fusion.preintegration import preintegrate
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.windows import (
-    MAX_IMU_GAP,
     WINDOW_RATE,
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
-    clean_samples,
-    resample,
+    imu_in_world,
 )
 
 
@@ -102,12 +100,7 @@ def _true_windows(
 ) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
     """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
     assert sequence.truth is not None  # checked by the caller
-    time, gyro, accel = clean_samples(sequence)
-    pose = sequence.truth.at(time)
-    imu_W = np.hstack([pose.attitude_WB.apply(gyro), pose.attitude_WB.apply(accel)])
-    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
-    imu_W = resample(time, imu_W, grid)
-    usable = sequence.truth.at(grid).valid & _sampled(time, grid)
+    grid, imu_W, usable = imu_in_world(sequence, sequence.truth)
     bad_before = np.concatenate([[0], np.cumsum(~usable)])
     stride = round(period * WINDOW_RATE)
     starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)
@@ -115,12 +108,7 @@ def _true_windows(
     if len(starts) == 0:
         raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    return grid[starts], imu_W[rows].transpose(0, 2, 1).astype(np.float32)
-
-
-def _sampled(time: FloatArray, grid: FloatArray) -> BoolArray:
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    return np.asarray(time[right] - time[right - 1] <= MAX_IMU_GAP)
+    return grid[starts], imu_W[rows].transpose(0, 2, 1)
 
 
 def _chained(

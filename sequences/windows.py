@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence, Trajectory
 
 WINDOW_RATE = 200.0
 """Samples per second of a window [Hz]."""
@@ -79,12 +79,7 @@ def world_streams(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
-    time, gyro, accel = clean_samples(sequence)
-    pose = sequence.truth.at(time)
-    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
-    usable = sequence.truth.at(grid).valid & ~_spans_gap(time, grid)
-    imu_W = np.concatenate([pose.attitude_WB.apply(gyro), pose.attitude_WB.apply(accel)], axis=1)
-    imu_W = resample(time, imu_W, grid).astype(np.float32)
+    grid, imu_W, usable = imu_in_world(sequence, sequence.truth)
     position_W = sequence.truth.at(grid).position_W
     return [
         WorldStream(
@@ -95,6 +90,26 @@ def world_streams(
         for start, stop in runs(usable)
         if (stop - start) / WINDOW_RATE >= min_seconds
     ]
+
+
+def imu_in_world(
+    sequence: ImuSequence, truth: Trajectory
+) -> tuple[FloatArray, NDArray[np.float32], BoolArray]:
+    """The IMU at 200 Hz turned by the true attitude.
+
+    Returns:
+        Grid times (M,) [s], gyroscope and specific force in W (M, 6) float32, and (M,) where
+        neither IMU nor truth has a gap.
+
+    Raises:
+        InputError: as for `clean_samples`.
+    """
+    time, gyro, accel = clean_samples(sequence)
+    attitude_WB = truth.at(time).attitude_WB
+    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
+    imu_W = np.concatenate([attitude_WB.apply(gyro), attitude_WB.apply(accel)], axis=1)
+    usable = truth.at(grid).valid & ~_spans_gap(time, grid)
+    return grid, resample(time, imu_W, grid).astype(np.float32), usable
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
