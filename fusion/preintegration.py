@@ -211,7 +211,8 @@ def _nav_transition(dt: float, gravity: float) -> FloatArray:
     return transition
 
 
-@lru_cache(maxsize=256)
+# Few: constant noise needs one, and noise that grows with motion never comes twice.
+@lru_cache(maxsize=4)
 def _params(noise: ImuNoise, gravity: float, noise_scale: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     eye = np.eye(3)
