@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stario.fusion.cli import _distinct, app, main
+from stario.fusion.cli import app, main
+from stario.fusion.commands.common import distinct
 from stario.fusion.config import read_config
 from stario.sequences.files import read_tum
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
@@ -315,7 +316,7 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
 def test_recordings_of_one_name_get_folders_of_their_own(recording: Path) -> None:
     walk = read_own_csv(recording)
     given = [replace(walk, name=name) for name in ("walk", "walk", "walk-2", "walk")]
-    names = [sequence.name for sequence in _distinct(given)]
+    names = [sequence.name for sequence in distinct(given)]
     assert names[:2] == ["walk", "walk-2"]
     assert len(set(names)) == 4
 

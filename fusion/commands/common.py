@@ -1,0 +1,178 @@
+"""What the commands share: groups of options, reading, progress and tables."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+import sys
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from stario.fusion.config import NavigatorConfig
+    from stario.fusion.navigator import Progress
+    from stario.network.model import DisplacementModel
+    from stario.sequences.sequence import ImuSequence
+
+PathsArgument = Annotated[
+    list[Path] | None, typer.Argument(help="Recordings, or folders that hold some.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options that say how a recording is read."""
+
+    format: Annotated[
+        str, typer.Option("--format", help="Format of the recording: auto, csv, euroc, oxiod.")
+    ] = "auto"
+    gyro_unit: Annotated[
+        str, typer.Option("--gyro-unit", help="Unit of the gyroscope: rad/s or deg/s.")
+    ] = "rad/s"
+    accel_unit: Annotated[
+        str,
+        typer.Option(
+            "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
+        ),
+    ] = "m/s^2"
+
+    def read(self, path: Path) -> ImuSequence:
+        """The recording at a path, in rad/s and m/s^2."""
+        from stario.sequences.checks import with_units
+        from stario.sequences.readers import read_recording
+
+        return with_units(read_recording(path, self.format), self.gyro_unit, self.accel_unit)
+
+
+@dataclass(frozen=True)
+class Estimating:
+    """Options that say what estimates a track."""
+
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML or JSON file with settings of the filter.")
+    ] = None
+    model: Annotated[
+        str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
+    ] = "default"
+
+    def settings(self) -> NavigatorConfig:
+        """The filter's settings."""
+        from stario.fusion.config import NavigatorConfig, read_config
+
+        return NavigatorConfig() if self.config is None else read_config(self.config)
+
+    def network(self) -> DisplacementModel:
+        """The network with its weights."""
+        from stario.network.model import load_model
+
+        return load_model(self.model)
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """A command for typer whose parameters `Reading` and `Estimating` become their fields' options.
+
+    So a group's options are written once, and a command that takes `reading: Reading` has them.
+    """
+    hints = typing.get_type_hints(command, include_extras=True)
+    groups = {name: kind for name, kind in hints.items() if kind in (Reading, Estimating)}
+    options: dict[str, inspect.Parameter] = {}
+    members: dict[str, list[str]] = {}
+    for parameter in inspect.signature(command).parameters.values():
+        group = groups.get(parameter.name)
+        if group is None:
+            options[parameter.name] = parameter.replace(
+                annotation=hints[parameter.name], kind=inspect.Parameter.KEYWORD_ONLY
+            )
+            continue
+        kinds = typing.get_type_hints(group, include_extras=True)
+        members[parameter.name] = [item.name for item in fields(group)]
+        for item in fields(group):
+            options[item.name] = inspect.Parameter(
+                item.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=item.default,
+                annotation=kinds[item.name],
+            )
+
+    @wraps(command)
+    def flat(**values: Any) -> None:
+        made = {
+            name: groups[name](**{key: values.pop(key) for key in keys})
+            for name, keys in members.items()
+        }
+        command(**values, **made)
+
+    flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
+    flat.__annotations__ = {name: option.annotation for name, option in options.items()}
+    return flat
+
+
+def found(paths: Iterable[Path]) -> list[Path]:
+    """Recordings at the paths: themselves, or all below a folder."""
+    from stario.sequences.readers import find_recordings
+
+    return [file for path in paths for file in find_recordings(path)]
+
+
+def distinct(sequences: Iterable[ImuSequence]) -> list[ImuSequence]:
+    """Recordings under names of their own, since a name is a folder of the results."""
+    from dataclasses import replace
+
+    result: dict[str, ImuSequence] = {}
+    for sequence in sequences:
+        names = (f"{sequence.name}-{k}" if k > 1 else sequence.name for k in itertools.count(1))
+        name = next(name for name in names if name not in result)
+        result[name] = replace(sequence, name=name)
+    return list(result.values())
+
+
+@contextmanager
+def progress_bar(title: str, total: int = 100) -> Iterator[Progress]:
+    """A bar on stderr, driven by the share of the work done; none where nobody watches."""
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc=title, disable=None, leave=False, file=sys.stderr) as bar:
+
+        def advance(share: float) -> None:
+            bar.update(max(0, round(share * total) - bar.n))
+
+        yield advance
+
+
+def track_table(metrics: dict[str, dict[str, float | None]]) -> str:
+    """A row of figures for each track."""
+    columns = {
+        "ate_m": "ATE [m]",
+        "rte_m": "RTE [m]",
+        "pde": "PDE",
+        "aye_rad": "AYE [rad]",
+        "nees": "NEES",
+        "nis": "NIS",
+        "seconds_network": "network [s]",
+        "seconds_filter": "rest [s]",
+    }
+    lines = [f"{'':<22}" + "".join(f"{title:>12}" for title in columns.values())]
+    for name, figures in metrics.items():
+        cells = [figures.get(key) for key in columns]
+        lines.append(f"{name:<22}" + "".join(f"{_cell(value):>12}" for value in cells))
+    return "\n".join(lines)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.3f}"
+
+
+def print_json(content: object) -> None:
+    """Print figures on stdout for another program."""
+    from stario.sequences.files import json_text
+
+    typer.echo(json_text(content), nl=False)

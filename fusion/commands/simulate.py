@@ -1,0 +1,49 @@
+"""`stario simulate`: a simulated walk as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stario.fusion.commands.common import JsonOption, print_json
+from stario.sequences.errors import InputError
+
+
+def simulate(
+    path: Annotated[Path, typer.Argument(help="CSV file to write.")],
+    seconds: Annotated[float, typer.Option(help="Duration in s.")] = 60.0,
+    rate: Annotated[float, typer.Option(help="Sampling rate in Hz.")] = 200.0,
+    carry: Annotated[
+        str, typer.Option(help="How the device is carried; random draws person and carry.")
+    ] = "random",
+    imu: Annotated[str, typer.Option(help="Sensor: phone, good or perfect.")] = "phone",
+    seed: Annotated[int, typer.Option(min=0, help="Of walk and sensor.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a simulated walk with its truth as a CSV recording."""
+    from stario.sequences.readers.own_csv import write_csv
+    from stario.sequences.simulate import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
+    from stario.sequences.walks import WalkStyle, generate_walk
+
+    sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
+    if imu not in sensors:
+        raise InputError("--imu", repr(imu), f"one of {', '.join(sensors)}")
+    style = None if carry == "random" else WalkStyle(carry=carry)
+    walk = generate_walk(seed, seconds, style=style)
+    sequence = simulate_imu(walk, rate, sensors[imu], seed, name=path.stem)
+    write_csv(path, sequence)
+    figures = {
+        "path": str(path),
+        "duration_s": sequence.duration,
+        "path_m": walk.path_length(),
+        "samples": len(sequence),
+    }
+    if as_json:
+        print_json(figures)
+        return
+    typer.echo(
+        f"{path}: {figures['samples']} samples, {sequence.duration:.1f} s, "
+        f"{walk.path_length():.1f} m"
+    )
