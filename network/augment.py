@@ -2,7 +2,8 @@
 
 Everything works on whole batches: a training step draws start points, a replay speed, a yaw, a
 tilt, biases, noise and a mirror image for each window at once. Sources: yaw, tilt and biases after
-TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics.
+TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics, and so is a device
+that is swung about a point beside it (`stario.network.swing`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from stario.network.swing import draw_swing, swung
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
@@ -27,6 +29,9 @@ class Augmentation:
         speeds: range of the replay speed; a window replayed s times as fast has angular rates x s,
             linear accelerations x s^2, and covers s seconds of the recording.
         replayed: share of windows that are replayed; the others keep speed 1.
+        swung: share of windows in which the device is swung besides.
+        swing_rate: largest angular rate of a swing [rad/s].
+        lever: largest distance of the device from the point it is swung about [m].
         tilt: largest error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
@@ -36,6 +41,9 @@ class Augmentation:
 
     speeds: tuple[float, float] = (0.6, 1.8)
     replayed: float = 0.4
+    swung: float = 0.35
+    swing_rate: float = 2.5
+    lever: float = 0.35
     tilt: float = 0.05
     gyro_bias: float = 0.03
     accel_bias: float = 0.15
@@ -113,6 +121,8 @@ class WindowSampler:
         size = len(imu)
         mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
         imu, displacement = _mirrored(imu, displacement, mirror)
+        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
+        imu, displacement = swung(imu, displacement, swings)
         R_yaw = _about_z(self._symmetric(size) * torch.pi)
         R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
         turned = imu.view(size, WINDOW_SAMPLES, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)

@@ -33,7 +33,9 @@ TINY = TrainingConfig(
     likelihood_from=0.5,
     average=0.9,
     device="cpu",
-    augmentation=Augmentation(speeds=(1.0, 1.0), tilt=0.02, gyro_bias=0.01, accel_bias=0.05),
+    augmentation=Augmentation(
+        speeds=(1.0, 1.0), swung=0.0, tilt=0.02, gyro_bias=0.01, accel_bias=0.05
+    ),
 )
 
 
