@@ -95,4 +95,5 @@ def _turned(vectors: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
     """Rodrigues' rotation of vectors (B, T, 3) about unit axes by angles (B, T, 1)."""
     along = axis * (axis * vectors).sum(2, keepdim=True)
     across = torch.linalg.cross(axis, vectors)
-    return along + angle.cos() * (vectors - along) + angle.sin() * across
+    turned: Tensor = along + angle.cos() * (vectors - along) + angle.sin() * across
+    return turned
