@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,9 +16,8 @@ from scipy.stats import chi2
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf, UpdateResult
 from stario.fusion.intake import Epoch, IntakeCounts, Start
-from stario.fusion.preintegration import Segment, preintegrate
+from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -89,9 +88,10 @@ class FilterRecipe:
         """Move to the epoch's end and take in the measurement of the window that ends there."""
         if epoch.gap:
             self._forget_window()
-        before = self.ekf.v_W
-        self.ekf.propagate(self._segment(epoch))
-        self._velocity_steps.append(self.ekf.v_W - before)
+        ekf = self.ekf
+        before = ekf.v_W
+        ekf.propagate(segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config))
+        self._velocity_steps.append(ekf.v_W - before)
         if measurement is not None:
             self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
@@ -134,41 +134,6 @@ class FilterRecipe:
         if self._uses_clones:
             self._clone(start.time)
 
-    def _segment(self, epoch: Epoch) -> Segment:
-        config, ekf = self._config, self.ekf
-        if epoch.gap:
-            return self._unseen_segment(epoch)
-        noise = self._noise(epoch)
-        return preintegrate(
-            epoch.time, epoch.gyro, epoch.accel, ekf.b_g, ekf.b_a, noise, config.gravity
-        )
-
-    def _unseen_segment(self, epoch: Epoch) -> Segment:
-        """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
-        config, ekf = self._config, self.ekf
-        hover = ekf.R_WB.T @ [0.0, 0.0, config.gravity] + ekf.b_a
-        noise = replace(
-            config.noise,
-            gyro_noise=config.filter.gap_gyro_noise,
-            accel_noise=config.filter.gap_accel_noise,
-        )
-        gyro, accel = np.tile(ekf.b_g, (2, 1)), np.tile(hover, (2, 1))
-        return preintegrate(epoch.time, gyro, accel, ekf.b_g, ekf.b_a, noise, config.gravity)
-
-    def _noise(self, epoch: Epoch) -> ImuNoise:
-        """White noise that grows with motion: scale and alignment errors act like it."""
-        noise, f = self._config.noise, self._config.filter
-        if f.gyro_motion_noise == 0.0 and f.accel_motion_noise == 0.0:
-            return noise
-        rate = math.sqrt(float(np.square(epoch.gyro).sum() / len(epoch.gyro)))
-        excess = np.linalg.norm(epoch.accel, axis=1) - self._config.gravity
-        motion = math.sqrt(float(np.square(excess).mean()))
-        return replace(
-            noise,
-            gyro_noise=math.hypot(noise.gyro_noise, f.gyro_motion_noise * rate),
-            accel_noise=math.hypot(noise.accel_noise, f.accel_motion_noise * motion),
-        )
-
     def _update(self, epoch: Epoch, measurement: Measurement) -> None:
         # What is not finite is the filter's to refuse and count.
         with np.errstate(invalid="ignore"):
@@ -181,11 +146,11 @@ class FilterRecipe:
         covariance_N = covariance_N * self._config.filter.overlap_scale
         if self._uses_clones:
             slot = self._slots[0]
-            R_WN = _yaw_between(self.ekf.clone_pose(slot)[0], epoch.R_NB_window)
+            R_WN = yaw_between(self.ekf.clone_pose(slot)[0], epoch.R_NB_window)
             return self.ekf.update_displacement(
                 slot, None, R_WN @ displacement_N, R_WN @ covariance_N @ R_WN.T, self._gate
             )
-        R_WN = _yaw_between(self.ekf.R_WB, epoch.R_NB)
+        R_WN = yaw_between(self.ekf.R_WB, epoch.R_NB)
         mean_W = R_WN @ displacement_N / WINDOW_SECONDS
         covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
         return self.ekf.update_mean_velocity(mean_W + self._velocity_gain(), covariance, self._gate)
@@ -209,7 +174,7 @@ class FilterRecipe:
         self._velocity_steps.clear()
 
 
-def _yaw_between(R_WB: FloatArray, R_NB: FloatArray | None) -> FloatArray:
+def yaw_between(R_WB: FloatArray, R_NB: FloatArray | None) -> FloatArray:
     """R_WN about the vertical: from the levelled frame's yaw to the estimated world's."""
     assert R_NB is not None  # a window always comes with the attitude it started at
     R = R_WB @ R_NB.T

@@ -1,0 +1,61 @@
+"""An epoch's samples as a preintegrated segment, with the noise that holds there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.intake import Epoch
+from stario.fusion.preintegration import Segment, preintegrate
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import FloatArray
+
+
+def segment_of(
+    epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+) -> Segment:
+    """The segment from an epoch's start to its end.
+
+    Args:
+        epoch: samples, or a gap.
+        R_WB: (3, 3) attitude at its start; only a gap needs it.
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        config: noise and gravity.
+    """
+    if epoch.gap:
+        return _unseen(epoch, R_WB, b_g, b_a, config)
+    noise = _noise(epoch, config)
+    return preintegrate(epoch.time, epoch.gyro, epoch.accel, b_g, b_a, noise, config.gravity)
+
+
+def _unseen(
+    epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+) -> Segment:
+    """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
+    hover = R_WB.T @ [0.0, 0.0, config.gravity] + b_a
+    noise = replace(
+        config.noise,
+        gyro_noise=config.filter.gap_gyro_noise,
+        accel_noise=config.filter.gap_accel_noise,
+    )
+    gyro, accel = np.tile(b_g, (2, 1)), np.tile(hover, (2, 1))
+    return preintegrate(epoch.time, gyro, accel, b_g, b_a, noise, config.gravity)
+
+
+def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:
+    """White noise that grows with motion: scale and alignment errors act like it."""
+    noise, f = config.noise, config.filter
+    if f.gyro_motion_noise == 0.0 and f.accel_motion_noise == 0.0:
+        return noise
+    rate = math.sqrt(float(np.square(epoch.gyro).sum() / len(epoch.gyro)))
+    excess = np.linalg.norm(epoch.accel, axis=1) - config.gravity
+    motion = math.sqrt(float(np.square(excess).mean()))
+    return replace(
+        noise,
+        gyro_noise=math.hypot(noise.gyro_noise, f.gyro_motion_noise * rate),
+        accel_noise=math.hypot(noise.accel_noise, f.accel_motion_noise * motion),
+    )
