@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_time_ns, read_lines, read_table
+from stario.sequences.readers.text import read_lines, read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
@@ -30,14 +30,15 @@ def read_euroc(path: Path) -> ImuSequence:
     imu = imu_file(path)
     if imu is None:
         raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
-    table = read_table(imu, columns=7, time_ns=True)
+    table = read_table(imu, columns=7)
+    stamps = table.stamps_ns()
     truth_file = _truth_file(imu.parent.parent)
     return ImuSequence(
         name=_name(imu),
-        time=table[:, 0],
-        gyro=table[:, 1:4],
-        accel=table[:, 4:7],
-        truth=None if truth_file is None else _truth(truth_file, first_time_ns(imu)),
+        time=seconds(stamps, stamps[0]),
+        gyro=table.values[:, 1:4],
+        accel=table.values[:, 4:7],
+        truth=None if truth_file is None else _truth(truth_file, stamps[0]),
     )
 
 
@@ -72,10 +73,10 @@ def _holds_velocity(path: Path) -> bool:
     return len(next(rows, "").split(",")) >= 11
 
 
-def _truth(path: Path, start_ns: int) -> Trajectory:
+def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     columns = 11 if _holds_velocity(path) else 8
-    table = read_table(path, columns=columns, time_ns=True)
-    time = table[:, 0] + (first_time_ns(path) - start_ns) * 1e-9
+    rows = read_table(path, columns=columns)
+    table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
     keep = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0])
     table, time = table[keep], time[keep]
     norm = np.linalg.norm(table[:, 4:8], axis=1)

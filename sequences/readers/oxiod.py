@@ -41,7 +41,7 @@ def read_oxiod(path: Path) -> ImuSequence:
     Raises:
         ReadError: a file is missing, cut short, or the two do not have the same number of rows.
     """
-    table = read_table(path, columns=16)
+    table = read_table(path, columns=16).values
     time = np.arange(len(table)) / RATE
     gyro = table[:, 4:7]
     accel = -_G * (table[:, 7:10] + table[:, 10:13])
@@ -64,7 +64,7 @@ def _name(path: Path) -> str:
 
 
 def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Trajectory | None:
-    table = read_table(path, columns=9)
+    table = read_table(path, columns=9).values
     if len(table) != len(time):
         raise ReadError(path, "rows", str(len(table)), f"{len(time)} as in the IMU's file")
     position, quat_xyzw = table[:, 2:5], table[:, 5:9]

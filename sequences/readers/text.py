@@ -1,14 +1,18 @@
-"""Numbers from comma-separated files, with errors that name file, line and column."""
+"""Numbers from text files, with errors that name file, line and column."""
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
 from stario.sequences.sequence import FloatArray
+
+IntArray = NDArray[np.int64]
 
 _HEAD_BYTES = 8192
 
@@ -33,73 +37,143 @@ def read_lines(path: Path) -> list[str]:
 def first_line(path: Path, comments: bool = False) -> str | None:
     """The first line of a text file that is not blank, or None if it has none or is no text.
 
-    Reads little of the file, and never raises: it serves to recognise formats.
-
     Args:
         path: the file.
         comments: return a line that starts with `#` as well.
+    """
+    return next(iter(first_lines(path, 1, comments)), None)
+
+
+def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
+    """Up to `count` lines like `first_line`; little of the file is read.
+
+    Never raises: it serves to recognise formats.
     """
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError:
-        return None
+        return []
     if b"\0" in head:
-        return None
+        return []
     # The head may end within a character: what is replaced there is never looked at.
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    kept = (x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#")))
-    return next(kept, None)
+    kept = [x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#"))]
+    return kept[:count]
 
 
-def first_numbers(path: Path) -> list[float]:
-    """The first row's numbers, or an empty list if the first row is anything else."""
+def magic(path: Path, count: int = 16) -> bytes:
+    """The first bytes of a file, empty where there is none; never raises."""
     try:
-        return [float(cell) for cell in (first_line(path) or "").split(",")]
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
+def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
+    """The numbers of a line, or an empty list if it holds anything else."""
+    try:
+        return [float(cell) for cell in line.split(delimiter)]
     except ValueError:
         return []
 
 
-def read_table(path: Path, columns: int, skip: int = 0, time_ns: bool = False) -> FloatArray:
-    """Rows of comma-separated numbers as (N, columns); `nan` and empty cells become NaN.
+def first_numbers(path: Path) -> list[float]:
+    """The first row's numbers, or an empty list if the first row is anything else."""
+    return numbers_in(first_line(path) or "")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of numbers as they stand in a file.
+
+    Attributes:
+        path: the file.
+        values: (N, K); `nan` and empty cells are NaN.
+        lines: the N lines.
+        line_numbers: where they stand in the file, counted from 1.
+        delimiter: between the cells, None for blanks.
+    """
+
+    path: Path
+    values: FloatArray
+    lines: list[str]
+    line_numbers: list[int]
+    delimiter: str | None = ","
+
+    def stamps_ns(self, column: int = 0, per_second: int = 10**9) -> IntArray:
+        """A column of times as whole nanoseconds (N,), exact: float64 cannot hold those of today.
+
+        Args:
+            column: which one.
+            per_second: how many of the column's units make a second.
+
+        Raises:
+            ReadError: a cell is no time.
+        """
+        cells = [line.split(self.delimiter, column + 1)[column] for line in self.lines]
+        unit_ns = 10**9 // per_second
+        try:
+            stamps = [int(cell) * unit_ns for cell in cells]
+        except ValueError:
+            stamps = [self._stamp(k, cell, unit_ns) for k, cell in enumerate(cells)]
+        try:
+            return np.array(stamps, dtype=np.int64)
+        except OverflowError:
+            found = f"a time of {max(map(abs, stamps)):.3g} ns"
+            raise ReadError(self.path, "time", found, "at most 9.2e18 ns") from None
+
+    def _stamp(self, row: int, cell: str, unit_ns: int) -> int:
+        try:
+            whole, _, fraction = cell.strip().partition(".")
+            if whole.isdecimal() and (fraction.isdecimal() or not fraction):
+                # Digit by digit: seconds since 1970 with nine decimals are more than a float holds.
+                return int(whole) * unit_ns + round(float(f"0.{fraction or 0}") * unit_ns)
+            return round(float(cell) * unit_ns)
+        except (ValueError, OverflowError):
+            where = f"line {self.line_numbers[row]}, time"
+            raise ReadError(self.path, where, repr(cell.strip()), "a time") from None
+
+
+def read_table(
+    path: Path,
+    columns: int,
+    skip: int = 0,
+    delimiter: str | None = ",",
+    used: list[int] | None = None,
+) -> Table:
+    """Rows of numbers; `nan` and empty cells become NaN.
 
     Args:
         path: the file; lines that start with `#` are skipped.
         columns: how many numbers a row must at least hold; more are dropped.
         skip: how many header lines come first.
-        time_ns: the first column is integer nanoseconds: returned as seconds since the first row,
-            because float64 cannot hold an epoch in nanoseconds.
+        delimiter: between the cells; None for blanks.
+        used: the columns to return, in this order; all if None.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
     lines = read_lines(path)
-    rows = [line for line in lines[skip:] if _is_row(line)]
-    if not rows:
+    numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
+    if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    rows = [line for _, line in numbered]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            table = np.loadtxt(rows, delimiter=",", ndmin=2, usecols=range(columns))
+            values = np.loadtxt(
+                rows, delimiter=delimiter, ndmin=2, usecols=used or range(columns), comments=None
+            )
     except (ValueError, IndexError):
-        table = np.array(
-            [
-                _row(path, k, text, columns)
-                for k, text in enumerate(lines, 1)
-                if k > skip and _is_row(text)
-            ]
-        )
-    if time_ns:
-        table[:, 0] = _seconds_since_first(path, lines, skip)
-    return np.asarray(table, dtype=np.float64)
+        values = np.array([_row(path, k, line, columns, delimiter, used) for k, line in numbered])
+    return Table(path, values, rows, [k for k, _ in numbered], delimiter)
 
 
-def first_time_ns(path: Path) -> int:
-    """The first row's time stamp [ns] of a file whose first column is integer nanoseconds."""
-    for number, line in enumerate(read_lines(path), 1):
-        if _is_row(line):
-            return _stamp(path, number, line)
-    raise ReadError(path, "rows", "none below the header", "rows of numbers")
+def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
+    """Seconds since an origin."""
+    return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
 
 
 def _is_row(line: str) -> bool:
@@ -107,21 +181,11 @@ def _is_row(line: str) -> bool:
     return bool(text) and text[0] != "#"
 
 
-def _stamp(path: Path, number: int, line: str) -> int:
-    cell = line.split(",", 1)[0].strip()
-    try:
-        return int(cell) if cell.isdecimal() else int(float(cell))
-    except (ValueError, OverflowError):
-        raise ReadError(path, f"line {number}, time", repr(cell), "integer nanoseconds") from None
-
-
-def _seconds_since_first(path: Path, lines: list[str], skip: int) -> FloatArray:
-    stamps = [_stamp(path, k, x) for k, x in enumerate(lines, 1) if k > skip and _is_row(x)]
-    return (np.array(stamps, dtype=np.int64) - stamps[0]).astype(np.float64) * 1e-9
-
-
-def _row(path: Path, number: int, text: str, columns: int) -> list[float]:
-    cells = text.split(",")
+def _row(
+    path: Path, number: int, text: str, columns: int, delimiter: str | None, used: list[int] | None
+) -> list[float]:
+    """One row the slow way, for the error that names its line and column."""
+    cells = text.split(delimiter)
     if len(cells) < columns:
         raise ReadError(
             path,
@@ -131,11 +195,10 @@ def _row(path: Path, number: int, text: str, columns: int) -> list[float]:
             "the file looks cut short" if number > 1 else "",
         )
     values = []
-    for k, cell in enumerate(cells[:columns], 1):
+    for k in used or range(columns):
         try:
-            values.append(float(cell) if cell.strip() else float("nan"))
+            values.append(float(cells[k]) if cells[k].strip() else float("nan"))
         except ValueError:
-            raise ReadError(
-                path, f"line {number}, column {k}", repr(cell.strip()), "a number"
-            ) from None
+            where = f"line {number}, column {k + 1}"
+            raise ReadError(path, where, repr(cells[k].strip()), "a number") from None
     return values

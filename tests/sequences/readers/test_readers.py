@@ -16,7 +16,7 @@ from stario.sequences.simulate import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.walks import WalkStyle, generate_walk
 
 DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")
 )
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 
