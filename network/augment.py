@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,6 +64,8 @@ class Augmentation:
 class WindowSampler:
     """Draws augmented training batches from streams, each stream weighted.
 
+    Streams may be memory-mapped: a batch reads the stretches it is cut from, nothing is kept.
+
     Args:
         streams: at least one, each longer than a window at the fastest replay.
         weights: relative frequency of each stream per second of it.
@@ -87,10 +90,9 @@ class WindowSampler:
             if len(stream) < reach:
                 found = f"a stretch of {len(stream)} samples"
                 raise InputError(stream.name, found, f"at least {reach}, the fastest replay's")
-        self._imu = torch.cat([torch.from_numpy(s.imu_W) for s in streams])
-        self._position = torch.cat([torch.from_numpy(s.position_W) for s in streams])
-        first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
-        self._first = first
+        self._streams = streams
+        self._reach = reach
+        self._first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
         self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
         share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
         self._cumulative = (share / share.sum()).cumsum(0)
@@ -103,12 +105,23 @@ class WindowSampler:
         # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
         speed = self._speeds(size)
+        # Samples count through all streams, as the draws of a seed always have.
         start = self._first[stream].double() + offset
         steps = torch.arange(WINDOW_SAMPLES + 1, dtype=torch.float64)
         at = start[:, None] + steps * speed[:, None].double()
-        imu = _lerp(self._imu, at[:, :-1])
-        ends = _lerp(self._position, at[:, [0, -1]])
+        imu_W, position_W = self._pieces(stream.tolist(), offset.long().tolist())
+        imu = _lerp(imu_W, start, at[:, :-1])
+        ends = _lerp(position_W, start, at[:, [0, -1]])
         return self._vary(_replayed(imu, speed), ends[:, 1] - ends[:, 0])
+
+    def _pieces(self, streams: list[int], offsets: list[int]) -> tuple[Tensor, Tensor]:
+        """Stretches (B, reach, 6) and (B, reach, 3): all that is read from a memory-mapped file."""
+        imu = np.empty((len(streams), self._reach, 6), dtype=np.float32)
+        position = np.empty((len(streams), self._reach, 3), dtype=np.float32)
+        for row, (stream, offset) in enumerate(zip(streams, offsets, strict=True)):
+            imu[row] = self._streams[stream].imu_W[offset : offset + self._reach]
+            position[row] = self._streams[stream].position_W[offset : offset + self._reach]
+        return torch.from_numpy(imu), torch.from_numpy(position)
 
     def _speeds(self, size: int) -> Tensor:
         low, high = self.augmentation.speeds
@@ -172,8 +185,17 @@ def _small_tilt(angles: Tensor) -> Tensor:
     return R
 
 
-def _lerp(table: Tensor, at: Tensor) -> Tensor:
-    """Rows of table (N, K) at fractional indices (B, M), as (B, M, K)."""
-    left = at.floor().long().clamp(max=len(table) - 2)
+def _lerp(pieces: Tensor, start: Tensor, at: Tensor) -> Tensor:
+    """Rows of pieces (B, reach, K), which begin at `start` (B,), at indices `at` (B, M).
+
+    Returns:
+        (B, M, K).
+    """
+    size, reach, _ = pieces.shape
+    last = start.long()[:, None] + reach - 2
+    left = at.floor().long().minimum(last)
     weight = (at - left).float().unsqueeze(-1)
-    return table[left] * (1.0 - weight) + table[left + 1] * weight
+    local = left - start.long()[:, None] + reach * torch.arange(size)[:, None]
+    rows = pieces.view(size * reach, -1)
+    here, there = (rows.index_select(0, k.flatten()).view(*k.shape, -1) for k in (local, local + 1))
+    return here * (1.0 - weight) + there * weight

@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -216,3 +217,37 @@ def test_no_window_reaches_over_the_end_of_its_stream() -> None:
 def test_a_stream_shorter_than_the_fastest_window_is_refused() -> None:
     with pytest.raises(InputError, match="short: found a stretch of 300 samples"):
         WindowSampler([STREAM, resting("short", 300)], [1.0, 1.0], Augmentation(), seed=0)
+
+
+def mapped(stream: WorldStream, folder: Path) -> WorldStream:
+    """The same stream in files that are not read until they are used."""
+    for name in ("imu_W", "position_W"):
+        np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
+    imu_W, position_W = (
+        np.load(folder / f"{stream.name}-{name}.npy", mmap_mode="r")
+        for name in ("imu_W", "position_W")
+    )
+    return WorldStream(stream.name, imu_W, position_W)
+
+
+def test_memory_mapped_streams_give_the_same_windows(tmp_path: Path) -> None:
+    streams = [stream_of(path(speed), f"path-{speed}") for speed in (1.0, 1.4, 0.8)]
+    files = [mapped(stream, tmp_path) for stream in streams]
+    weights = [1.0, 0.3, 2.0]
+    memory, disk = (WindowSampler(s, weights, Augmentation(), seed=5) for s in (streams, files))
+    for _ in range(3):
+        for expected, found in zip(memory.batch(64), disk.batch(64), strict=True):
+            assert torch.equal(expected, found)
+
+
+def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    rows = 10 * 3600 * 200  # 260 MB; a file of zeros that takes no room on the disk
+    imu_W, position_W = (
+        np.memmap(tmp_path / str(width), np.float32, "w+", shape=(rows, width)) for width in (6, 3)
+    )
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    sampler = WindowSampler([WorldStream("long", imu_W, position_W)], [1.0], Augmentation(), seed=0)
+    windows, _ = sampler.batch(64)
+    assert torch.isfinite(windows).all()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
