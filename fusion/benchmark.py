@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.ekf import Block, StateCloningEkf
+from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.jacobians import Block
 from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment, preintegrate
 from stario.sequences.noise import ImuNoise

@@ -6,10 +6,6 @@ with the meaning given in `preintegration`. The state itself lives on SE_2(3) an
 `x` is the mean of the error, zero before each update, and moved into the state by the group's
 exponential after it. An empty slot has zero covariance and zero columns in every Jacobian.
 
-filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
-(core rows against the clones, one slot, a symmetric update of the measurement's rank), with the
-same result; `benchmark.DenseEkf` runs filterpy's own algebra for comparison.
-
 Sources: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", 2017;
 S. Roumeliotis, J. Burdick, "Stochastic cloning", 2002; W. Liu et al., "TLIO", 2020 (displacements
 as measurements).
@@ -18,53 +14,33 @@ as measurements).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
-from scipy.linalg.blas import dgemm
-from scipy.linalg.lapack import dpotrf, dtrtri
 
+from stario.fusion.checked import check_covariance, checked
+from stario.fusion.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.jacobians import (
+    CLONE,
+    displacement_jacobian,
+    heading_jacobian,
+    mean_velocity_jacobian,
+    position_jacobian,
+    velocity_jacobian,
+    world_from_invariant,
+    yaw_twist,
+)
 from stario.fusion.lie import FloatArray, exp_times, skew
 from stario.fusion.preintegration import CORE, Segment
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
-CLONE = 6
-"""Size of the error state of one clone."""
 
-GateMode = Literal["inflate", "reject"]
-Block = tuple[int, FloatArray]
-"""First column of the error state a Jacobian block stands at, and the block (m, width)."""
-
-
-class UpdateResult(NamedTuple):
-    """What became of one measurement.
-
-    Attributes:
-        nis: normalised innovation squared under the covariance given, before any inflation;
-            not-a-number where it could not be computed.
-        dof: dimension of the measurement, the expectation of `nis`.
-        accepted: False where the state was left alone.
-        scale: factor by which the measurement covariance was inflated (1: not gated).
-        reason: why the measurement was refused; empty where it was accepted.
-    """
-
-    nis: float
-    dof: int
-    accepted: bool
-    scale: float = 1.0
-    reason: str = ""
-
-
-class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy is untyped
+class StateCloningEkf(ErrorStateEngine):
     """Right-invariant EKF over the current state and `slots` cloned poses.
 
     Use it as: `initialise`, then `propagate` segments, `clone` poses, `update_...`, `release`.
-    filterpy's `P`, `R`, `y`, `z`, `S`, `SI`, `K`, `log_likelihood`, `mahalanobis`, `x_post`,
-    `P_prior` and `P_post` describe the last step; `x` is the error's mean, always zero between
-    steps. Its `predict` and `update` are the dense engine and not meant to be called from outside.
+    What filterpy tells of the last step is described in `engine.ErrorStateEngine`.
 
     Args:
         slots: number of poses that can be held at once.
@@ -74,12 +50,9 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
     def __init__(self, slots: int, gravity: float = STANDARD_GRAVITY) -> None:
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
-        self._last_downdate: FloatArray | None = None
-        super().__init__(dim_x=CORE + CLONE * slots, dim_z=3)
+        super().__init__(CORE + CLONE * slots)
         self.gravity = gravity
         self.slots = slots
-        self.P = np.zeros((self.dim_x, self.dim_x))
-        self.Q = np.zeros((self.dim_x, self.dim_x))
         self.time = math.nan
         # Row 0 is the current pose, row 1 + s the clone in slot s: one stack to correct at once.
         # Columns R, v, p; a clone's v is not used and stays zero.
@@ -139,7 +112,8 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         Order: rotation error about the world's axes [rad], velocity error [m/s] and position error
         [m] in W, biases [rad/s], [m/s^2], each true minus estimate (R = (I + [theta]x) R^).
         """
-        to_world = _world_from_invariant(self.v_W, self.p_W)
+        X = self._X[0]
+        to_world = world_from_invariant(X[:, 3], X[:, 4])
         return np.asarray(to_world @ self.P[:CORE, :CORE] @ to_world.T)
 
     def initialise(
@@ -168,18 +142,18 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
                 covariance is not symmetric and positive semi-definite.
         """
         given = {"v_W": v_W, "p_W": p_W, "b_g": b_g, "b_a": b_a}
-        arrays = {name: _checked(name, value, (3,)) for name, value in given.items()}
-        R = _checked("R_WB", R_WB, (3, 3))
+        arrays = {name: checked(name, value, (3,)) for name, value in given.items()}
+        R = checked("R_WB", R_WB, (3, 3))
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
             raise InputError("R_WB", "a matrix that is no rotation", "R R^T = I with det R = 1")
-        covariance = _checked("covariance", covariance, (CORE, CORE))
-        _check_covariance(covariance)
+        covariance = checked("covariance", covariance, (CORE, CORE))
+        check_covariance(covariance)
 
-        self.time = _checked("time", time, ()).item()
+        self.time = checked("time", time, ()).item()
         self._set_pose(R, arrays["v_W"], arrays["p_W"])
         self._b_g, self._b_a = arrays["b_g"], arrays["b_a"]
         self._clone_time = [None] * self.slots
-        from_world = np.linalg.inv(_world_from_invariant(arrays["v_W"], arrays["p_W"]))
+        from_world = np.linalg.inv(world_from_invariant(arrays["v_W"], arrays["p_W"]))
         core = from_world @ covariance @ from_world.T
         self.P[:] = 0.0
         self.P[:CORE, :CORE] = 0.5 * (core + core.T)
@@ -228,6 +202,82 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         first = CORE + CLONE * slot
         self.P[first : first + CLONE] = 0.0
         self.P[:, first : first + CLONE] = 0.0
+
+    # --- the world as a whole --------------------------------------------------------------------
+
+    def move_world(self, R: FloatArray, shift: FloatArray) -> None:
+        """Give every pose in another world: p <- R p + shift, likewise attitude and velocity.
+
+        A turn about the vertical (and any shift) leaves gravity where it is; the error turns with
+        the world exactly, by the adjoint of (R, shift).
+
+        Args:
+            R: (3, 3) rotation about the vertical.
+            shift: (3,) [m].
+        """
+        self._X = R @ self._X
+        self._X[:, :, 4] += shift
+        A = np.eye(self.dim_x)
+        for first, rho in self._poses():
+            A[first : first + 3, first : first + 3] = R
+            A[rho : rho + 3, rho : rho + 3] = R
+            A[rho : rho + 3, first : first + 3] = skew(shift) @ R
+        A[3:6, 3:6] = R
+        P = A @ self.P @ A.T
+        self.P = 0.5 * (P + P.T)
+        self._last_downdate = None
+
+    def loosen_yaw(self, about_W: FloatArray, sigma: float) -> None:
+        """Admit that the world as a whole may be turned about a vertical through a point.
+
+        Args:
+            about_W: (3,) the point that stays [m].
+            sigma: of the turn [rad].
+        """
+        N = np.zeros((self.dim_x, 1))
+        for first, rho in self._poses():
+            N[first + 2, 0] = 1.0
+            N[rho, 0], N[rho + 1, 0] = about_W[1], -about_W[0]  # -e3 x p
+        self._loosen(N, sigma)
+
+    def loosen_position(self, sigma: float) -> None:
+        """Admit that the world as a whole may be shifted by `sigma` [m] per axis."""
+        N = np.zeros((self.dim_x, 3))
+        for _, rho in self._poses():
+            N[rho : rho + 3] = np.eye(3)
+        self._loosen(N, sigma)
+
+    def _loosen(self, directions: FloatArray, sigma: float) -> None:
+        self.P = self.P + sigma**2 * (directions @ directions.T)
+        self._last_downdate = None
+
+    def _poses(self) -> list[tuple[int, int]]:
+        """First rows of theta and rho_p of the current pose and of every clone held."""
+        held = (CORE + CLONE * k for k, time in enumerate(self._clone_time) if time is not None)
+        return [(0, 6), *((first, first + 3) for first in held)]
+
+    # --- going back ------------------------------------------------------------------------------
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that `rewind` needs, as copies: arrays, numbers and a list."""
+        return {
+            "time": self.time,
+            "X": self._X.copy(),
+            "b_g": self._b_g,
+            "b_a": self._b_a,
+            "P": self.P.copy(),
+            "clone_time": list(self._clone_time),
+        }
+
+    def rewind(self, checkpoint: dict[str, Any]) -> None:
+        """Go back to a checkpoint of a filter with as many slots; the checkpoint stays usable."""
+        self.time = checkpoint["time"]
+        self._X = checkpoint["X"].copy()
+        self._b_g, self._b_a = checkpoint["b_g"], checkpoint["b_a"]
+        self.P = checkpoint["P"].copy()
+        self._clone_time = list(checkpoint["clone_time"])
+        self.x = np.zeros((self.dim_x, 1))
+        self._last_downdate = None
 
     # --- measurements ----------------------------------------------------------------------------
 
@@ -300,109 +350,32 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
         """Current position (3,) [m] with covariance (3, 3) [m^2]."""
-        H, predicted = np.zeros((3, 9)), self.p_W
-        H[:, 0:3], H[:, 6:9] = -skew(predicted), _EYE
-        return self.update_linear(p_W - predicted, [(0, H)], covariance, gate, gate_mode)
+        predicted = self.p_W
+        blocks = position_jacobian(predicted)
+        return self.update_linear(p_W - predicted, blocks, covariance, gate, gate_mode)
 
-    def update_linear(
+    def update_velocity_W(
         self,
-        residual: FloatArray,
-        blocks: Sequence[Block],
+        v_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
-        """Update with any measurement that is linear in the error.
+        """Current velocity (3,) [m/s] in W itself, not in its estimate, covariance (3, 3)."""
+        predicted = self.v_W
+        blocks = velocity_jacobian(predicted)
+        return self.update_linear(v_W - predicted, blocks, covariance, gate, gate_mode)
 
-        Args:
-            residual: (m,) measured minus predicted.
-            blocks: Jacobian of the residual by the error (true minus estimate), as blocks
-                (first column, (m, width)); columns in no block are zero.
-            covariance: (m, m).
-            gate: NIS from which the measurement counts as an outlier, None for no gate.
-            gate_mode: "inflate" multiplies an outlier's covariance by NIS / gate, so that a run
-                of outliers can still pull a filter back that is itself wrong; "reject" drops it.
-
-        Returns:
-            What happened. Values that are not finite and covariances that are not positive
-            definite are refused with a reason; the state stays as it was.
-        """
-        m = len(residual)
-        if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
-            return UpdateResult(math.nan, m, False, reason="value that is not finite")
-        if dpotrf(covariance, lower=1)[1] != 0:
-            return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
-        HP = _sum([H @ self.P[first : first + H.shape[1]] for first, H in blocks])
-        HPH = _sum([HP[:, first : first + H.shape[1]] @ H.T for first, H in blocks])
-        whitener = _whitener(HPH + covariance)
-        white = whitener @ residual
-        nis = float(white @ white)
-        scale = 1.0
-        if gate is not None and nis > gate:
-            if gate_mode == "reject":
-                return UpdateResult(nis, m, False, reason="gated")
-            scale = nis / gate
-            covariance = covariance * scale
-            whitener = _whitener(HPH + covariance)
-        if not math.isfinite(nis):
-            return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        self._correct(residual, blocks, covariance, HP, HPH, whitener)
-        self._inject()
-        return UpdateResult(nis, m, True, scale)
-
-    # --- filterpy's record of the last step ------------------------------------------------------
-
-    @property
-    def P_prior(self) -> FloatArray:
-        """Covariance before the last update; computed when asked, for a copy per step is dear."""
-        if self._last_downdate is None:
-            return np.array(self.P)
-        return np.asarray(self.P + self._last_downdate.T @ self._last_downdate)
-
-    @P_prior.setter
-    def P_prior(self, value: FloatArray) -> None:  # filterpy assigns it
-        pass
-
-    @property
-    def P_post(self) -> FloatArray:
-        """Covariance after the last step."""
-        return np.array(self.P)
-
-    @P_post.setter
-    def P_post(self, value: FloatArray) -> None:  # filterpy assigns it
-        pass
-
-    # --- structured algebra ----------------------------------------------------------------------
-
-    def _propagate_covariance(self, transition: FloatArray, noise: FloatArray) -> None:
-        P = self.P
-        P[:CORE] = transition @ P[:CORE]
-        P[CORE:, :CORE] = P[:CORE, CORE:].T
-        core = P[:CORE, :CORE] @ transition.T + noise
-        P[:CORE, :CORE] = 0.5 * (core + core.T)
-        self._last_downdate = None
-
-    def _correct(
-        self,
-        residual: FloatArray,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
-    ) -> None:
-        """P - K S K^T as P - W^T W with W = L^-1 H P: symmetric, of the measurement's rank."""
-        W = whitener @ HP
-        self.R, self.S = covariance, HPH + covariance
-        self.SI = whitener.T @ whitener
-        self.K = (whitener.T @ W).T
-        self.y = self.z = residual[:, None]
-        self.x = self.K @ self.y
-        self.x_post = self.x
-        # P is symmetric: its transpose is the same matrix in the order BLAS updates in place.
-        self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1, overwrite_c=1).T
-        self._last_downdate = W
-        self._log_likelihood = self._likelihood = self._mahalanobis = None
+    def update_heading(
+        self, yaw: float, sigma: float, gate: float | None = None, gate_mode: GateMode = "inflate"
+    ) -> UpdateResult:
+        """Current yaw [rad] as `yaw_twist` defines it; refused where the device is upside down."""
+        R = self._X[0, :, :3]
+        residual = np.array([math.remainder(yaw - yaw_twist(R), 2.0 * math.pi)])
+        if not math.isfinite(residual[0]):
+            return UpdateResult(math.nan, 1, False, reason="yaw not defined upside down")
+        covariance = np.array([[sigma * sigma]])
+        return self.update_linear(residual, heading_jacobian(R), covariance, gate, gate_mode)
 
     def _inject(self) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
@@ -423,75 +396,3 @@ class StateCloningEkf(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy i
         if not 0 <= slot < self.slots or self._clone_time[slot] is None:
             held = [k for k, time in enumerate(self._clone_time) if time is not None]
             raise InputError("slot", repr(slot), f"one that holds a clone: {held}")
-
-
-def displacement_jacobian(
-    p_i_W: FloatArray, p_j_W: FloatArray, slot_i: int, slot_j: int | None
-) -> list[Block]:
-    """Jacobian of `update_displacement`'s residual.
-
-    theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
-    column of the first block equals that of [p_j]x; written so, H times yaw is zero to the bit.
-    """
-    P_i, P_j = skew(np.array((p_i_W, p_j_W)))
-    H_i = _LAST_MINUS_EYE.copy()
-    H_i[:, :2], H_i[:, 2] = P_i[:, :2], P_j[:, 2]
-    H_j = (_LAST_EYE_CORE if slot_j is None else _LAST_EYE).copy()
-    H_j[:, :3] -= P_j
-    first_j = 0 if slot_j is None else CORE + CLONE * slot_j
-    return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
-
-
-def mean_velocity_jacobian(v_W: FloatArray) -> list[Block]:
-    """Jacobian of `update_mean_velocity`'s residual: theta -[v]x - (e3 x v) e3^T, rho_v I."""
-    H = np.zeros((3, CLONE))
-    H[:, :2], H[:, 3:] = -skew(v_W)[:, :2], _EYE
-    return [(0, H)]
-
-
-_EYE = np.eye(3)
-_LAST_EYE = np.eye(3, CLONE, k=3)
-_LAST_MINUS_EYE = -_LAST_EYE
-_LAST_EYE_CORE = np.eye(3, 9, k=6)
-
-
-def _sum(terms: list[FloatArray]) -> FloatArray:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total
-
-
-def _whitener(covariance: FloatArray) -> FloatArray:
-    """Inverse of the lower Cholesky factor; not-a-number where there is none."""
-    factor, failed = dpotrf(covariance, lower=1)
-    if failed:
-        return np.full_like(covariance, math.nan)
-    inverse: FloatArray = dtrtri(factor, lower=1)[0]
-    return inverse
-
-
-def _world_from_invariant(v_W: FloatArray, p_W: FloatArray) -> FloatArray:
-    """Plain errors from invariant ones: v - v^ = rho_v - [v^]x theta, likewise for position."""
-    matrix = np.eye(CORE)
-    matrix[3:6, 0:3] = -skew(v_W)
-    matrix[6:9, 0:3] = -skew(p_W)
-    return matrix
-
-
-def _checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape:
-        raise InputError(name, f"shape {array.shape}", f"{shape}")
-    if not np.isfinite(array).all():
-        raise InputError(name, "a value that is not finite", "finite values")
-    return array
-
-
-def _check_covariance(covariance: FloatArray) -> None:
-    largest = np.abs(covariance).max()
-    if np.abs(covariance - covariance.T).max() > 1e-9 * largest:
-        raise InputError("covariance", "an asymmetric matrix", "a symmetric one")
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma)).min() < -1e-9:
-        raise InputError("covariance", "a negative eigenvalue", "a positive semi-definite matrix")

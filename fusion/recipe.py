@@ -14,7 +14,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.ekf import StateCloningEkf, UpdateResult
+from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.engine import UpdateResult
 from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState

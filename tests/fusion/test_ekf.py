@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from stario.fusion.benchmark import DenseEkf, filter_speed
-from stario.fusion.ekf import StateCloningEkf, displacement_jacobian, mean_velocity_jacobian
+from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.lie import exp_se23, exp_so3, log_so3, skew
 from stario.fusion.preintegration import Segment, preintegrate
 from stario.sequences.errors import InputError

@@ -1,0 +1,51 @@
+"""Arrays checked at the public edge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stario.fusion.lie import FloatArray
+from stario.sequences.errors import InputError
+
+
+def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """A copy of `value` as float64 of a given shape.
+
+    Raises:
+        InputError: it holds no numbers or has another shape.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, repr(value), f"numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(name, f"shape {array.shape}", f"{shape}")
+    return array
+
+
+def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """A copy of `value` as finite float64 of a given shape.
+
+    Raises:
+        InputError: as for `shaped`, or a value is not finite.
+    """
+    array = shaped(name, value, shape)
+    if not np.isfinite(array).all():
+        raise InputError(name, "a value that is not finite", "finite values")
+    return array
+
+
+def check_covariance(covariance: FloatArray) -> None:
+    """Refuse a matrix that is no covariance.
+
+    Raises:
+        InputError: it is not symmetric, or has a negative eigenvalue beyond rounding.
+    """
+    largest = np.abs(covariance).max()
+    if np.abs(covariance - covariance.T).max() > 1e-9 * largest:
+        raise InputError("covariance", "an asymmetric matrix", "a symmetric one")
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma)).min() < -1e-9:
+        raise InputError("covariance", "a negative eigenvalue", "a positive semi-definite matrix")
