@@ -55,7 +55,7 @@ class Card:
     """Description of a weights file.
 
     Attributes:
-        architecture: a name `build_network` knows.
+        architecture: a name in `architectures.ARCHITECTURES`.
         outputs: 3 displacements [m], then 3 log standard deviations.
         rate: samples per second of a window [Hz].
         samples: samples of a window.

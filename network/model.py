@@ -17,30 +17,16 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
 from stario.network.inference import inference_form
-from stario.network.stario import StarIO
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES, WINDOW_SECONDS
 
-ARCHITECTURES = {"StarIO": StarIO}
-"""Networks by name; each takes the number of outputs."""
-
 _BATCH = 64
 _LOG_SIGMA_RANGE = (-6.0, 3.0)
-
-
-def build_network(architecture: str, outputs: int = 6) -> nn.Module:
-    """A fresh network by name.
-
-    Raises:
-        InputError: no network has that name.
-    """
-    if architecture not in ARCHITECTURES:
-        raise InputError("architecture", repr(architecture), f"one of {', '.join(ARCHITECTURES)}")
-    return ARCHITECTURES[architecture](outputs)
 
 
 class DisplacementNetwork(nn.Module):

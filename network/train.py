@@ -24,10 +24,11 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from stario.network.architectures import build_network
 from stario.network.augment import Augmentation, WindowSampler
 from stario.network.calibrate import calibrate
 from stario.network.card import Calibration, Card
-from stario.network.model import DisplacementModel, DisplacementNetwork, build_network, save_model
+from stario.network.model import DisplacementModel, DisplacementNetwork, save_model
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WorldStream, windows_of

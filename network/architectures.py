@@ -1,0 +1,84 @@
+"""Every network by the name it has in the paper's table, imported when it is built."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from stario.sequences.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Where a network is built, and what the paper's table says of it.
+
+    Attributes:
+        module: below `stario.network`.
+        attribute: class there, which takes the number of outputs.
+        parameters: of the paper's table [millions].
+        flops: of the paper's table [millions], for one window.
+        heads: 2 where displacement and log sigma have a head each, both counted by the table.
+        options: arguments of the class beside the number of outputs.
+    """
+
+    module: str
+    attribute: str
+    parameters: float
+    flops: float
+    heads: int = 1
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def table_outputs(self) -> int:
+        """Outputs that the paper's table counts: the horizontal mean velocity, of each head."""
+        return 2 * self.heads
+
+
+ARCHITECTURES = {
+    "R-ResNet": Architecture("baselines.resnet", "RoninResNet", 4.635, 38.252),
+    "R-LSTM": Architecture("baselines.lstm", "RoninLstm", 13.589, 57.473),
+    "RNIN": Architecture("baselines.rnin", "Rnin", 5.259, 72.032, heads=2),
+    "I-IMUNet": Architecture("baselines.imunet", "ImuNet", 3.659, 18.838),
+    "I-MobileNet": Architecture("baselines.mobilenet", "MobileNet", 3.179, 34.559),
+    "I-MnasNet": Architecture("baselines.mnasnet", "MnasNet", 2.979, 25.256),
+    "I-EfficientNetB0": Architecture("baselines.efficientnet", "EfficientNetB0", 3.232, 28.831),
+    "DeepILS": Architecture("baselines.deepils", "DeepIls", 2.291, 15.287),
+    "TLIO": Architecture("baselines.tlio", "Tlio", 5.424, 39.436, heads=2),
+    "StarIO without MSGCU": Architecture(
+        "stario", "StarIO", 2.252, 21.555, options={"gated_unit": False}
+    ),
+    "StarIO": Architecture("stario", "StarIO", 2.762, 25.122),
+}
+"""In the order of the paper's table."""
+
+
+def architecture(name: str) -> Architecture:
+    """Look a network up by name.
+
+    Raises:
+        InputError: no network has that name.
+    """
+    if name not in ARCHITECTURES:
+        raise InputError("architecture", repr(name), f"one of {', '.join(ARCHITECTURES)}")
+    return ARCHITECTURES[name]
+
+
+def build_network(name: str, outputs: int = 6) -> nn.Module:
+    """A fresh network: (B, 6, 200) to (B, outputs).
+
+    Args:
+        name: of the architecture.
+        outputs: 6 for displacement and log standard deviation; an architecture's `table_outputs`
+            for the paper's table.
+
+    Raises:
+        InputError: no network has that name.
+    """
+    entry = architecture(name)
+    module = importlib.import_module(f"stario.network.{entry.module}")
+    network: nn.Module = getattr(module, entry.attribute)(outputs, **entry.options)
+    return network

@@ -1,0 +1,1 @@
+"""The networks that the paper compares StarIO with, one file each."""

@@ -1,0 +1,72 @@
+"""RNIN: residual trunk, an LSTM over successive windows, two heads.
+
+Chen et al.: RNIN-VIO: Robust Neural Inertial Navigation Aided Visual-Inertial Odometry in
+Challenging Scenes, ISMAR 2021.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from stario.network.baselines.parts import BasicBlock, ConvNorm, residual_groups, resnet_stem
+
+_HIDDEN = 256
+
+
+class Rnin(nn.Module):
+    """Displacements of windows whose LSTM state comes from the windows before them.
+
+    A call with (B, 6, 200) takes each window as the first of its own; `step` takes up the state
+    that an earlier call left; a call with (B, K, 6, 200) runs through K windows in a row, as
+    training does.
+    """
+
+    def __init__(self, outputs: int = 6) -> None:
+        super().__init__()
+        self.trunk = nn.Sequential(
+            resnet_stem(pool=False), residual_groups(BasicBlock), ConvNorm(512, 64), nn.Flatten()
+        )
+        self.lstm = nn.LSTM(64 * 13, _HIDDEN, batch_first=True)
+        self.mean = _head(outputs // 2)
+        self.log_sigma = _head(outputs // 2)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """(B, 6, 200) to (B, outputs), or (B, K, 6, 200) to (B, K, outputs)."""
+        if windows.dim() == 3:
+            return self.step(windows, self.first_state(windows))[0]
+        features = self.trunk(windows.flatten(0, 1)).unflatten(0, windows.shape[:2])
+        return self._heads(self.lstm(features)[0])
+
+    def first_state(self, windows: Tensor) -> Tensor:
+        """State (2, B, 256) before the first window: zero."""
+        return windows.new_zeros(2, len(windows), _HIDDEN)
+
+    def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """One window of each of B chains.
+
+        Args:
+            windows: (B, 6, 200).
+            state: (2, B, 256) hidden and cell state after each chain's last window.
+
+        Returns:
+            outputs (B, outputs) and the state after these windows.
+        """
+        features = self.trunk(windows).unsqueeze(1)
+        recalled, (hidden, cell) = self.lstm(features, (state[:1], state[1:]))
+        return self._heads(recalled.squeeze(1)), torch.cat([hidden, cell])
+
+    def _heads(self, features: Tensor) -> Tensor:
+        return torch.cat([self.mean(features), self.log_sigma(features)], dim=-1)
+
+
+def _head(outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(_HIDDEN, 256),
+        nn.ReLU(),
+        nn.Dropout(0.2),
+        nn.Linear(256, 256),
+        nn.ReLU(),
+        nn.Dropout(0.2),
+        nn.Linear(256, outputs),
+    )

@@ -1,0 +1,96 @@
+"""What a network costs by the convention of the paper's table.
+
+The table's figures are those of a counter that knows a few kinds of modules and nothing of what
+happens between them: the rules below, for one window, in evaluation mode. Multiplications and
+additions of a convolution count as one, a bias not at all; parameters count where their module has
+a rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from stario.network.architectures import architecture, build_network
+from stario.sequences.windows import WINDOW_SAMPLES
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Counts for one window.
+
+    Attributes:
+        parameters: of modules that have a rule.
+        flops: by the rules.
+    """
+
+    parameters: int
+    flops: int
+
+
+def table_cost(name: str) -> Cost:
+    """Counts of an architecture with the outputs that the paper's table counts.
+
+    Raises:
+        InputError: no network has that name.
+    """
+    return cost(build_network(name, architecture(name).table_outputs))
+
+
+def cost(network: nn.Module) -> Cost:
+    """Count a network (B, 6, 200) to (B, outputs); it is left in evaluation mode."""
+    flops = 0
+    counted: dict[nn.Module, int] = {}
+
+    def count(module: nn.Module, inputs: tuple[Any, ...], output: Any) -> None:
+        nonlocal flops
+        rule = _RULES.get(type(module))
+        if rule is not None:
+            flops += rule(module, inputs[0], output)
+            counted[module] = sum(p.numel() for p in module.parameters())
+
+    hooks = [m.register_forward_hook(count) for m in network.modules()]
+    try:
+        with torch.inference_mode():
+            network.eval()(torch.zeros(1, 6, WINDOW_SAMPLES))
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return Cost(sum(counted.values()), flops)
+
+
+def _convolution(module: nn.Conv1d, x: Tensor, y: Tensor) -> int:
+    return y.numel() * (module.in_channels // module.groups) * module.kernel_size[0]
+
+
+def _linear(module: nn.Linear, x: Tensor, y: Tensor) -> int:
+    return module.in_features * y.numel()
+
+
+def _norm(module: nn.BatchNorm1d, x: Tensor, y: Tensor) -> int:
+    return (4 if module.affine else 2) * x.numel()
+
+
+def _global_pool(module: nn.AdaptiveAvgPool1d, x: Tensor, y: Tensor) -> int:
+    return y.numel() * (x.shape[2] // y.shape[2] + 1)
+
+
+def _lstm(module: nn.LSTM, x: Tensor, y: Any) -> int:
+    hidden = module.hidden_size
+    steps = x.shape[0] * x.shape[1]
+    inputs = [module.input_size, *[hidden] * (module.num_layers - 1)]
+    bias = 2 * hidden if module.bias else 0
+    return steps * sum(4 * ((n + hidden) * hidden + hidden + bias) + 4 * hidden for n in inputs)
+
+
+_RULES: dict[type[nn.Module], Callable[..., int]] = {
+    nn.Conv1d: _convolution,
+    nn.Linear: _linear,
+    nn.BatchNorm1d: _norm,
+    nn.AdaptiveAvgPool1d: _global_pool,
+    nn.LSTM: _lstm,
+}

@@ -1,0 +1,82 @@
+import pytest
+import torch
+from torch import nn
+
+from stario.network.architectures import ARCHITECTURES, build_network
+from stario.network.baselines.imunet import NoiseLayer
+from stario.network.baselines.rnin import Rnin
+
+NAMES = [name for name, entry in ARCHITECTURES.items() if entry.module.startswith("baselines")]
+
+
+def windows(count: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(count, 6, 200, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_row_per_window_and_a_window_does_not_feel_the_others(name: str) -> None:
+    torch.manual_seed(0)
+    network = build_network(name).eval()
+    batch = windows(3)
+    with torch.inference_mode():
+        alone, together = network(batch[2:]), network(batch)
+    assert together.shape == (3, 6)
+    torch.testing.assert_close(together[2:], alone, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_learns_and_stays_finite_where_nothing_varies(name: str) -> None:
+    torch.manual_seed(0)
+    network = build_network(name)
+    for module in network.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = 0.0
+    batch = torch.cat([windows(3), torch.zeros(1, 6, 200)])
+    # Only a chain of windows uses the weights of a state that is no longer zero.
+    network(batch.unflatten(0, (2, 2)) if name == "RNIN" else batch).square().sum().backward()
+    for key, parameter in network.named_parameters():
+        assert parameter.grad is not None, key
+        assert torch.isfinite(parameter.grad).all(), key
+        assert (parameter.grad != 0.0).any(), key
+
+
+@pytest.mark.parametrize("name", ["TLIO", "RNIN"])
+def test_two_heads_learn_apart(name: str) -> None:
+    network = build_network(name)
+    network(windows(4))[:, :3].square().sum().backward()
+    for key, parameter in network.named_parameters():
+        assert parameter.grad is not None
+        assert (parameter.grad == 0.0).all() == key.startswith("log_sigma."), key
+
+
+@pytest.fixture(scope="module")
+def rnin() -> Rnin:
+    torch.manual_seed(0)
+    return Rnin().eval()
+
+
+def test_rnin_remembers_the_windows_before(rnin: Rnin) -> None:
+    with torch.inference_mode():
+        first, state = rnin.step(windows(1, seed=1), rnin.first_state(windows(1)))
+        after = rnin.step(windows(1, seed=2), state)[0]
+        alone = rnin(windows(1, seed=2))
+    assert torch.equal(first, rnin(windows(1, seed=1)))
+    assert float((after - alone).abs().max()) > 1e-4
+
+
+def test_rnin_runs_a_chain_at_once_as_step_by_step(rnin: Rnin) -> None:
+    chains = windows(2 * 5).unflatten(0, (2, 5))
+    with torch.inference_mode():
+        at_once = rnin(chains)
+        state = rnin.first_state(chains[:, 0])
+        for k in range(5):
+            outputs, state = rnin.step(chains[:, k], state)
+            torch.testing.assert_close(outputs, at_once[:, k], rtol=1e-4, atol=1e-6)
+
+
+def test_the_noise_layer_takes_a_weighted_copy_of_the_raw_window_off() -> None:
+    layer = NoiseLayer(4)
+    features, raw = torch.randn(3, 4), torch.randn(3, 4)
+    with torch.no_grad():
+        layer.bias.fill_(0.5)
+        torch.testing.assert_close(layer(features, raw), features - layer.weight * raw + 0.5)
