@@ -46,7 +46,8 @@ def test_two_heads_learn_apart(name: str) -> None:
     network(windows(4))[:, :3].square().sum().backward()
     for key, parameter in network.named_parameters():
         assert parameter.grad is not None
-        assert (parameter.grad == 0.0).all() == key.startswith("log_sigma."), key
+        if key.startswith(("mean.", "log_sigma.")):
+            assert bool((parameter.grad != 0.0).any()) == key.startswith("mean."), key
 
 
 @pytest.fixture(scope="module")
