@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.alignment import cumulative_rotations
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
+from stario.sequences.truth_fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS, with_units
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples
 
@@ -42,6 +43,9 @@ _APART_RATIO = 6.0
 
 _COHERENT = 0.7
 """A force that keeps less of its size in its average is not dominated by gravity."""
+
+_NO_GRAVITY = 0.3
+"""A smaller average force holds gravity in no unit: a device at rest whose gravity was removed."""
 
 _G_RANGE = (0.8, 1.25)
 _FORCE_RANGE = (7.5, 12.5)
@@ -71,7 +75,7 @@ def check_units(sequence: ImuSequence) -> None:
     average = _average_force(time, gyro, accel, pieces)
     in_degrees = _average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
     _check_gyro(sequence.name, gyro, force, average, in_degrees)
-    _check_force(sequence.name, force, average)
+    _check_force(sequence, force, average)
     _check_direction(sequence)
 
 
@@ -121,14 +125,19 @@ def _check_gyro(
     )
 
 
-def _check_force(name: str, force: float, average: float) -> None:
-    field = f"{name}: accelerometer"
-    if not average > _COHERENT * force:
+def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
+    field = f"{sequence.name}: accelerometer"
+    if not average > _COHERENT * force or average < _NO_GRAVITY:
         raise InputError(
             field,
             f"an average of {average:.3g} in samples of {force:.3g}",
             f"specific force with gravity, about {STANDARD_GRAVITY:.2f} m/s^2 on average",
-            "record the raw accelerometer, not linear or user acceleration",
+            "if it is linear or user acceleration, "
+            + (
+                "record the raw accelerometer: gravity cannot be put back without a true attitude"
+                if sequence.truth is None
+                else "pass `--gravity removed`"
+            ),
         )
     if _G_RANGE[0] <= average <= _G_RANGE[1]:
         raise InputError(
@@ -157,19 +166,30 @@ def _check_direction(sequence: ImuSequence) -> None:
         return
     up = pose.attitude_WB[pose.valid].apply(accel[pose.valid]).mean(axis=0)
     tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
-    if tilt > math.pi - _MAX_TILT_RAD:
+    if tilt < _MAX_TILT_RAD:
+        return
+    axes = _axes(sequence)
+    if tilt > math.pi - _MAX_TILT_RAD and axes is None:
         raise InputError(
             f"{sequence.name}: accelerometer",
             "a force that points down in the true attitude",
             "specific force: up at rest",
             "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header",
         )
-    if tilt > _MAX_TILT_RAD:
-        raise InputError(
-            f"{sequence.name}: truth's attitude",
-            f"an average force {math.degrees(tilt):.0f} degrees off the vertical",
-            "quaternion x y z w, body to a world with z up",
-        )
+    raise InputError(
+        f"{sequence.name}: truth's attitude",
+        f"an average force {math.degrees(tilt):.0f} degrees off the vertical",
+        "quaternion x y z w, body to a world with z up",
+        f"the IMU's axes are not the truth's: pass `--axes={axes}`" if axes else "",
+    )
+
+
+def _axes(sequence: ImuSequence) -> str | None:
+    """The `--axes` that gyroscope and true attitude ask for, None if none."""
+    try:
+        return fit_truth(sequence).axes()
+    except InputError:
+        return None
 
 
 def _pieces(time: FloatArray) -> list[slice]:

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.checks import check_units, with_units
+from stario.sequences.conventions import with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
@@ -52,7 +53,9 @@ def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
     check_units(walk.without_truth())
     assert "--gyro-unit deg/s" in refused(in_degrees(walk).without_truth())
     assert "--accel-unit g" in refused(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
-    assert "not linear or user acceleration" in refused(without_gravity(walk))
+    assert "--gravity removed" in refused(without_gravity(walk))
+    check_units(with_conventions(without_gravity(walk), gravity="removed"))
+    assert "record the raw accelerometer" in refused(without_gravity(walk).without_truth())
 
 
 def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
@@ -64,7 +67,7 @@ def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
     check_units(still)
     check_units(biased)
     assert "accelerometer does not see" in refused(in_degrees(biased))
-    assert "accelerometer" in refused(replace(still, accel=still.accel - UP))
+    assert "record the raw accelerometer" in refused(replace(still, accel=still.accel - UP))
 
 
 def test_both_wrong_are_told_one_after_the_other(walk: ImuSequence) -> None:
@@ -93,6 +96,15 @@ def test_a_truth_with_its_quaternion_in_another_order_is_refused(walk: ImuSequen
     shuffled = Rotation.from_quat(walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
     text = refused(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
     assert "x y z w" in text
+
+
+def test_axes_that_are_not_the_truths_are_named(walk: ImuSequence) -> None:
+    """Also where gravity points exactly down, which a wrong sign would explain as well."""
+    for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
+        turned = with_axes(walk, axes)
+        assert f"--axes={undone}" in refused(turned)
+        check_units(with_axes(turned, undone))
+        check_units(turned.without_truth())
 
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])

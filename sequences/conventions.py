@@ -1,0 +1,139 @@
+"""What a file's numbers mean, told by its owner: units, axes, and whether gravity is in them."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
+from stario.sequences.units import with_units
+
+log = logging.getLogger(__name__)
+
+GRAVITY = ("included", "removed")
+"""Whether the accelerometer's numbers hold gravity; without it they are linear acceleration."""
+
+SAME_AXES = "x,y,z"
+
+
+def with_conventions(
+    sequence: ImuSequence,
+    gyro_unit: str = "rad/s",
+    accel_unit: str = "m/s^2",
+    axes: str = SAME_AXES,
+    gravity: str = "included",
+) -> ImuSequence:
+    """The recording in rad/s, m/s^2 of specific force and the axes of its truth.
+
+    Args:
+        sequence: a recording whose numbers are as the other arguments say.
+        gyro_unit: as for `with_units`.
+        accel_unit: as for `with_units`.
+        axes: as for `with_axes`.
+        gravity: one of `GRAVITY`; "removed" is put back by `with_gravity`.
+
+    Raises:
+        InputError: an argument is unknown, or gravity cannot be put back.
+    """
+    if gravity not in GRAVITY:
+        raise InputError("gravity", repr(gravity), f"one of {', '.join(GRAVITY)}")
+    sequence = with_axes(with_units(sequence, gyro_unit, accel_unit), axes)
+    return with_gravity(sequence) if gravity == "removed" else sequence
+
+
+def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
+    """The recording with gyroscope and accelerometer turned to other axes.
+
+    The truth stays as it is: this mends an IMU whose axes are not those whose attitude the truth
+    gives. Where there is no truth, any right-handed axes do.
+
+    Args:
+        sequence: the recording.
+        axes: what the new x, y and z are in the file's axes: `y,-x,z` takes y for x, -x for y.
+
+    Raises:
+        InputError: not a permutation of x, y, z with signs, or a left-handed one.
+    """
+    if axes == SAME_AXES:
+        return sequence
+    R = axes_matrix(axes)
+    return replace(sequence, gyro=sequence.gyro @ R.T, accel=sequence.accel @ R.T)
+
+
+def axes_matrix(axes: str) -> FloatArray:
+    """The rotation (3, 3) from the file's axes to those that `axes` names.
+
+    Raises:
+        InputError: as for `with_axes`.
+    """
+    words = [word.strip().lower().removeprefix("+") for word in axes.split(",")]
+    expected = "x, y and z once each, with signs, such as y,-x,z"
+    if sorted(word.removeprefix("-") for word in words) != ["x", "y", "z"]:
+        raise InputError("axes", repr(axes), expected)
+    R = np.zeros((3, 3))
+    for row, word in enumerate(words):
+        R[row, "xyz".index(word[-1])] = -1.0 if word[0] == "-" else 1.0
+    if np.linalg.det(R) < 0.0:
+        raise InputError(
+            "axes", f"{axes!r}, left-handed", "right-handed axes", "turn one sign over"
+        )
+    return R
+
+
+def axes_named(R: FloatArray) -> str:
+    """The text that `axes_matrix` turns into the right-handed axes nearest to a rotation (3, 3)."""
+    signed = [
+        (permutation, signs)
+        for permutation in itertools.permutations(range(3))
+        for signs in itertools.product((1, -1), repeat=3)
+    ]
+    texts = [
+        ",".join(("-" if s < 0 else "") + "xyz"[k] for k, s in zip(*choice, strict=True))
+        for choice in signed
+        if np.linalg.det(np.diag(choice[1]) @ np.eye(3)[list(choice[0])]) > 0.0
+    ]
+    return max(texts, key=lambda text: float((axes_matrix(text) * R).sum()))
+
+
+def with_gravity(sequence: ImuSequence) -> ImuSequence:
+    """Specific force from linear acceleration: gravity put back by the recording's true attitude.
+
+    f_B = a_B + R_WB^T (0, 0, g). Samples whose attitude is not known are dropped and their number
+    is logged. The track of a recording mended so rests on its truth's attitude.
+
+    Raises:
+        InputError: there is no truth, or it gives no sample's attitude.
+    """
+    found = "removed"
+    fix = "record the raw accelerometer, or give the attitude: truth with px,py,pz,qx,qy,qz,qw"
+    expected = "an attitude that says where gravity was"
+    truth = sequence.truth
+    if truth is None or truth.valid.sum() < 2:
+        raise InputError(f"{sequence.name}: gravity", f"{found} and no truth", expected, fix)
+    times, index = np.unique(sequence.time, return_inverse=True)
+    finite = np.isfinite(times)
+    pose = truth.at(times[finite])
+    known = np.zeros(len(times), dtype=np.bool_)
+    known[finite] = pose.valid
+    kept = known[index]
+    if not kept.any():
+        raise InputError(
+            f"{sequence.name}: gravity", f"{found} and no attitude at any sample", expected, fix
+        )
+    if not kept.all():
+        log.warning(
+            "%s: %d of %d samples dropped: no attitude puts gravity back there",
+            sequence.name, len(kept) - kept.sum(), len(kept),
+        )  # fmt: skip
+    R_WB = pose.attitude_WB[index[kept]]
+    gravity_B = R_WB.apply([0.0, 0.0, STANDARD_GRAVITY], inverse=True)
+    return replace(
+        sequence,
+        time=sequence.time[kept],
+        gyro=sequence.gyro[kept],
+        accel=sequence.accel[kept] + gravity_B,
+    )

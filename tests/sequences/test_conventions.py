@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.conventions import (
+    axes_matrix,
+    axes_named,
+    with_axes,
+    with_conventions,
+    with_gravity,
+)
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.simulate import simulate_imu
+from stario.sequences.walks import generate_walk
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(3, 20.0), 100.0, seed=1)
+
+
+def linear(sequence: ImuSequence) -> ImuSequence:
+    """The same with gravity taken off by the true attitude."""
+    assert sequence.truth is not None
+    up_B = sequence.truth.at(sequence.time).attitude_WB.apply([0, 0, STANDARD_GRAVITY], True)
+    return replace(sequence, accel=sequence.accel - up_B)
+
+
+def test_axes_take_the_files_for_the_new_ones(walk: ImuSequence) -> None:
+    turned = with_axes(walk, "y, -x, +Z")
+    assert np.array_equal(turned.gyro, walk.gyro[:, [1, 0, 2]] * [1, -1, 1])
+    assert np.array_equal(turned.accel, walk.accel[:, [1, 0, 2]] * [1, -1, 1])
+    assert turned.truth is walk.truth
+    assert with_axes(walk, "x,y,z") is walk
+
+
+def test_all_24_right_handed_axes_are_rotations_and_are_named() -> None:
+    names = {axes_named(R.as_matrix()) for R in Rotation.create_group("O")}
+    assert len(names) == 24
+    for name in names:
+        R = axes_matrix(name)
+        np.testing.assert_allclose(R @ R.T, np.eye(3))
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        tilted = Rotation.from_rotvec([0.2, -0.1, 0.2]).as_matrix() @ R
+        assert axes_named(tilted) == name
+
+
+@pytest.mark.parametrize("axes", ["y,x,z", "-x,y,z", "x,-z,-y", "-x,-y,-z"])
+def test_left_handed_axes_are_refused(walk: ImuSequence, axes: str) -> None:
+    with pytest.raises(InputError, match=r"left-handed.*turn one sign over"):
+        with_axes(walk, axes)
+
+
+@pytest.mark.parametrize("axes", ["", "x,y", "x,x,z", "x,y,w", "x y z", "--x,y,z", "x,y,z,z", ",,"])
+def test_what_is_no_permutation_is_refused(walk: ImuSequence, axes: str) -> None:
+    with pytest.raises(InputError, match=r"axes: found .* expected x, y and z once each"):
+        with_axes(walk, axes)
+
+
+def test_gravity_comes_back_with_the_true_attitude(walk: ImuSequence) -> None:
+    np.testing.assert_allclose(with_gravity(linear(walk)).accel, walk.accel, atol=1e-9)
+
+
+def test_conventions_are_undone_in_one_go(walk: ImuSequence) -> None:
+    """Apple's user acceleration in g, rates in degrees, axes turned against the truth's."""
+    bare = with_axes(linear(walk), "-y,x,z")
+    apple = replace(bare, gyro=np.degrees(bare.gyro), accel=-bare.accel / STANDARD_GRAVITY)
+    mended = with_conventions(apple, "deg/s", "-g", "y,-x,z", "removed")
+    np.testing.assert_allclose(mended.gyro, walk.gyro, atol=1e-12)
+    np.testing.assert_allclose(mended.accel, walk.accel, atol=1e-9)
+
+
+def test_samples_of_unknown_attitude_are_dropped_and_counted(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert walk.truth is not None
+    time = walk.time.copy()
+    time[7] = np.nan
+    half = replace(linear(walk), time=time, truth=walk.truth.slice(0.0, 10.0))
+    with caplog.at_level(logging.WARNING):
+        mended = with_gravity(half)
+    assert f"{len(walk) - len(mended)} of {len(walk)} samples dropped" in caplog.text
+    assert mended.time[-1] == pytest.approx(10.0)
+    assert np.isfinite(mended.time).all()
+    np.testing.assert_allclose(mended.accel[:7], walk.accel[:7], atol=1e-9)
+
+
+def test_without_an_attitude_gravity_is_not_guessed(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    for blind in (
+        walk.without_truth(),
+        replace(walk, truth=replace(walk.truth, valid=np.zeros(len(walk.truth), dtype=bool))),
+        replace(walk, truth=replace(walk.truth, time=walk.truth.time + 1000.0)),
+    ):
+        with pytest.raises(InputError, match=r"gravity: found removed and no .*record the raw"):
+            with_gravity(blind)
+
+
+def test_unknown_words_are_refused(walk: ImuSequence) -> None:
+    with pytest.raises(InputError, match="gravity: found 'gone', expected one of included, rem"):
+        with_conventions(walk, gravity="gone")
+    with pytest.raises(InputError, match="gyro_unit"):
+        with_conventions(walk, gyro_unit="rpm")
