@@ -21,6 +21,9 @@ from stario.sequences.windows import WINDOW_SECONDS
 UPDATE_RATES = (1, 2, 5, 10, 20)
 """Network updates per second that may be asked for."""
 
+KEYFRAME_RATES = (1, 2, 5, 10)
+"""Keyframes of the graph per second that may be asked for."""
+
 LEAST_OUTPUT_RATE = 10
 """States per second where the network is asked less often [Hz]."""
 
@@ -48,6 +51,8 @@ class FilterConfig:
             [m/s^2/sqrt(Hz) per m/s^2].
         gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
         gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
+        rest_noise: factor on a consumer sensor's densities (`ImuNoise()`) within which a second of
+            samples counts as rest; 0 never does.
     """
 
     update_rate: int = 1
@@ -63,6 +68,7 @@ class FilterConfig:
     accel_motion_noise: float = 0.12
     gap_gyro_noise: float = 0.3
     gap_accel_noise: float = 1.0
+    rest_noise: float = 1.0
 
     def __post_init__(self) -> None:
         if self.update_rate not in UPDATE_RATES:
@@ -100,12 +106,33 @@ class FilterConfig:
 
 
 @dataclass(frozen=True)
+class GraphConfig:
+    """The factor graph, batch and fixed-lag.
+
+    Attributes:
+        keyframe_rate: keyframes per second, at most; windows count that begin and end at one.
+        lag: how far back the fixed-lag graph moves its keyframes [s].
+    """
+
+    keyframe_rate: int = 1
+    lag: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.keyframe_rate not in KEYFRAME_RATES:
+            found = repr(self.keyframe_rate)
+            raise ConfigError("keyframe_rate", found, f"one of {KEYFRAME_RATES}")
+        if not 2.0 <= self.lag <= 60.0:
+            raise ConfigError("lag", repr(self.lag), "2 to 60 s")
+
+
+@dataclass(frozen=True)
 class NavigatorConfig:
     """Everything a run depends on besides the recording and the weights.
 
     Attributes:
         noise: densities of the IMU as the filter assumes them.
         filter: the EKF.
+        graph: the factor graph.
         gravity: magnitude [m/s^2].
         levelling_rate: natural frequency of the loop that levels the attitude [rad/s].
     """
@@ -116,6 +143,7 @@ class NavigatorConfig:
         )
     )
     filter: FilterConfig = field(default_factory=FilterConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
     gravity: float = STANDARD_GRAVITY
     levelling_rate: float = 0.06
 
@@ -126,7 +154,7 @@ class NavigatorConfig:
             raise ConfigError("levelling_rate", repr(self.levelling_rate), "0 to 10 rad/s")
 
 
-_GROUPS: dict[str, type] = {"noise": ImuNoise, "filter": FilterConfig}
+_GROUPS: dict[str, type] = {"noise": ImuNoise, "filter": FilterConfig, "graph": GraphConfig}
 
 
 def config_from_dict(values: dict[str, Any]) -> NavigatorConfig:

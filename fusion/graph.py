@@ -1,0 +1,283 @@
+"""A factor graph over keyframes on gtsam: IMU, prior and measurements, solved and marginalised.
+
+A keyframe is a pose, a velocity and the biases. gtsam's `CombinedImuFactor` binds each to the next
+through the same preintegration as the filter's; the measurements are those of `graph_terms`,
+linearised anew in every round. No factor calls back into Python.
+
+Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
+2017; F. Dellaert, M. Kaess, "Factor graphs for robot perception", 2017 (marginalisation).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from scipy.stats import chi2
+
+from stario.fusion.graph_terms import Term
+from stario.fusion.lie import FloatArray
+from stario.fusion.preintegration import CORE, Segment
+from stario.fusion.state import NavState
+
+_MOST_ROUNDS = 10
+_MOVED = 1e-3
+"""A round that moves no keyframe further [m] is the last."""
+
+_LOST_SIGMA = 1e5
+"""Nobody walks so far, so fast or so biased: a state this uncertain [m, m/s, rad, ...] is free."""
+
+_NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
+
+
+class IndeterminateError(Exception):
+    """The graph does not determine a state; the message names it and its time."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """How the optimisation went.
+
+    Attributes:
+        rounds: linearisations of the measurements until nothing moved.
+        weighed_down: measurements that counted less than their covariance says.
+    """
+
+    rounds: int
+    weighed_down: int
+
+
+class KeyframeGraph:
+    """Keyframes, numbered from 0, with everything known of them.
+
+    Args:
+        first: the first keyframe; its covariance is the prior.
+        gate: probability from which a residual counts as an outlier; its covariance is then
+            inflated by its squared norm / quantile, as in the filter.
+    """
+
+    def __init__(self, first: NavState, gate: float) -> None:
+        self._gate = gate
+        self._values = gtsam.Values()
+        self._factors: list[tuple[int, Any]] = []  # with the first keyframe each touches
+        self._terms: list[Term] = []
+        self._time: dict[int, float] = {}
+        self._tree: Any = None
+        self.last = -1
+        self._insert(first)
+        self._factors.append((0, _prior(first)))
+
+    @property
+    def keyframes(self) -> list[int]:
+        """Numbers of the keyframes held, in order."""
+        return list(self._time)
+
+    def time(self, k: int) -> float:
+        """Of a keyframe [s]."""
+        return self._time[k]
+
+    def add_keyframe(self, segment: Segment, guess: NavState) -> int:
+        """Bind a new keyframe to the last one by a segment; returns its number."""
+        i, j = self.last, self.last + 1
+        self._insert(guess)
+        imu = gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), segment.pim)
+        self._factors.append((i, imu))
+        return j
+
+    def add(self, term: Term) -> None:
+        """Take in a measurement; its covariance is positive definite."""
+        self._terms.append(term)
+        self._tree = None
+
+    def solve(self) -> Solution:
+        """Move the keyframes to where everything known fits best.
+
+        Raises:
+            IndeterminateError: a state is not determined, or the optimisation diverged; the
+                keyframes stay as they were.
+        """
+        start, self._tree = self._values, None
+        try:
+            rounds = self._optimise()
+            self._tree = self._linear().eliminateMultifrontal(self._ordering(), gtsam.EliminateQR)
+            self._check_determined()
+        except RuntimeError as error:  # gtsam's way to report it
+            self._values = start
+            raise IndeterminateError(self._named(str(error))) from error
+        except IndeterminateError:
+            self._values = start
+            raise
+        heavy = sum(self._weighed(term)[1] < 1.0 for term in self._terms)
+        return Solution(rounds, heavy)
+
+    def pose(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """R_WB, v_W, p_W, b_g, b_a of a keyframe."""
+        pose, bias = self._values.atPose3(X(k)), self._values.atConstantBias(B(k))
+        return (
+            pose.rotation().matrix(),
+            self._values.atVector(V(k)),
+            pose.translation(),
+            bias.gyroscope(),
+            bias.accelerometer(),
+        )
+
+    def state(self, k: int) -> NavState:
+        """A keyframe with its marginal covariance, after `solve`."""
+        R, v, p, b_g, b_a = self.pose(k)
+        joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
+        to_world = _world_from_local(R)
+        return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
+
+    def marginalise(self, before: int) -> None:
+        """Forget the keyframes before one, keeping what they say of the others."""
+        old = [k for k in self._time if k < before]
+        if not old:
+            return
+        touched = gtsam.NonlinearFactorGraph()
+        for _first, factor in (item for item in self._factors if item[0] < before):
+            touched.add(factor)
+        linear = touched.linearize(self._values)
+        for term in self._terms:
+            if term.keyframes[0] < before:
+                linear.push_back(self._factor(term))
+        keys = [key(k) for k in old for key in (X, V, B)]
+        _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+        kept = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
+        self._factors = [item for item in self._factors if item[0] >= before]
+        self._factors += [(before, kept.at(n)) for n in range(kept.size())]
+        self._terms = [term for term in self._terms if term.keyframes[0] >= before]
+        for key in keys:
+            self._values.erase(key)
+        for k in old:
+            del self._time[k]
+        self._tree = None
+
+    def _insert(self, state: NavState) -> None:
+        self.last += 1
+        k = self.last
+        self._time[k] = state.time
+        self._values.insert(X(k), gtsam.Pose3(gtsam.Rot3(state.R_WB), state.p_W))
+        self._values.insert(V(k), state.v_W)
+        self._values.insert(B(k), gtsam.imuBias.ConstantBias(state.b_a, state.b_g))
+        self._tree = None
+
+    def _optimise(self) -> int:
+        fixed = gtsam.NonlinearFactorGraph()
+        for _first, factor in self._factors:
+            fixed.add(factor)
+        for done in range(1, _MOST_ROUNDS + 1):
+            graph = gtsam.NonlinearFactorGraph(fixed)
+            for term in self._terms:
+                graph.add(gtsam.LinearContainerFactor(self._factor(term), self._values))
+            before = self._positions()
+            optimizer = gtsam.LevenbergMarquardtOptimizer(
+                graph, self._values, self._ordering(), _parameters()
+            )
+            self._values = optimizer.optimize()
+            moved = float(np.abs(self._positions() - before).max())
+            if not moved > _MOVED:
+                break
+        if not np.isfinite(moved):
+            raise IndeterminateError("the optimisation diverged")
+        return done
+
+    def _positions(self) -> FloatArray:
+        return np.array([self._values.atPose3(X(k)).translation() for k in self._time])
+
+    def _linear(self) -> Any:
+        graph = gtsam.NonlinearFactorGraph()
+        for _first, factor in self._factors:
+            graph.add(factor)
+        linear = graph.linearize(self._values)
+        for term in self._terms:
+            linear.push_back(self._factor(term))
+        return linear
+
+    def _factor(self, term: Term) -> Any:
+        """A term as gtsam's linear factor at the present values."""
+        linearised, weight, whitener = self._weighed(term)
+        scaled = weight * whitener
+        arguments = [part for key, H in linearised.blocks for part in (key, scaled @ H)]
+        unit = gtsam.noiseModel.Unit.Create(len(linearised.residual))
+        return gtsam.JacobianFactor(*arguments, scaled @ linearised.residual, unit)
+
+    def _weighed(self, term: Term) -> Any:
+        linearised = term.linearise(self._values)
+        whitener = np.linalg.inv(np.linalg.cholesky(term.covariance))
+        white = whitener @ linearised.residual
+        squared, limit = float(white @ white), _quantile(self._gate, len(white))
+        return linearised, (limit / squared) ** 0.5 if squared > limit else 1.0, whitener
+
+    def _ordering(self) -> Any:
+        """Time's: the graph is a chain whose longest link is a window."""
+        return _ordering([key(k) for k in self._time for key in (X, V, B)])
+
+    def _check_determined(self) -> None:
+        for k in (next(iter(self._time)), self.last):
+            sigma = np.sqrt(np.diag(self.state(k).covariance))
+            if not (sigma < _LOST_SIGMA).all():
+                groups = (
+                    "attitude",
+                    "velocity",
+                    "position",
+                    "gyroscope bias",
+                    "accelerometer bias",
+                )
+                worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
+                raise IndeterminateError(f"{groups[worst // 3]} at {self._time[k]:.1f} s")
+
+    def _named(self, message: str) -> str:
+        """The state that gtsam's message is about."""
+        found = re.search(r"Symbol: ([xvb])(\d+)", message)
+        if found is None:
+            return message.strip().splitlines()[0]
+        return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
+
+
+def _prior(state: NavState) -> Any:
+    """The state's covariance as a linear factor on its pose, velocity and biases together."""
+    to_local = np.linalg.inv(_world_from_local(state.R_WB))
+    local = to_local @ state.covariance @ to_local.T
+    whitener = np.linalg.inv(np.linalg.cholesky(local))
+    blocks = (X(0), whitener[:, :6], V(0), whitener[:, 6:9], B(0), whitener[:, 9:])
+    unit = gtsam.noiseModel.Unit.Create(CORE)
+    point = gtsam.Values()
+    point.insert(X(0), gtsam.Pose3(gtsam.Rot3(state.R_WB), state.p_W))
+    point.insert(V(0), state.v_W)
+    point.insert(B(0), gtsam.imuBias.ConstantBias(state.b_a, state.b_g))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*blocks, np.zeros(CORE), unit), point)
+
+
+def _world_from_local(R_WB: FloatArray) -> FloatArray:
+    """(15, 15) from w, dp, dv, b_a, b_g to the order and axes of `NavState.covariance`."""
+    matrix = np.zeros((CORE, CORE))
+    matrix[0:3, 0:3] = R_WB
+    matrix[3:6, 6:9] = np.eye(3)
+    matrix[6:9, 3:6] = R_WB
+    matrix[9:12, 12:15] = np.eye(3)
+    matrix[12:15, 9:12] = np.eye(3)
+    return matrix
+
+
+def _ordering(keys: list[int]) -> Any:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
+@cache
+def _parameters() -> Any:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    return parameters
+
+
+@cache
+def _quantile(probability: float, dof: int) -> float:
+    return float(chi2.ppf(probability, dof))
