@@ -13,6 +13,7 @@ import typer
 
 from stario.fusion.commands.benchmark import benchmark
 from stario.fusion.commands.compare import compare
+from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
@@ -26,7 +27,7 @@ app = typer.Typer(
     help="Inertial navigation: fused trajectories from IMU recordings.",
 )
 
-for command in (run, compare, evaluate, simulate, train, benchmark):
+for command in (run, compare, evaluate, simulate, convert, train, benchmark):
     app.command()(command)
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
@@ -55,6 +56,36 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def atomic_folder(path: Path | str) -> Iterator[Path]:
+    """A folder that takes its name only when everything is in it.
+
+    The block fills a temporary folder beside `path`, which becomes `path` on leaving it; an
+    exception inside leaves nothing.
+
+    Args:
+        path: the folder to make; nothing but an empty folder may be there.
+
+    Raises:
+        InputError: something is there already, or the folder above does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError("path", str(path), "a folder in an existing folder", "create the folder")
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError("path", f"{path}, which exists", "a new folder")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        temporary.mkdir()
+        yield temporary
+        if path.exists():
+            path.rmdir()
+        temporary.rename(path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 

@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from stario.fusion.cli import app, main
 from stario.fusion.commands.common import distinct
 from stario.fusion.config import read_config
+from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
 
-COMMANDS = ("run", "compare", "evaluate", "simulate", "train", "benchmark")
+COMMANDS = ("run", "compare", "evaluate", "simulate", "convert", "train", "benchmark")
 
 
 class Done:
@@ -185,6 +187,43 @@ def test_settings_come_from_a_file_and_are_kept(stario, recording: Path, tmp_pat
     assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
 
 
+# --- convert -----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_converted_recording_gives_the_same_track(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    assert stario("convert", recording, "there").code == 0
+    done = stario("convert", "there", "back.csv")
+    assert done.code == 0
+    assert "there: 1201 samples, 12.0 s\nback.csv" in done.out
+    for path, out in ((recording, "a"), ("back.csv", "b")):
+        assert stario("run", path, "--out", out).code == 0
+    a, b = (read_tum(tmp_path / out / "ekf.tum") for out in "ab")
+    np.testing.assert_allclose(a.position_W, b.position_W, atol=0.01)  # times by whole ns
+    assert_one_line_error(stario("convert", recording, "there"), "there", "exists")
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
+def test_what_the_numbers_mean_can_be_told_to_every_command(
+    stario, recording: Path, tmp_path: Path, command: str
+) -> None:
+    """Rates in degrees, Apple's user acceleration in g, axes turned against the truth's."""
+    walk = with_axes(read_own_csv(recording), "-y,x,z")
+    upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
+    linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
+    write_csv(
+        tmp_path / "odd.csv", replace(walk, gyro=np.degrees(walk.gyro), accel=linear / -9.80665)
+    )
+    target = ["out.csv"] if command == "convert" else []
+    assert_one_line_error(stario(command, "odd.csv", *target))
+    words = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
+    done = stario(command, "odd.csv", *target, *words)
+    assert done.code == 0, done.err
+
+
 # --- wrong input -------------------------------------------------------------------------------
 
 
@@ -254,6 +293,11 @@ def test_a_recording_cut_within_a_line_is_named(stario, recording: Path, tmp_pat
         (["evaluate", "--split", "practice"], ["split", "practice"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
         (["run", "RECORDING", "--gyro-unit", "rpm"], ["gyro_unit", "rpm"]),
+        (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
+        (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
+        (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
+        (["convert", "missing.csv", "a.csv"], ["missing.csv", "nothing there"]),
+        (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
         (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
         (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
         (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),

@@ -33,7 +33,7 @@ class Reading:
     """Options that say how a recording is read."""
 
     format: Annotated[
-        str, typer.Option("--format", help="Format of the recording: auto, csv, euroc, oxiod.")
+        str, typer.Option("--format", help="Format of the recording: auto, or its name.")
     ] = "auto"
     gyro_unit: Annotated[
         str, typer.Option("--gyro-unit", help="Unit of the gyroscope: rad/s or deg/s.")
@@ -44,13 +44,28 @@ class Reading:
             "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
         ),
     ] = "m/s^2"
+    axes: Annotated[
+        str,
+        typer.Option(
+            "--axes",
+            help="The truth's x, y, z in the file's axes, such as y,-x,z (--axes=-y,x,z).",
+        ),
+    ] = "x,y,z"
+    gravity: Annotated[
+        str,
+        typer.Option(
+            "--gravity",
+            help="Included in the accelerometer, or removed: put back by the true attitude.",
+        ),
+    ] = "included"
 
     def read(self, path: Path) -> ImuSequence:
-        """The recording at a path, in rad/s and m/s^2."""
-        from stario.sequences.checks import with_units
+        """The recording at a path, in rad/s, m/s^2 of specific force and its truth's axes."""
+        from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
-        return with_units(read_recording(path, self.format), self.gyro_unit, self.accel_unit)
+        sequence = read_recording(path, self.format)
+        return with_conventions(sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity)
 
 
 @dataclass(frozen=True)
