@@ -8,11 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.android import is_android, read_android
+from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.euroc import is_euroc, read_euroc
+from stario.sequences.readers.imunet import is_imunet, read_imunet
+from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv, write_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.text import first_line
+from stario.sequences.readers.ridi import is_ridi, read_ridi
+from stario.sequences.readers.rnin import is_rnin, read_rnin
+from stario.sequences.readers.ronin import is_ronin, read_ronin
+from stario.sequences.readers.text import first_line, magic
+from stario.sequences.readers.tlio import is_tlio, read_tlio
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]
@@ -26,29 +34,43 @@ class Format:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
         read: reads it, or raises ReadError.
+        options: names of what else `read` takes, all text.
     """
 
     recognises: Callable[[Path], bool]
-    read: Callable[[Path], ImuSequence]
+    read: Callable[..., ImuSequence]
+    options: tuple[str, ...] = ()
 
 
 FORMATS: dict[str, Format] = {
+    "ronin": Format(is_ronin, read_ronin),
+    "ridi": Format(is_ridi, read_ridi),
+    "imunet": Format(is_imunet, read_imunet),
+    "rnin": Format(is_rnin, read_rnin),
+    "tlio": Format(is_tlio, read_tlio),
+    "bag": Format(is_bag, read_bag, options=("imu_topic", "truth_topic")),
     "euroc": Format(is_euroc, read_euroc),
     "oxiod": Format(is_oxiod, read_oxiod),
+    "android": Format(is_android, read_android),
     "csv": Format(is_own_csv, read_own_csv),
 }
-"""Known formats by name, asked in this order; `euroc` is TUM-VI's as well."""
+"""Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
+well, `ridi` that of IMUNet's processed recordings."""
+
+_SUFFIXES = (".csv", ".txt", ".bag", ".mcap", ".db3", ".hdf5", ".h5")
+"""Files that may be a recording by themselves."""
 
 
-def read_recording(path: str | Path, format: str = "auto") -> ImuSequence:
+def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
     """Read a recording.
 
     Args:
-        path: a file, or the folder of an EuRoC or TUM-VI recording.
+        path: a file or a folder, as the format has it.
         format: a name in `FORMATS`, or "auto" to recognise it by its content.
+        options: what the format's reader takes besides: `imu_topic` and `truth_topic` of a bag.
 
     Raises:
-        InputError: the format's name is unknown.
+        InputError: the format's name is unknown, or it does not take an option.
         ReadError: nothing is there, no format fits, or the content is malformed.
     """
     path = Path(path)
@@ -56,27 +78,49 @@ def read_recording(path: str | Path, format: str = "auto") -> ImuSequence:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
     if not path.exists():
         raise ReadError(path, "path", "nothing there", "a recording")
-    if format != "auto":
-        return FORMATS[format].read(path)
-    for known in FORMATS.values():
-        if known.recognises(path):
-            return known.read(path)
-    raise _unknown(path)
+    name = _recognised(path) if format == "auto" else format
+    if name is None:
+        raise _unknown(path)
+    for option in options:
+        if option not in FORMATS[name].options:
+            known = ", ".join(FORMATS[name].options) or "none"
+            raise InputError(option, f"an option of a {name} recording", known)
+    return FORMATS[name].read(path, **options)
 
 
-def find_recordings(path: str | Path) -> list[Path]:
-    """The recordings at a path: itself if it is one, else all below it in sorted order.
+def find_recordings(
+    path: str | Path, on_error: Callable[[ReadError], None] | None = None
+) -> list[Path]:
+    """The recordings at a path: itself if it is one, those that it lists, else all below it.
 
-    Folders called `raw` beside `syn` are left out: OxIOD's unsynchronised doubles.
+    A list is a text file with the name of a recording, or of a folder of some, on each line. Of a
+    folder the recordings come in sorted order; folders called `raw` beside `syn` are left out:
+    OxIOD's unsynchronised doubles.
+
+    Args:
+        path: a recording, a list file or a folder.
+        on_error: called for each entry of a list that is empty or leads nowhere; the others are
+            returned all the same. Without it such an entry is raised.
 
     Raises:
-        ReadError: nothing is there, or a folder holds no recording.
+        ReadError: nothing is there, a folder holds no recording, or a list's entry is wrong.
     """
     path = Path(path)
     if not path.exists():
         raise ReadError(path, "path", "nothing there", "a recording or a folder of recordings")
-    if path.is_file() or _is_recording(path):
+    if _is_recording(path):
         return [path]
+    if is_list(path):
+        return _listed(path, on_error)
+    if path.is_file():
+        return [path]
+    found = _below(path)
+    if not found:
+        raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
+    return sorted(found)
+
+
+def _below(path: Path) -> list[Path]:
     found: list[Path] = []
     for folder, subfolders, files in os.walk(path):
         here = Path(folder)
@@ -91,15 +135,35 @@ def find_recordings(path: str | Path) -> list[Path]:
         found += [
             here / name
             for name in files
-            if name.lower().endswith((".csv", ".txt")) and _is_recording(here / name)
+            if name.lower().endswith(_SUFFIXES) and _is_recording(here / name)
         ]
-    if not found:
-        raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
-    return sorted(found)
+    return found
+
+
+def _listed(path: Path, on_error: Callable[[ReadError], None] | None) -> list[Path]:
+    """What a list names, each once; a list in a list is an error, or it could name itself."""
+    found: list[Path] = []
+    for entry in list_entries(path):
+        try:
+            if isinstance(entry, ReadError):
+                raise entry
+            if not _is_recording(entry) and is_list(entry):
+                raise ReadError(path, "list", f"the list {entry.name}", "names of recordings")
+            found += find_recordings(entry)
+        except ReadError as error:
+            if on_error is None:
+                raise
+            on_error(error)
+    return list(dict.fromkeys(found))
 
 
 def _is_recording(path: Path) -> bool:
-    return any(known.recognises(path) for known in FORMATS.values())
+    return _recognised(path) is not None
+
+
+def _recognised(path: Path) -> str | None:
+    """Name of the format whose content a path has."""
+    return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
 
 
 def _names() -> str:
@@ -108,8 +172,13 @@ def _names() -> str:
 
 def _unknown(path: Path) -> ReadError:
     """What was seen instead of a recording, in one line."""
+    fix = ""
     if path.is_dir():
-        found, fix = "a folder without mav0/imu0/data.csv", "name one recording in it"
+        inside = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        names = ", ".join(inside[:5]) + (f" and {len(inside) - 5} more" if len(inside) > 5 else "")
+        found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
+    elif magic(path, 2)[:1] == b"\x80":
+        found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     elif (line := first_line(path)) is None:
         found, fix = "no line of text", "is it empty or compressed?"
     else:

@@ -1,16 +1,25 @@
-"""OxIOD, synchronised form: `syn/imuN.csv` beside `syn/viN.csv` (Chen et al., 2018).
+"""OxIOD: `<carriage>/<dataN>/{syn,raw}/imuN.csv` with the capture beside it (Chen et al., 2018).
 
 `imuN.csv` has no header: time, roll, pitch, yaw [rad], gyroscope xyz [rad/s], gravity xyz [g],
 user acceleration xyz [g], magnetic field xyz [uT], in Apple's signs: the specific force is
--(gravity + user acceleration) * 9.81. Its printed times are rounded to uselessness; the rows of
-both files are synchronous at 100 Hz. `viN.csv`: time, frame, position xyz [m], quaternion xyzw of
-the tracked body. The phone sits turned in that body, the capture glitches and flips, and its
-world is not quite level: see `stario.sequences.alignment`.
+-(gravity + user acceleration) * 9.81. The capture is Vicon's `viN.csv` (`handN.csv` in one
+folder) or, at large scale, `tangoN.csv`: time, frame, position xyz [m], quaternion xyzw of the
+tracked body.
+
+In `syn` the printed times are rounded to uselessness; the rows of both files are synchronous at
+100 Hz. In `raw` each file has its own clock, in ns, us, ms or s: the rate tells which. There the
+IMU's rows are sorted (neighbours are swapped now and then), and the capture is brought onto the
+phone's clock by what both see of the turning. The Nexus 5 of `multi devices` writes other rows in
+`raw`: time, code of the sensor (1 accelerometer [m/s^2], 4 gyroscope [rad/s]) and xyz.
+
+The phone sits turned in the tracked body, the capture glitches and flips, and its world is not
+quite level: see `stario.sequences.alignment`.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,43 +27,76 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.alignment import align_tracked_body
+from stario.sequences.clock_offset import clock_offset
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.text import first_numbers, read_table
+from stario.sequences.readers.clocks import on_one_clock, time_unit
+from stario.sequences.readers.text import (
+    IntArray,
+    Table,
+    first_lines,
+    first_numbers,
+    numbers_in,
+    read_table,
+    seconds,
+)
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 
 RATE = 100.0
 _log = logging.getLogger(__name__)
 
 _G = 9.81
-_JUMP_M = 0.04
-"""A tracked body that moves further than this within one row (4 m/s) is a glitch."""
+_CAPTURES = ("vi", "hand", "tango")
+_ACCELEROMETER, _GYROSCOPE = 1, 4
+
+_JUMP_M_S = 4.0
+"""A tracked body that moves faster than this from row to row is a glitch."""
 
 _SPIKE_M = 0.1
 """Nor is it ever this far from the median of the half second around it."""
 
 
+@dataclass(frozen=True)
+class _Phone:
+    """Its samples; the stamps [ns] are None where rows are all there is to go by."""
+
+    time: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+    stamps_ns: IntArray | None
+
+
 def read_oxiod(path: Path) -> ImuSequence:
-    """Read `syn/imuN.csv` and, where it lies beside it, `syn/viN.csv`.
+    """Read `imuN.csv` and, where it lies beside it, the capture.
 
     Truth is None, with a warning logged, where too little of it agrees with the gyroscope.
 
     Raises:
-        ReadError: a file is missing, cut short, or the two do not have the same number of rows.
+        ReadError: a file is missing, cut short, or two of `syn` do not have as many rows.
     """
-    table = read_table(path, columns=16).values
-    time = np.arange(len(table)) / RATE
-    gyro = table[:, 4:7]
-    accel = -_G * (table[:, 7:10] + table[:, 10:13])
-    vicon = path.with_name(path.name.replace("imu", "vi", 1))
-    has_truth = vicon != path and vicon.exists()
-    truth = _truth(vicon, time, gyro, accel) if has_truth else None
-    return ImuSequence(name=_name(path), time=time, gyro=gyro, accel=accel, truth=truth)
+    phone = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
+    capture = _capture_file(path)
+    return ImuSequence(
+        name=_name(path),
+        time=phone.time,
+        gyro=phone.gyro,
+        accel=phone.accel,
+        truth=None if capture is None else _truth(capture, phone),
+    )
 
 
 def is_oxiod(path: Path) -> bool:
     """Whether a file starts with 16 numbers whose gravity is one g long; there is no header."""
     row = first_numbers(path)
-    return len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
+    apple = len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
+    return apple or _is_sensor_rows(path)
+
+
+def _is_sensor_rows(path: Path) -> bool:
+    rows = [numbers_in(line) for line in first_lines(path, 40)[:-1]]
+    if not rows or any(len(row) != 5 for row in rows):
+        return False
+    codes = {row[1] for row in rows}
+    return {_ACCELEROMETER, _GYROSCOPE} <= codes and all(c == int(c) for c in codes)
 
 
 def _name(path: Path) -> str:
@@ -63,20 +105,61 @@ def _name(path: Path) -> str:
     return "-".join(p for p in parts if p not in ("/", "..", "."))
 
 
-def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Trajectory | None:
-    table = read_table(path, columns=9).values
-    if len(table) != len(time):
-        raise ReadError(path, "rows", str(len(table)), f"{len(time)} as in the IMU's file")
-    position, quat_xyzw = table[:, 2:5], table[:, 5:9]
+def _phone(path: Path) -> _Phone:
+    table = read_table(path, columns=16)
+    rows = table.values
+    gyro, accel = rows[:, 4:7], -_G * (rows[:, 7:10] + rows[:, 10:13])
+    if path.parent.name == "syn" or len(np.unique(rows[:, 0])) < len(rows) / 2:
+        return _Phone(np.arange(len(rows)) / RATE, gyro, accel, None)
+    stamps = _stamps_ns(table)
+    order = np.argsort(stamps, kind="stable")
+    stamps = stamps[order]
+    return _Phone(seconds(stamps, stamps[0]), gyro[order], accel[order], stamps)
+
+
+def _sensor_rows(path: Path) -> _Phone:
+    """A row for each sample of each sensor, at its own time."""
+    table = read_table(path, columns=5)
+    stamps, code = _stamps_ns(table), table.values[:, 1]
+    gyro, accel = code == _GYROSCOPE, code == _ACCELEROMETER
+    xyz = table.values[:, 2:5]
+    stamps, rate, force = on_one_clock(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
+    return _Phone(seconds(stamps, stamps[0]), rate, force, stamps)
+
+
+def _stamps_ns(table: Table) -> IntArray:
+    return table.stamps_ns(0, time_unit(table.path, table.values[:, 0]))
+
+
+def _capture_file(path: Path) -> Path | None:
+    """The capture of the same number beside the IMU's file, or in a folder `tango` beside its."""
+    if not path.name.startswith("imu"):
+        return None
+    number = path.name.removeprefix("imu")
+    folders = (path.parent, path.parent.parent / "tango")
+    files = (folder / f"{name}{number}" for folder in folders for name in _CAPTURES)
+    return next((file for file in files if file.is_file()), None)
+
+
+def _truth(path: Path, phone: _Phone) -> Trajectory | None:
+    table = read_table(path, columns=max(8, len(first_numbers(path))))
+    position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
     norm = np.linalg.norm(quat_xyzw, axis=1)
-    valid = np.isfinite(table[:, 2:9]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
-    valid &= ~_position_glitches(position)
+    valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
     quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
-    known = np.isfinite(gyro).all(axis=1) & np.isfinite(accel).all(axis=1)
-    imu = (time[known], gyro[known], accel[known])
+    attitude_WV = Rotation.from_quat(quat_xyzw)
+    known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
+    imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
-        aligned = align_tracked_body(*imu, time, Rotation.from_quat(quat_xyzw), valid)
+        time, kept = _capture_time(table, phone)
+        position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
+        valid &= ~_position_glitches(time, position)
+        if phone.stamps_ns is not None:
+            time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
+        aligned = align_tracked_body(*imu, time, attitude_WV, valid)
     except InputError as error:
+        if isinstance(error, ReadError):
+            raise
         _log.warning("%s: left out: %s", path, error)
         return None
     return Trajectory(
@@ -87,13 +170,26 @@ def _truth(path: Path, time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     )
 
 
-def _position_glitches(position: FloatArray) -> BoolArray:
+def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
+    """Seconds since the phone's first sample by the capture's clock, and the rows they are of."""
+    rows = np.arange(len(table.values))
+    if phone.stamps_ns is None:
+        if len(rows) != len(phone.time):
+            expected = f"{len(phone.time)} as in the IMU's file"
+            raise ReadError(table.path, "rows", str(len(rows)), expected)
+        return phone.time, rows
+    stamps, rows = np.unique(_stamps_ns(table), return_index=True)
+    return seconds(stamps, phone.stamps_ns[0]), rows
+
+
+def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
     """Rows at either end of an impossible step or far from the median around them, widened."""
     half = 25
     padded = np.pad(position, ((half, half), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
     distance = np.linalg.norm(position - np.median(windows, axis=-1), axis=1)
-    jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < _JUMP_M)
+    limit = _JUMP_M_S * np.maximum(np.diff(time), 1.0 / RATE)
+    jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < limit)
     bad = ~(distance < _SPIKE_M)
     bad[1:] |= jump
     bad[:-1] |= jump

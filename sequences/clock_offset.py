@@ -1,0 +1,89 @@
+"""How far two clocks are apart that watched the same turning."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray
+
+_GRID_HZ = 50.0
+_NEAR_CLOCKS_S = 5.0
+_FASTEST_RAD_S = 12.0
+"""What turns faster is a glitch of the capture."""
+
+
+def clock_offset(
+    imu_time: FloatArray,
+    gyro: FloatArray,
+    truth_time: FloatArray,
+    attitude_WV: Rotation,
+    valid: BoolArray,
+) -> float:
+    """What brings the truth's clock near the IMU's, by what both see of the turning [s].
+
+    Clocks that agree to within 5 s (both stretches overlap) are searched that far, others over all
+    their length. It is good to a few hundredths of a second: `align_tracked_body` does the rest.
+
+    Args:
+        imu_time: (N,) [s].
+        gyro: (N, 3) angular rate in B [rad/s].
+        truth_time: (M,) [s], strictly increasing.
+        attitude_WV: M rotations of the tracked body.
+        valid: (M,) samples to be trusted at all.
+
+    Raises:
+        InputError: there are fewer than two valid samples.
+    """
+    known = np.flatnonzero(valid)
+    if min(len(known), len(imu_time)) < 2:
+        raise InputError("clocks", f"{len(known)} valid poses", "at least 2, and as many samples")
+    turned = (attitude_WV[known[:-1]].inv() * attitude_WV[known[1:]]).magnitude()
+    steps = np.diff(truth_time[known])
+    speed_V = np.where(steps < 0.1, turned / steps, np.nan)
+    start_B, start_V = float(imu_time[0]), float(truth_time[known[0]])
+    seen_B = _on_grid(imu_time - start_B, np.linalg.norm(gyro, axis=1))
+    seen_V = _on_grid(truth_time[known[1:]] - start_V, speed_V)
+    apart = start_B - start_V
+    lags, scores = _correlations(seen_B, seen_V)
+    overlapping = start_V < imu_time[-1] and start_B < truth_time[known[-1]]
+    near = np.abs(lags / _GRID_HZ + apart) <= _NEAR_CLOCKS_S
+    if overlapping and near.any():
+        lags, scores = lags[near], scores[near]
+    return float(lags[int(np.argmax(scores))]) / _GRID_HZ + apart
+
+
+def _on_grid(time: FloatArray, speed: FloatArray) -> FloatArray:
+    """Angular speed at 50 Hz, averaged over each step; nan where there is none."""
+    use = np.isfinite(speed) & (speed < _FASTEST_RAD_S)
+    cells = np.rint(time[use] * _GRID_HZ).astype(np.int64)
+    count = np.bincount(cells)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.bincount(cells, weights=speed[use]) / count, dtype=np.float64)
+
+
+def _correlations(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Correlation of a(k + lag) with b(k) for every lag at which half the shorter one overlaps."""
+    masks = [np.isfinite(x).astype(np.float64) for x in (a, b)]
+    values = [np.nan_to_num(x - np.nanmean(x)) for x in (a, b)]
+    lags = np.arange(-(len(b) - 1), len(a)).astype(np.float64)
+    common, products, power_a, power_b = (
+        _convolved(x, y[::-1])
+        for x, y in (
+            (masks[0], masks[1]),
+            (values[0], values[1]),
+            (values[0] ** 2, masks[1]),
+            (masks[0], values[1] ** 2),
+        )
+    )
+    enough = common >= 0.5 * min(masks[0].sum(), masks[1].sum())
+    scores = products / np.sqrt(np.maximum(power_a * power_b, 1e-12))
+    return lags[enough], np.asarray(scores[enough], dtype=np.float64)
+
+
+def _convolved(x: FloatArray, y: FloatArray) -> FloatArray:
+    count = len(x) + len(y) - 1
+    size = next_fast_len(count, real=True)
+    return np.asarray(irfft(rfft(x, size) * rfft(y, size), size)[:count], dtype=np.float64)

@@ -1,0 +1,157 @@
+"""ROS 1 and ROS 2 bags: an Imu topic and, where there is one, a pose topic as truth.
+
+`.bag` files, rosbag2 folders, `.mcap` and `.db3` files, read by `rosbags` without ROS. Of the
+messages only the numbers are looked at: whatever precedes them, a message of the types below ends
+with a fixed run of doubles, in ROS 1's serialisation as in CDR, and both hold the stamp at byte 4.
+That needs no definition of the types (a `.db3` of the older kind has none) and is quick.
+
+Time is the header's stamp, the bag's own where a driver left that zero. Poses are taken as those of
+the IMU in a world with z up; `stario inspect` shows where they are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked, optional_package, rotations, trajectory
+from stario.sequences.readers.text import IntArray, magic, seconds
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+_IMU = "sensor_msgs/msg/Imu"
+_DOUBLES = {
+    _IMU: 37,  # orientation, gyroscope and accelerometer, each with its covariance
+    "geometry_msgs/msg/PoseStamped": 7,  # position xyz, quaternion xyzw
+    "geometry_msgs/msg/TransformStamped": 7,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": 7 + 36,
+    "nav_msgs/msg/Odometry": 7 + 36 + 6 + 36,
+}
+_GYRO, _ACCEL = slice(13, 16), slice(25, 28)
+_STAMP = slice(4, 12)
+
+NO_TRUTH = "none"
+"""Given as the topic of the truth: leave it out."""
+
+
+def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSequence:
+    """Read a bag.
+
+    Args:
+        path: a `.bag`, `.mcap` or `.db3` file, or a rosbag2 folder.
+        imu_topic: the topic with sensor_msgs/Imu; may be left out if there is one.
+        truth_topic: a topic with PoseStamped, PoseWithCovarianceStamped, Odometry or
+            TransformStamped; may be left out if there is one or none, "none" for no truth.
+
+    Raises:
+        ReadError: the bag is broken, a topic is missing, or several fit and none was named.
+        InputError: rosbags is not installed.
+    """
+    messages = _messages(path, imu_topic, truth_topic)
+    imu = messages[_IMU]
+    stamps = imu.stamps_ns
+    values = checked(path, f"{imu.topic}, values", imu.values, first_row=0)
+    truth = next((m for kind, m in messages.items() if kind != _IMU), None)
+    return ImuSequence(
+        name=path.resolve().stem,
+        time=seconds(stamps, stamps[0]),
+        gyro=values[:, _GYRO],
+        accel=values[:, _ACCEL],
+        truth=None if truth is None else _truth(path, truth, stamps[0]),
+    )
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
+    if path.is_dir():
+        return b"rosbag2_bagfile_information" in magic(path / "metadata.yaml", 200)
+    head = magic(path)
+    return head.startswith((b"#ROSBAG V2", b"\x89MCAP0\r\n")) or (
+        path.suffix == ".db3" and head.startswith(b"SQLite format 3")
+    )
+
+
+@dataclass(frozen=True)
+class _Messages:
+    """A topic's messages: stamps (N,) [ns] and the doubles at their ends (N, K)."""
+
+    topic: str
+    stamps_ns: IntArray
+    values: FloatArray
+
+
+def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messages]:
+    """The IMU's messages and the truth's, if there is one, by type."""
+    version = "1" if magic(path).startswith(b"#ROSBAG") else "2"
+    reader_type: Any = optional_package(f"rosbags.rosbag{version}", "bags").Reader
+    try:
+        with reader_type(path) as reader:
+            topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
+            chosen = [_imu_topic(path, topics, imu_topic)]
+            chosen += _truth_topic(path, topics, truth_topic)
+            return {topics[topic]: _topic(path, reader, topic, topics[topic]) for topic in chosen}
+    except ReadError:
+        raise
+    except Exception as error:  # whatever the library stumbles over, the file is broken
+        found = " ".join(f"{type(error).__name__} {error}".split())[:120]
+        raise ReadError(path, "file", found, "a whole bag", "is the download complete?") from None
+
+
+def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
+    fitting = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
+    if wanted:
+        return _named(path, "imu topic", wanted, fitting)
+    if len(fitting) != 1:
+        seen = ", ".join(fitting or [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8])
+        fix = f"name one: imu_topic={fitting[0]}" if fitting else ""
+        raise ReadError(path, "topics", seen or "none", "one topic with sensor_msgs/Imu", fix)
+    return fitting[0]
+
+
+def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
+    fitting = [t for t, kind in sorted(topics.items()) if kind in _DOUBLES and kind != _IMU]
+    if wanted == NO_TRUTH:
+        return []
+    if wanted:
+        return [_named(path, "truth topic", wanted, fitting)]
+    if len(fitting) > 1:
+        fix = f"name one: truth_topic={fitting[0]}, or truth_topic={NO_TRUTH}"
+        raise ReadError(path, "topics", ", ".join(fitting), "one topic with poses", fix)
+    return fitting
+
+
+def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:
+    if wanted not in fitting:
+        raise ReadError(path, field, repr(wanted), f"one of {', '.join(fitting) or 'none'}")
+    return wanted
+
+
+def _topic(path: Path, reader: Any, topic: str, kind: str) -> _Messages:
+    connections = [c for c in reader.connections if c.topic == topic]
+    received = [(time, bytes(raw)) for _, time, raw in reader.messages(connections)]
+    raws = [raw for _, raw in received]
+    size = 8 * _DOUBLES[kind]
+    shortest = min(map(len, raws))
+    if shortest < _STAMP.stop + size:
+        raise ReadError(path, topic, f"a message of {shortest} bytes", f"a whole {kind}")
+    # ROS 1 is little-endian; CDR says so in its second byte.
+    big = not magic(path).startswith(b"#ROSBAG") and raws[0][1] & 1 == 0
+    order = ">" if big else "<"
+    parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{order}u4").reshape(-1, 2)
+    stamps = parts.astype(np.int64) @ np.array([10**9, 1])
+    if not stamps.any():
+        stamps = np.array([time for time, _ in received], dtype=np.int64)
+    doubles = np.frombuffer(b"".join(raw[-size:] for raw in raws), f"{order}f8")
+    values = doubles.astype(np.float64).reshape(-1, _DOUBLES[kind])
+    return _Messages(topic, stamps, values)
+
+
+def _truth(path: Path, poses: _Messages, start_ns: np.int64) -> Trajectory:
+    order = np.argsort(poses.stamps_ns, kind="stable")
+    values = poses.values[order]
+    position = checked(path, f"{poses.topic}, position", values[:, :3], first_row=0)
+    attitude_WB = rotations(path, f"{poses.topic}, quaternion", values[:, 3:7], "xyzw", 0)
+    return trajectory(seconds(poses.stamps_ns[order], start_ns), position, attitude_WB)

@@ -1,0 +1,105 @@
+"""What every reader of a data set holds against its file: finite numbers, unit quaternions."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
+
+_NORM_TOLERANCE = 1e-2
+
+
+def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
+    """The values (N,) or (N, K) if every one is finite.
+
+    Args:
+        path: the file they come from.
+        field: what they are, for the error.
+        values: to be checked.
+        first_row: number of the first row in the file, for the error.
+
+    Raises:
+        ReadError: one is not; it names the row.
+    """
+    good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    if not good.all():
+        k = int(np.argmin(good))
+        found = "nan" if np.isnan(values[k]).any() else "inf"
+        where = f"row {k + first_row}, {field}"
+        raise ReadError(path, where, found, "finite numbers", "cut the recording there")
+    return values
+
+
+def rotations(
+    path: Path, field: str, quat: FloatArray, order: str = "wxyz", first_row: int = 1
+) -> Rotation:
+    """Rotations from unit quaternions.
+
+    Args:
+        path: the file they come from.
+        field: what they are, for the error.
+        quat: (N, 4).
+        order: of their components, `wxyz` or `xyzw`.
+        first_row: number of the first row in the file, for the error.
+
+    Raises:
+        ReadError: a component is not finite or a norm is off 1 by more than a percent.
+    """
+    norm = np.linalg.norm(checked(path, field, quat, first_row), axis=1)
+    bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
+    if bad.any():
+        k = int(np.argmax(bad))
+        where = f"row {k + first_row}, {field}"
+        raise ReadError(
+            path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
+        )
+    return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+
+
+def same_length(path: Path, expected: int, **arrays: FloatArray) -> None:
+    """Refuse arrays that do not have as many rows as there are times.
+
+    Raises:
+        ReadError: names the array.
+    """
+    for name, values in arrays.items():
+        if len(values) != expected:
+            raise ReadError(path, name, f"{len(values)} rows", f"{expected} as time")
+
+
+def trajectory(
+    time: FloatArray,
+    position_W: FloatArray,
+    attitude_WB: Rotation,
+    velocity_W: FloatArray | None = None,
+    valid: BoolArray | None = None,
+) -> Trajectory:
+    """A track of the poses whose time is later than all before: files repeat rows."""
+    keep = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0
+    return Trajectory(
+        time=time[keep],
+        position_W=position_W[keep],
+        attitude_WB=attitude_WB[keep],
+        velocity_W=None if velocity_W is None else velocity_W[keep],
+        valid=np.ones(int(keep.sum()), dtype=np.bool_) if valid is None else valid[keep],
+    )
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """An optional package, imported.
+
+    Raises:
+        InputError: it is not installed; it names the extra that brings it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.split(".")[0]
+        fix = f'pip install "stario[{extra}]"'
+        raise InputError(package, "not installed", f"the package {package}", fix) from None

@@ -1,0 +1,78 @@
+"""Times in a unit that nothing names, and sensors with clocks of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
+from stario.sequences.units import TIME_UNITS
+
+_RATES = (10.0, 1000.0)
+"""Samples a second that sensors and captures make; the units are further apart than these."""
+
+
+def on_one_clock(
+    path: Path, gyro_ns: IntArray, gyro: FloatArray, accel_ns: IntArray, accel: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The gyroscope's samples of the common stretch, the accelerometer interpolated to them.
+
+    Samples within a gap of the accelerometer of more than 0.1 s are left out: nothing is known
+    there.
+
+    Args:
+        path: the recording, for errors.
+        gyro_ns: (N,) [ns].
+        gyro: (N, 3).
+        accel_ns: (M,) [ns], of the same origin.
+        accel: (M, 3).
+
+    Returns:
+        Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
+
+    Raises:
+        ReadError: the two have no stretch in common.
+    """
+    order = np.unique(accel_ns, return_index=True)[1]
+    accel_ns, accel = accel_ns[order], accel[order]
+    kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
+    if not kept.any():
+        origin = min(gyro_ns.min(), accel_ns[0])
+        spans = [
+            f"{name} from {seconds(ns, origin).min():.3f} to {seconds(ns, origin).max():.3f} s"
+            for name, ns in (("gyroscope", gyro_ns), ("accelerometer", accel_ns))
+        ]
+        raise ReadError(path, "time", ", ".join(spans), "a common stretch of one clock")
+    right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
+    before, after = accel_ns[right - 1], accel_ns[np.minimum(right, len(accel_ns) - 1)]
+    exact = (gyro_ns == before) | (gyro_ns == after)
+    kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
+    time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
+    resampled = np.stack([np.interp(time, t, accel[:, k]) for k in range(3)], axis=1)
+    return gyro_ns[kept], gyro[kept], resampled
+
+
+def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
+    """How many of the time's units make a second, told by the rate where no unit is named.
+
+    Args:
+        file: for errors.
+        time: (N,) in whatever unit.
+        unit: its name, or empty.
+
+    Raises:
+        ReadError: the unit is unknown, or none makes a sensor's rate of it.
+    """
+    if unit in TIME_UNITS:
+        return TIME_UNITS[unit]
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if len(steps) else 0.0
+    for per_second in TIME_UNITS.values():
+        if step and _RATES[0] <= per_second / step <= _RATES[1]:
+            return per_second
+    found = f"a step of {step:.4g}" + (f" {unit}" if unit else "")
+    raise ReadError(file, "time", found, "10 to 1000 samples a second in s, ms, us or ns")

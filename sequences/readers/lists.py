@@ -1,0 +1,72 @@
+"""List files: a recording's name on each line, as the data sets publish their splits.
+
+Blanks around a name, `,type` behind it and comments from `#` on are dropped; so are blank lines at
+the end, but an empty entry elsewhere is an error, because the data sets' own readers take it for
+the folder itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import first_line, numbers_in, read_lines
+
+_SUFFIXES = (".txt", ".list", ".lst")
+_OXIOD_FORMS = ("syn", "raw")
+
+
+def is_list(path: Path) -> bool:
+    """Whether a file may be a list: text by its suffix whose first line is no row of numbers."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    line = first_line(path)
+    return line is not None and not numbers_in(line) and not numbers_in(line, None)
+
+
+def list_entries(path: Path) -> Iterator[Path | ReadError]:
+    """The files and folders that a list names, in its order, or what is wrong with a line.
+
+    Names count from the list's folder, from a folder in it, or, where the list stands in a folder
+    of nothing but lists, from the folder around that. `data1/imu3.csv` is found as
+    `data1/syn/imu3.csv` too (OxIOD).
+
+    Raises:
+        ReadError: the list cannot be read or names nothing.
+    """
+    lines = read_lines(path)
+    while lines and not lines[-1].strip():
+        lines.pop()
+    entries = [(k, line.split("#")[0]) for k, line in enumerate(lines, 1)]
+    written = [(k, text) for k, text in entries if text.strip() or not lines[k - 1].strip()]
+    if not written:
+        raise ReadError(path, "list", "no entry", "names of recordings")
+    bases = _bases(path.parent)
+    for number, text in written:
+        name = text.split(",")[0].strip()
+        if not name:
+            yield ReadError(
+                path, f"line {number}", "an empty entry", "a recording's name", "delete the line"
+            )
+            continue
+        found = _located(bases, Path(name))
+        fix = "take it off the list or fetch it"
+        yield found or ReadError(path, f"line {number}", f"{name}, not there", "a recording", fix)
+
+
+def _bases(folder: Path) -> list[Path]:
+    inside = _folders(folder)
+    if inside:
+        return [folder, *inside]
+    return [folder, folder.parent, *_folders(folder.parent)]
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
+def _located(bases: list[Path], name: Path) -> Path | None:
+    forms = [name, *(name.parent / form / name.name for form in _OXIOD_FORMS)]
+    candidates = (base / form for base in bases for form in forms)
+    return next((path for path in candidates if path.exists()), None)

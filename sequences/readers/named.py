@@ -1,0 +1,58 @@
+"""Columns of a CSV by the names in its header."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked
+from stario.sequences.readers.text import Table, first_line, read_lines, read_table
+from stario.sequences.sequence import FloatArray
+
+
+def header_names(path: Path) -> list[str]:
+    """The cells of a file's first line, empty for a file that is no text; never raises."""
+    return [cell.strip().strip('"') for cell in (first_line(path) or "").split(",")]
+
+
+class NamedColumns:
+    """Columns of a CSV with a header, all finite.
+
+    Args:
+        path: the file.
+        names: the columns to read.
+
+    Raises:
+        ReadError: the file or a column is missing, a row is cut short, or a cell is no finite
+            number.
+    """
+
+    def __init__(self, path: Path, names: Collection[str]) -> None:
+        read_lines(path)  # a missing or empty file is told from a missing column
+        header = header_names(path)
+        missing = [name for name in names if name not in header]
+        if missing:
+            raise ReadError(path, "header", f"no {', '.join(missing)}", "one column of that name")
+        self._places = {name: k for k, name in enumerate(names)}
+        self._columns = [header.index(name) for name in names]
+        self.table: Table = read_table(path, max(self._columns) + 1, skip=1, used=self._columns)
+        for name in names:
+            checked(path, name, self[name], self.table.line_numbers[0])
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """A column (N,)."""
+        return self.table.values[:, self._places[name]]
+
+    def stack(self, stem: str, axes: str = "xyz") -> FloatArray:
+        """The columns `stem_x`, `stem_y`, ... side by side (N, K)."""
+        return self.table.values[:, [self._places[f"{stem}_{axis}"] for axis in axes]]
+
+    def file_column(self, name: str) -> int:
+        """Where a column stands in the file."""
+        return self._columns[self._places[name]]
+
+
+def axes_of(stem: str, axes: str = "xyz") -> list[str]:
+    """The names `stem_x`, `stem_y`, ..."""
+    return [f"{stem}_{axis}" for axis in axes]
