@@ -1,7 +1,11 @@
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 from torch import Tensor, nn
 
+from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.benchmark import network_speed
 from stario.network.inference import inference_form
 from stario.network.model import DisplacementNetwork
@@ -13,10 +17,8 @@ from stario.sequences.walks import generate_walk
 from stario.sequences.windows import windows_of, world_streams
 
 
-def lived_in(gated_unit: bool = True, seed: int = 0) -> DisplacementNetwork:
-    """A network whose every parameter and statistic differs from what it starts with."""
-    torch.manual_seed(seed)
-    network = DisplacementNetwork(StarIO(gated_unit=gated_unit))
+def live_in(network: nn.Module) -> None:
+    """Give every norm parameters and statistics that differ from what they start with."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm1d):
             nn.init.uniform_(module.weight, 0.5, 1.5)
@@ -25,6 +27,13 @@ def lived_in(gated_unit: bool = True, seed: int = 0) -> DisplacementNetwork:
             assert module.running_var is not None
             module.running_mean.normal_(0.0, 0.5)
             module.running_var.uniform_(0.3, 2.0)
+
+
+def lived_in(gated_unit: bool = True, seed: int = 0) -> DisplacementNetwork:
+    """A StarIO whose every parameter and statistic differs from what it starts with."""
+    torch.manual_seed(seed)
+    network = DisplacementNetwork(StarIO(gated_unit=gated_unit))
+    live_in(network)
     for name, parameter in network.named_parameters():
         if name.endswith((".mu", ".xi")):
             nn.init.uniform_(parameter, -1.5, 1.5)
@@ -97,10 +106,46 @@ def test_later_training_does_not_reach_the_inference_form() -> None:
         assert torch.equal(fast(windows)[0], before)
 
 
-def test_an_unknown_network_stays_as_it_is_in_evaluation_mode() -> None:
-    network = DisplacementNetwork(nn.Sequential(nn.Flatten(), nn.Dropout(), nn.Linear(1200, 6)))
-    assert inference_form(network) is network
-    assert not network.training
+@pytest.mark.parametrize("name", [name for name in ARCHITECTURES if "StarIO" not in name])
+def test_both_forms_of_every_other_network_agree(name: str) -> None:
+    torch.manual_seed(0)
+    network = DisplacementNetwork(build_network(name))
+    with torch.no_grad():
+        live_in(network)
+    assert_same(network.eval(), random_windows(3))
+
+
+def test_batches_of_any_size_in_any_order() -> None:
+    network, windows = lived_in(), random_windows(7)
+    fast = inference_form(network)
+    with torch.inference_mode():
+        whole = fast(windows)[0]
+        for sizes in ([1, 1, 1, 4], [2, 5], [3, 3, 1], [1, 6], [7]):
+            parts = [fast(part)[0] for part in windows.split(sizes)]
+            torch.testing.assert_close(torch.cat(parts), whole, rtol=0.0, atol=1e-5)
+
+
+def test_an_answer_stays_when_the_next_one_is_asked() -> None:
+    fast = inference_form(lived_in())
+    first = fast(random_windows(2))[0]
+    kept = first.clone()
+    fast(3.0 * random_windows(2))
+    assert torch.equal(first, kept)
+
+
+def test_threads_do_not_disturb_each_other() -> None:
+    fast = inference_form(lived_in())
+    batches = [random_windows(2) * scale for scale in (0.5, 1.0, 2.0, 3.0)]
+    alone = [fast(batch)[0] for batch in batches]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda k: fast(batches[k % 4])[0], range(40)))
+    assert all(torch.equal(together[k], alone[k % 4]) for k in range(40))
+
+
+def test_the_inference_form_travels_to_another_process() -> None:
+    fast, windows = inference_form(lived_in()), random_windows(2)
+    expected = fast(windows)[0]
+    assert torch.equal(pickle.loads(pickle.dumps(fast))(windows)[0], expected)
 
 
 def test_speed_of_both_forms_is_measured_for_each_batch() -> None:
