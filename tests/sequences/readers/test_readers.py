@@ -302,9 +302,9 @@ def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
         assert all(name in str(caught.value) for name in FORMATS)
     with pytest.raises(ReadError, match="nothing there"):
         read_recording(tmp_path / "none.csv")
-    with pytest.raises(ReadError, match="found a folder with imu.csv, expected one of"):
+    with pytest.raises(ReadError, match=r"found a folder with imu\.csv, expected one of"):
         read_recording(tmp_path)
-    with pytest.raises(InputError, match="format: found 'bags', expected auto, ronin, .*, csv"):
+    with pytest.raises(InputError, match=r"format: found 'bags', expected auto, ronin, .*, csv"):
         read_recording(path, format="bags")
 
 

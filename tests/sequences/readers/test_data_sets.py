@@ -1,0 +1,64 @@
+"""Every published format: what the writers of `conftest.py` write comes back as it was."""
+
+import numpy as np
+import pytest
+
+from stario.sequences.readers import FORMATS, find_recordings, read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY
+
+
+def test_what_was_written_comes_back(written) -> None:
+    _, recording = written
+    expected = recording.expected
+    read = read_recording(recording.path)
+    assert read.name == expected.name
+    assert np.abs(read.time - expected.time).max() < 1e-8
+    assert np.abs(read.gyro - expected.gyro).max() < 1e-9
+    assert np.abs(read.accel - expected.accel).max() < 1e-9
+    if expected.truth is None:
+        assert read.truth is None
+        return
+    assert read.truth is not None
+    assert len(read.truth) == len(expected.truth)
+    assert read.truth.valid.all()
+    assert np.abs(read.truth.time - expected.truth.time).max() < 1e-8
+    assert np.abs(read.truth.position_W - expected.truth.position_W).max() < 1e-6
+    off = (read.truth.attitude_WB.inv() * expected.truth.attitude_WB).magnitude()
+    assert off.max() < 1e-6
+
+
+def test_each_is_recognised_by_its_content_alone(written) -> None:
+    name, recording = written
+    assert next(n for n, known in FORMATS.items() if known.recognises(recording.path)) == name
+    assert find_recordings(recording.path) == [recording.path]
+    read = read_recording(recording.path, format=name)
+    assert np.array_equal(read.gyro, read_recording(recording.path).gyro)
+
+
+def test_each_is_found_below_a_folder(written, tmp_path) -> None:
+    _, recording = written
+    whole = recording.path.parent if recording.path.suffix == ".csv" else recording.path
+    assert find_recordings(tmp_path) == [whole]
+
+
+def test_force_is_gravity_on_average_and_rate_the_attitudes_derivative(written) -> None:
+    """Physics, not the writer: a wrong order, sign or frame would not pass."""
+    _, recording = written
+    read = read_recording(recording.path)
+    if read.truth is None:
+        pytest.skip("a logger's folder has no truth")
+    pose = read.truth
+    inside = (read.time >= pose.time[0]) & (read.time <= pose.time[-1])
+    force = pose.at(read.time[inside]).attitude_WB.apply(read.accel[inside]).mean(axis=0)
+    speeds = np.diff(pose.position_W, axis=0) / np.diff(pose.time)[:, None]
+    change = (speeds[-1] - speeds[0]) / (pose.time[-1] - pose.time[0])
+    assert np.abs(force - change - [0.0, 0.0, STANDARD_GRAVITY]).max() < 0.05
+    stride = max(1, round(0.03 / np.median(np.diff(pose.time))))
+    turned = (pose.attitude_WB[:-stride].inv() * pose.attitude_WB[stride:]).as_rotvec()
+    steps = 0.5 * (read.gyro[1:] + read.gyro[:-1]) * np.diff(read.time)[:, None]
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    at_poses = [np.interp(pose.time, read.time, angle[:, k]) for k in range(3)]
+    measured = np.stack(at_poses, axis=1)
+    measured = measured[stride:] - measured[:-stride]
+    assert np.corrcoef(turned.ravel(), measured.ravel())[0, 1] > 0.999
+    assert np.sqrt(np.square(turned - measured).mean()) < 0.03 * measured.std()
