@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison
+from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison, Metrics
 from stario.sequences.sequence import FloatArray
 
 _COLUMNS = (
@@ -19,27 +20,47 @@ _COLUMNS = (
 )
 
 
-def summary(comparisons: Sequence[Comparison]) -> dict[str, object]:
+@dataclass(frozen=True)
+class Scores:
+    """The figures of one recording: what stays when a comparison's arrays are let go.
+
+    Attributes:
+        name: the recording's.
+        metrics: by track name.
+        record: the recording's entry in `metrics.json`.
+    """
+
+    name: str
+    metrics: dict[str, Metrics]
+    record: dict[str, object]
+
+
+def scores_of(comparison: Comparison) -> Scores:
+    """The figures of a comparison."""
+    return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict())
+
+
+def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """Figures of every recording with medians and means over them, as plain values."""
-    recordings = {c.sequence.name: c.as_dict() for c in comparisons}
+    records = {scores.name: scores.record for scores in recordings}
     metrics = ("ate_m", "rte_m", "pde", "aye_rad", "nees", "nis")
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
             for metric in metrics
-            if len(values := _known(comparisons, track, metric))
+            if len(values := _known(recordings, track, metric))
         }
         for track in TRACKS
     }
-    return {"recordings": recordings, "over_recordings": over, "conventions": METRIC_WORDS}
+    return {"recordings": records, "over_recordings": over, "conventions": METRIC_WORDS}
 
 
-def summary_table(comparisons: Sequence[Comparison]) -> str:
+def summary_table(recordings: Sequence[Scores]) -> str:
     """The same for a person: horizontal ATE of each track, consistency of the EKF."""
-    width = max([24, *(len(c.sequence.name) + 2 for c in comparisons)])
+    width = max([24, *(len(r.name) + 2 for r in recordings)])
     lines = [f"{'':<{width}}" + "".join(f"{title:>24}" for _, _, title in _COLUMNS)]
-    rows = [(c.sequence.name, [_value(c, t, m) for t, m, _ in _COLUMNS]) for c in comparisons]
-    known = [_known(comparisons, track, metric) for track, metric, _ in _COLUMNS]
+    rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
+    known = [_known(recordings, track, metric) for track, metric, _ in _COLUMNS]
     for name, over in (("median", np.median), ("mean", np.mean)):
         rows.append((name, [float(over(values)) if len(values) else None for values in known]))
     for name, row in rows:
@@ -49,14 +70,14 @@ def summary_table(comparisons: Sequence[Comparison]) -> str:
     return "\n".join(lines)
 
 
-def _known(comparisons: Sequence[Comparison], track: str, metric: str) -> FloatArray:
-    values = [_value(c, track, metric) for c in comparisons]
+def _known(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
+    values = [_value(scores, track, metric) for scores in recordings]
     return np.array([value for value in values if value is not None])
 
 
-def _value(comparison: Comparison, track: str, metric: str) -> float | None:
+def _value(scores: Scores, track: str, metric: str) -> float | None:
     """A figure, None where it is not known."""
-    value = comparison.metrics.get(track, {}).get(metric)
+    value = scores.metrics.get(track, {}).get(metric)
     return value if value is not None and math.isfinite(value) else None
 
 

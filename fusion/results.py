@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stario.fusion.compare import METRIC_WORDS, Comparison, Metrics
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluate import Scores, scores_of
 from stario.fusion.state import Innovations, Track
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
@@ -53,29 +54,55 @@ def write_comparison(
     Raises:
         InputError: a folder cannot be made.
     """
-    make_folder(folder)
-    written = [folder / "metrics.json", folder / "config.json"]
-    write_json(written[0], comparison_dict(comparisons))
-    write_json(written[1], asdict(config))
+    written = write_summary(folder, [scores_of(c) for c in comparisons], config)
     for comparison in comparisons:
-        name = comparison.sequence.name
-        inner = folder / name
-        make_folder(inner)
-        for track_name, track in comparison.tracks.items():
-            written += _track_files(inner, track_name, track)
-        truth = comparison.sequence.truth
-        if truth is not None:
-            write_tum(inner / "truth.tum", truth)
-            written.append(inner / "truth.tum")
-        filtered = comparison.tracks["ekf"].innovations
-        written += _figures(inner, name, comparison.aligned(), truth, filtered, config)
+        written += write_recording(folder, comparison, config)
     return written
+
+
+def write_summary(
+    folder: Path, recordings: Sequence[Scores], config: NavigatorConfig
+) -> list[Path]:
+    """Write `metrics.json` and `config.json` of several recordings.
+
+    Raises:
+        InputError: the folder cannot be made.
+    """
+    make_folder(folder)
+    write_json(folder / "metrics.json", scores_dict(recordings))
+    write_json(folder / "config.json", asdict(config))
+    return [folder / "metrics.json", folder / "config.json"]
+
+
+def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfig) -> list[Path]:
+    """Write tracks and figures of one recording into a sub-folder of its name.
+
+    Raises:
+        InputError: a folder cannot be made.
+    """
+    name = comparison.sequence.name
+    inner = folder / name
+    make_folder(inner)
+    written: list[Path] = []
+    for track_name, track in comparison.tracks.items():
+        written += _track_files(inner, track_name, track)
+    truth = comparison.sequence.truth
+    if truth is not None:
+        write_tum(inner / "truth.tum", truth)
+        written.append(inner / "truth.tum")
+    filtered = comparison.tracks["ekf"].innovations
+    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config)
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
     """The content of `metrics.json`."""
-    recordings = {c.sequence.name: c.as_dict() for c in comparisons}
-    return {"recordings": recordings, "conventions": METRIC_WORDS}
+    return scores_dict([scores_of(comparison) for comparison in comparisons])
+
+
+def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
+    """The same from the figures alone."""
+    records = {scores.name: scores.record for scores in recordings}
+    return {"recordings": records, "conventions": METRIC_WORDS}
 
 
 def make_folder(folder: Path) -> None:

@@ -397,6 +397,34 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
     assert_one_line_error(stario("evaluate", "blind.csv"), "truth")
 
 
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_batch_goes_on_past_what_fails_and_says_so(
+    stario, recording: Path, tmp_path: Path, jobs: int
+) -> None:
+    walk = read_own_csv(recording)
+    write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
+    write_csv(tmp_path / "blind.csv", walk.without_truth())
+    (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
+    (tmp_path / "list.txt").write_text("deg.csv\nnosuch.csv\n\nblind.csv\nbroken.csv\n")
+    done = stario(
+        "evaluate", recording, "list.txt", "missing", recording, "--jobs", jobs,
+        "--out", "out", "--json",
+    )  # fmt: skip
+    assert done.code == 1
+    figures = json.loads(done.out)
+    assert set(figures["recordings"]) == {"walk", "walk-2"}
+    assert json.loads((tmp_path / "out/metrics.json").read_text())["recordings"].keys() == {
+        "walk", "walk-2"
+    }  # fmt: skip
+    lines = done.err.splitlines()
+    assert all(line.startswith("stario: skipped: ") for line in lines)
+    reasons = ("--gyro-unit", "nosuch.csv", "an empty entry", "truth", "ax: found 'x'", "missing")
+    assert len(lines) == len(reasons)
+    for reason in reasons:
+        assert sum(reason in line for line in lines) == 1
+
+
 # --- train -------------------------------------------------------------------------------------
 
 

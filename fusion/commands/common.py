@@ -6,7 +6,7 @@ import inspect
 import itertools
 import sys
 import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import wraps
@@ -15,16 +15,29 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stario.sequences.errors import StarioError
+
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.fusion.navigator import Progress
     from stario.network.model import DisplacementModel
+    from stario.sequences.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 PathsArgument = Annotated[
-    list[Path] | None, typer.Argument(help="Recordings, or folders that hold some.")
+    list[Path] | None, typer.Argument(help="Recordings, folders or lists of some.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
+FixesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--fixes",
+        help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or heading.",
+    ),
+]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
 
 
@@ -51,6 +64,12 @@ class Reading:
             help="The truth's x, y, z in the file's axes, such as y,-x,z (--axes=-y,x,z).",
         ),
     ] = "x,y,z"
+    imu_topic: Annotated[
+        str | None, typer.Option("--imu-topic", help="Of a bag, where it holds several IMUs.")
+    ] = None
+    truth_topic: Annotated[
+        str | None, typer.Option("--truth-topic", help="Of a bag: poses or odometry that are true.")
+    ] = None
     gravity: Annotated[
         str,
         typer.Option(
@@ -64,7 +83,9 @@ class Reading:
         from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
-        sequence = read_recording(path, self.format)
+        topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
+        named = {name: topic for name, topic in topics.items() if topic is not None}
+        sequence = read_recording(path, self.format, **named)
         return with_conventions(sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity)
 
 
@@ -132,10 +153,34 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def found(paths: Iterable[Path]) -> list[Path]:
-    """Recordings at the paths: themselves, or all below a folder."""
+    """Recordings at the paths, in folders or in lists."""
     from stario.sequences.readers import find_recordings
 
     return [file for path in paths for file in find_recordings(path)]
+
+
+def recordings_at(paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
+    """Recordings at the paths, in folders or in lists, and what leads to none."""
+    from stario.sequences.batch import Skipped
+    from stario.sequences.readers import find_recordings
+
+    files: list[Path] = []
+    errors: list[StarioError] = []
+    for path in paths:
+        try:
+            files += find_recordings(path, errors.append)
+        except StarioError as error:
+            errors.append(error)
+    return files, [Skipped("", str(error)) for error in errors]
+
+
+def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
+    """Name on stderr what could not be used, and leave with 1 if there was any."""
+    for one in skipped:
+        where = "" if one.item in one.reason else f"{one.item}: "
+        typer.echo(f"stario: skipped: {where}{one.reason}", err=True)
+    if skipped:
+        raise typer.Exit(1)
 
 
 def distinct(sequences: Iterable[ImuSequence]) -> list[ImuSequence]:

@@ -12,7 +12,7 @@ import pytest
 from stario.fusion import compare as compare_module
 from stario.fusion.compare import TRACKS, Comparison, compare, demonstration
 from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
-from stario.fusion.evaluate import summary, summary_table
+from stario.fusion.evaluate import scores_of, summary, summary_table
 from stario.fusion.results import write_comparison, write_run
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
@@ -185,10 +185,11 @@ def test_summary_has_median_and_mean_over_recordings(
     worst = replace(compared, metrics={**compared.metrics, "ekf": {
         **compared.metrics["ekf"], "ate_m": 8.0}})  # fmt: skip
     ate = compared.metrics["ekf"]["ate_m"]
-    over = summary([compared, worse, worst])["over_recordings"]["ekf"]["ate_m"]
+    scores = [scores_of(comparison) for comparison in (compared, worse, worst)]
+    over = summary(scores)["over_recordings"]["ekf"]["ate_m"]
     assert over["median"] == pytest.approx(3.0)
     assert over["mean"] == pytest.approx((ate + 11.0) / 3.0)
-    table = summary_table([compared, worse, worst])
+    table = summary_table(scores)
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
     assert "3.00" in lines[4]
@@ -199,9 +200,10 @@ def test_the_table_of_a_recording_without_one_of_the_tracks_has_no_number_there(
 ) -> None:
     scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
     comparison = compare(model, scarce, CONFIG)
-    assert "nan" not in summary_table([comparison])
+    scores = [scores_of(comparison)]
+    assert "nan" not in summary_table(scores)
     assert "network_true_attitude" not in {
-        k for k, v in summary([comparison])["over_recordings"].items() if v
+        k for k, v in summary(scores)["over_recordings"].items() if v
     }
 
 

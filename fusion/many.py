@@ -1,0 +1,70 @@
+"""The tracks of many recordings, compared in parallel and past those that cannot be used."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from stario.fusion.compare import Comparison, compare
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.navigator import Predictor, Progress
+from stario.sequences.batch import Skipped, each
+from stario.sequences.errors import InputError
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import ImuSequence
+
+
+def compare_recordings(
+    paths: Sequence[Path],
+    model: Predictor,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence] = read_recording,
+    jobs: int | None = None,
+    truth_needed: bool = False,
+    progress: Progress = lambda share: None,
+) -> Iterator[Comparison | Skipped]:
+    """Compare the tracks of each recording, in the order of the paths.
+
+    Comparisons come one by one, so that they need not all be in memory, under names of their own:
+    a second `walk` is `walk-2`.
+
+    Args:
+        paths: recordings.
+        model: the network.
+        config: the navigator's settings.
+        read: how a path is read; can be pickled.
+        jobs: processes, as for `stario.sequences.batch.each`.
+        truth_needed: skip recordings without truth.
+        progress: called with the share of the recordings that are done.
+    """
+    work = partial(_compare, model=model, config=config, read=read, truth_needed=truth_needed)
+    names: set[str] = set()
+    for done, outcome in enumerate(each(work, paths, jobs), 1):
+        progress(done / len(paths))
+        if isinstance(outcome, Comparison):
+            name = distinct_name(outcome.sequence.name, names)
+            names.add(name)
+            outcome = replace(outcome, sequence=replace(outcome.sequence, name=name))
+        yield outcome
+
+
+def distinct_name(name: str, taken: set[str]) -> str:
+    """The name, or the first of name-2, name-3, ... that is not taken."""
+    names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
+    return next(name for name in names if name not in taken)
+
+
+def _compare(
+    path: Path,
+    model: Predictor,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence],
+    truth_needed: bool,
+) -> Comparison:
+    sequence = read(path)
+    if truth_needed and sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+    return compare(model, sequence, config)
