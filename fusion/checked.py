@@ -49,3 +49,13 @@ def check_covariance(covariance: FloatArray) -> None:
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma)).min() < -1e-9:
         raise InputError("covariance", "a negative eigenvalue", "a positive semi-definite matrix")
+
+
+def floored(covariance: FloatArray, sigma: float) -> FloatArray:
+    """The covariance with no positive variance below sigma^2; others are left to be refused."""
+    variance = covariance.diagonal()
+    short = (variance > 0.0) & (variance < sigma * sigma)
+    if not short.any():
+        return covariance
+    lift: FloatArray = np.diag(np.where(short, sigma * sigma - variance, 0.0))
+    return covariance + lift

@@ -7,8 +7,9 @@ see many windows at once. As the intake does not depend on the filter both give 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Protocol
 
@@ -16,9 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
 from stario.fusion.intake import Epoch, Intake, Start, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.state import Health, NavState, Track, track_from_states
+from stario.fusion.world import in_last_world
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -81,6 +84,7 @@ class Navigator:
         self.config = config or NavigatorConfig()
         self._intake = Intake(self.config)
         self._recipe: FilterRecipe | None = None
+        self._fixes = FixQueue()
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
         """Take in one sample of a stream.
@@ -106,6 +110,33 @@ class Navigator:
             state = self._advance(epoch)
         return state
 
+    def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
+        """A position fix for the stream.
+
+        It is taken in at its own time: up to a window (1 s) before the newest state, or later,
+        when the stream gets there. Older ones, and values that are not finite or no covariance,
+        are refused and counted in `health`. A track that started without a pose is moved to its
+        first position fix and turned by the second that is far enough away (see `world`): states
+        with another `world` must not be compared with those before.
+
+        Args:
+            time: [s], on the samples' clock.
+            p_W: (3,) [m].
+            covariance: (3, 3) [m^2].
+
+        Raises:
+            InputError: a value has another shape.
+        """
+        self._take(position_fix(time, p_W, covariance))
+
+    def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> None:
+        """A velocity fix (3,) [m/s] with covariance (3, 3); else as `update_position`."""
+        self._take(velocity_fix(time, v_W, covariance))
+
+    def update_heading(self, time: float, yaw: float, sigma: float) -> None:
+        """A fix of the body's yaw [rad], that of `yaw_of`; else as `update_position`."""
+        self._take(heading_fix(time, yaw, sigma))
+
     @property
     def state(self) -> NavState | None:
         """The newest state of the stream, None before the first second is over."""
@@ -114,12 +145,19 @@ class Navigator:
     @property
     def health(self) -> Health:
         """The stream's report so far."""
+        counts = self._intake.counts
         if self._recipe is None:
-            counts = self._intake.counts
-            return Health(samples=counts.samples(), gaps=list(counts.gaps))
-        return self._recipe.health(self._intake.counts)
+            health = Health(samples=counts.samples(), gaps=list(counts.gaps))
+        else:
+            health = self._recipe.health(counts)
+        return _with_refused(health, self._fixes)
 
-    def run(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Track:
+    def run(
+        self,
+        sequence: ImuSequence,
+        progress: Progress = lambda share: None,
+        fixes: Iterable[Fix] = (),
+    ) -> Track:
         """The fused track of a recording; its truth is never looked at.
 
         Does not touch the stream of `push`.
@@ -127,11 +165,14 @@ class Navigator:
         Args:
             sequence: the recording.
             progress: called now and then with the share of the work done.
+            fixes: of position, heading or velocity, in any order; those outside the recording, or
+                without meaning, are refused and counted. The whole track is given in the world it
+                ends in.
 
         Raises:
-            InputError: the recording is shorter than two seconds, or its units or rate are wrong.
+            InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
         """
-        return self.track(self.observe(sequence, progress), progress)
+        return self.track(self.observe(sequence, progress), progress, fixes)
 
     def observe(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Observed:
         """Prepare a recording and let the network see its windows.
@@ -146,7 +187,7 @@ class Navigator:
             raise InputError(
                 f"{sequence.name}: samples",
                 f"{intake.counts.used} usable over {sequence.duration:.2f} s",
-                f"an unbroken stretch of at least {2 * WINDOW_SECONDS:g} s",
+                f"an unbroken stretch of at least {WINDOW_SECONDS:g} s",
             )
         seconds_intake = perf_counter() - began
         progress(0.1)
@@ -154,24 +195,32 @@ class Navigator:
         measurements = self._measure(epochs, progress)
         return Observed(epochs, measurements, intake, seconds_intake, perf_counter() - began)
 
-    def track(self, observed: Observed, progress: Progress = lambda share: None) -> Track:
-        """The filter's track of a prepared recording."""
+    def track(
+        self,
+        observed: Observed,
+        progress: Progress = lambda share: None,
+        fixes: Iterable[Fix] = (),
+    ) -> Track:
+        """The filter's track of a prepared recording; fixes as for `run`."""
         began = perf_counter()
         start = observed.intake.start
         assert start is not None  # observe() refuses recordings without one
         recipe = FilterRecipe(self.config, start, self.prior)
+        queue = FixQueue(fixes)
+        queue.start(start.time)
         states = [recipe.state()]
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
         ):
-            states.append(recipe.step(epoch, measurement))
+            states.append(recipe.step(epoch, measurement, queue.due(epoch.stop)))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
+        queue.refuse("after the end", len(queue.due(math.inf)))
         return track_from_states(
-            states,
+            in_last_world(states, recipe.world_changes),
             recipe.innovations(),
-            recipe.health(observed.intake.counts),
+            _with_refused(recipe.health(observed.intake.counts), queue),
             seconds_network=observed.seconds_network,
             seconds_filter=observed.seconds_intake + perf_counter() - began,
         )
@@ -190,12 +239,19 @@ class Navigator:
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
             start = self._checked_start()
-            self._recipe = FilterRecipe(self.config, start, self.prior, keep_innovations=False)
+            self._recipe = FilterRecipe(self.config, start, self.prior, streaming=True)
+            self._fixes.start(start.time)
         measurement = None
         if epoch.window is not None:
             mean, covariance = self.model.predict(epoch.window[None])
             measurement = (mean[0], covariance[0])
-        return self._recipe.step(epoch, measurement)
+        return self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
+
+    def _take(self, fix: Fix) -> None:
+        if self._recipe is None or fix.fault() or fix.time > self._recipe.state().time:
+            self._fixes.hold(fix)
+        elif not self._recipe.late_fix(fix):
+            self._fixes.refuse("too late")
 
     def _checked_start(self) -> Start:
         """A stream cannot be checked as a whole before it runs: its first second is."""
@@ -210,6 +266,11 @@ class Navigator:
                 "give specific force in m/s^2 with gravity left in, and rates in rad/s",
             )
         return start
+
+
+def _with_refused(health: Health, queue: FixQueue) -> Health:
+    waiting = {"waiting": len(queue)} if len(queue) else {}
+    return replace(health, fixes=health.fixes | queue.refused | waiting)
 
 
 def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,9 +18,15 @@ from scipy.stats import chi2
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import UpdateResult
+from stario.fusion.fixes import Fix, parts
+from stario.fusion.history import History, Step
+from stario.fusion.history import Measurement as Measurement
+from stario.fusion.innovations import InnovationLog
 from stario.fusion.intake import Epoch, IntakeCounts, Start
+from stario.fusion.rest import RestDetector, rest_measurement
 from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState
+from stario.fusion.world import KNOWN_YAW, WorldChange, WorldFrame
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -28,8 +36,8 @@ STILL_TILT_SIGMA = 0.01
 SMALLEST_SIGMA = 1e-6
 """What is known exactly is given this much, so that the covariance stays positive definite."""
 
-Measurement = tuple[FloatArray, FloatArray]
-"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
+_CHECKPOINT_SECONDS = 0.2
+"""A late fix takes at most this much more filtering than its own lateness [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +70,8 @@ class FilterRecipe:
         config: noise and filter settings.
         start: time and levelled attitude of the first sample.
         prior: what is known of the first pose; None starts level, at rest, at the origin.
-        keep_innovations: False for streams, whose memory must not grow.
+        streaming: True for streams: innovations are not kept, since memory must not grow, and the
+            last second is, since fixes may come late.
     """
 
     def __init__(
@@ -70,34 +79,63 @@ class FilterRecipe:
         config: NavigatorConfig,
         start: Start,
         prior: PriorPose | None = None,
-        keep_innovations: bool = True,
+        streaming: bool = False,
     ) -> None:
+        f = config.filter
         self._config = config
-        self._uses_clones = config.filter.measurement == "displacement"
+        self._uses_clones = f.measurement == "displacement"
         self.ekf = StateCloningEkf(
-            slots=config.filter.window_updates if self._uses_clones else 0, gravity=config.gravity
+            slots=f.window_updates if self._uses_clones else 0, gravity=config.gravity
         )
         self._slots: deque[int] = deque()
-        self._velocity_steps: deque[FloatArray] = deque(
-            maxlen=round(config.filter.output_rate * WINDOW_SECONDS)
+        per_window = round(f.output_rate * WINDOW_SECONDS)
+        self._velocity_steps: deque[FloatArray] = deque(maxlen=per_window)
+        self._gates = {n: float(chi2.ppf(f.gate, n)) for n in (3, 6)}
+        self._log = InnovationLog(keep_rows=not streaming)
+        self._rest = RestDetector(per_window, f.rest_noise)
+        self._world = WorldFrame(
+            placed=prior is not None,
+            oriented=prior is not None and prior.yaw_sigma <= KNOWN_YAW,
+            gate=f.gate,
         )
-        self._gate = float(chi2.ppf(config.filter.gate, 3))
-        self._log = _InnovationLog(keep_innovations)
+        every = max(1, round(_CHECKPOINT_SECONDS * f.output_rate))
+        self._history = History(every) if streaming else None
+        self._start = start.time
         self._initialise(start, prior)
 
-    def step(self, epoch: Epoch, measurement: Measurement | None) -> NavState:
-        """Move to the epoch's end and take in the measurement of the window that ends there."""
-        if epoch.gap:
-            self._forget_window()
-        ekf = self.ekf
-        before = ekf.v_W
-        ekf.propagate(segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config))
-        self._velocity_steps.append(ekf.v_W - before)
-        if measurement is not None:
-            self._update(epoch, measurement)
-        if self._uses_clones and (epoch.update or epoch.gap):
-            self._clone(epoch.stop)
+    def step(
+        self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
+    ) -> NavState:
+        """Move to the epoch's end and take in the measurement of the window that ends there.
+
+        Args:
+            epoch: that follows the one before.
+            measurement: None where no window ends, or nothing is known of it.
+            fixes: with times up to the epoch's end that were not given before, in order.
+        """
+        if self._history is not None:
+            before = self.checkpoint() if self._history.due() else None
+            self._history.add(Step(epoch, measurement, list(fixes), before))
+        self._step(epoch, measurement, fixes)
         return self.state(in_gap=epoch.gap)
+
+    def late_fix(self, fix: Fix) -> bool:
+        """Take in a fix at a time before now; False where it is more than a window late.
+
+        The state is then the one it would be had the fix come in time.
+        """
+        if self._history is None or fix.time < max(self._start, self.ekf.time - WINDOW_SECONDS):
+            return False
+        done = False
+        for step in self._history.insert(fix):
+            if not done:
+                assert step.before is not None  # the first one has it
+                self.rewind(step.before)
+            elif step.before is not None:
+                step.before = self.checkpoint()
+            self._step(step.epoch, step.measurement, step.fixes)
+            done = True
+        return done
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
@@ -111,15 +149,88 @@ class FilterRecipe:
             b_a=ekf.b_a,
             covariance=ekf.world_covariance(),
             in_gap=in_gap,
+            world=len(self._world.changes),
         )
+
+    @property
+    def world_changes(self) -> list[WorldChange]:
+        """How fixes moved and turned the world so far."""
+        return list(self._world.changes)
 
     def innovations(self) -> Innovations:
         """Every innovation so far."""
         return self._log.stacked()
 
-    def health(self, counts: IntakeCounts) -> Health:
-        """The report so far."""
-        return self._log.health(counts, self.state())
+    @property
+    def rests(self) -> int:
+        """How often the device was found at rest and held there."""
+        return self._log.rests.get("applied", 0)
+
+    def health(self, counts: IntakeCounts, state: NavState | None = None) -> Health:
+        """The report so far, with the sigmas of another estimator's state where one is given."""
+        return self._log.health(counts, state or self.state())
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that `rewind` needs: arrays, numbers, text, lists and dictionaries."""
+        return {
+            "ekf": self.ekf.checkpoint(),
+            "slots": list(self._slots),
+            "velocity_steps": list(self._velocity_steps),
+            "log": self._log.checkpoint(),
+            "rest": self._rest.checkpoint(),
+            "world": self._world.checkpoint(),
+        }
+
+    def rewind(self, checkpoint: dict[str, Any]) -> None:
+        """Go back to a checkpoint."""
+        self.ekf.rewind(checkpoint["ekf"])
+        self._slots = deque(checkpoint["slots"])
+        self._velocity_steps = deque(
+            checkpoint["velocity_steps"], maxlen=self._velocity_steps.maxlen
+        )
+        self._log.rewind(checkpoint["log"])
+        self._rest.rewind(checkpoint["rest"])
+        self._world.rewind(checkpoint["world"])
+
+    def _step(
+        self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
+    ) -> None:
+        if epoch.gap:
+            self._forget_window()
+        if not fixes:
+            self._propagate(epoch)
+        for piece, due in parts(epoch, fixes) if fixes else ():
+            if piece is not None:
+                self._propagate(piece)
+            for fix in due:
+                self._take_fix(fix)
+        if self._rest.at_rest(epoch):
+            self._hold_still(epoch)
+        if measurement is not None:
+            self._update(epoch, measurement)
+        if self._uses_clones and (epoch.update or epoch.gap):
+            self._clone(epoch.stop)
+
+    def _propagate(self, epoch: Epoch) -> None:
+        ekf = self.ekf
+        before = None if self._uses_clones else ekf.v_W
+        ekf.propagate(segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config))
+        if before is not None:
+            self._velocity_steps.append(ekf.v_W - before)
+
+    def _take_fix(self, fix: Fix) -> None:
+        result, change = self._world.apply(self.ekf, fix)
+        self._log.add_fix(result)
+        if change is not None:
+            turned = [change.R @ step for step in self._velocity_steps]
+            self._velocity_steps.clear()
+            self._velocity_steps.extend(turned)
+
+    def _hold_still(self, epoch: Epoch) -> None:
+        ekf = self.ekf
+        residual, blocks, covariance = rest_measurement(epoch, ekf.v_W, ekf.b_g, self._config.noise)
+        result = ekf.update_linear(residual, blocks, covariance, self._gates[6], "reject")
+        self._log.add_rest(result)
 
     def _initialise(self, start: Start, prior: PriorPose | None) -> None:
         f = self._config.filter
@@ -139,7 +250,7 @@ class FilterRecipe:
         # What is not finite is the filter's to refuse and count.
         with np.errstate(invalid="ignore"):
             result = self._offer(epoch, *measurement)
-        self._log.add(epoch.stop, self.ekf, result)
+        self._log.add(epoch.stop, result)
 
     def _offer(
         self, epoch: Epoch, displacement_N: FloatArray, covariance_N: FloatArray
@@ -149,12 +260,14 @@ class FilterRecipe:
             slot = self._slots[0]
             R_WN = yaw_between(self.ekf.clone_pose(slot)[0], epoch.R_NB_window)
             return self.ekf.update_displacement(
-                slot, None, R_WN @ displacement_N, R_WN @ covariance_N @ R_WN.T, self._gate
+                slot, None, R_WN @ displacement_N, R_WN @ covariance_N @ R_WN.T, self._gates[3]
             )
         R_WN = yaw_between(self.ekf.R_WB, epoch.R_NB)
         mean_W = R_WN @ displacement_N / WINDOW_SECONDS
         covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
-        return self.ekf.update_mean_velocity(mean_W + self._velocity_gain(), covariance, self._gate)
+        return self.ekf.update_mean_velocity(
+            mean_W + self._velocity_gain(), covariance, self._gates[3]
+        )
 
     def _velocity_gain(self) -> FloatArray:
         """Current velocity minus its mean over the window, from the IMU alone (trapezoids)."""
@@ -183,58 +296,3 @@ def yaw_between(R_WB: FloatArray, R_NB: FloatArray | None) -> FloatArray:
     norm = math.hypot(sine, cosine)
     s, c = (sine / norm, cosine / norm) if norm > 0.0 else (0.0, 1.0)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-class _InnovationLog:
-    """Innovations of the filter's updates and their statistics."""
-
-    def __init__(self, keep_rows: bool) -> None:
-        self._rows: list[tuple[float, ...]] = []
-        self._offered = self._gated = 0
-        self._refused: dict[str, int] = {}
-        self._nis_sum, self._nis_count = 0.0, 0
-        self._keep_rows = keep_rows
-
-    def add(self, time: float, ekf: StateCloningEkf, result: UpdateResult) -> None:
-        self._offered += 1
-        if not result.accepted:
-            self._refused[result.reason] = self._refused.get(result.reason, 0) + 1
-            return
-        gated = result.scale > 1.0
-        self._gated += gated
-        self._nis_sum += result.nis
-        self._nis_count += 1
-        if self._keep_rows:
-            residual = np.ravel(ekf.y)
-            sigma = np.sqrt(np.diag(ekf.S))
-            self._rows.append((time, *residual, *sigma, result.nis, float(gated)))
-
-    def stacked(self) -> Innovations:
-        table = np.array(self._rows).reshape(-1, 9)
-        return Innovations(
-            time=table[:, 0],
-            residual_W=table[:, 1:4],
-            sigma=table[:, 4:7],
-            nis=table[:, 7],
-            gated=table[:, 8] > 0.5,
-        )
-
-    def health(self, counts: IntakeCounts, state: NavState) -> Health:
-        sigma = np.sqrt(np.diag(state.covariance))
-        groups = {
-            "tilt_rad": sigma[0:2],
-            "yaw_rad": sigma[2:3],
-            "velocity_m_s": sigma[3:6],
-            "position_m": sigma[6:9],
-            "gyro_bias_rad_s": sigma[9:12],
-            "accel_bias_m_s2": sigma[12:15],
-        }
-        return Health(
-            samples=counts.samples(),
-            gaps=list(counts.gaps),
-            updates=self._offered,
-            gated=self._gated,
-            refused=dict(self._refused),
-            mean_nis=self._nis_sum / self._nis_count if self._nis_count else math.nan,
-            final_sigma={name: float(np.max(values)) for name, values in groups.items()},
-        )

@@ -25,6 +25,8 @@ class NavState:
         covariance: (15, 15) of rotation about the world's axes [rad], velocity, position, b_g, b_a;
             each error is true minus estimate.
         in_gap: True right after a stretch without samples.
+        world: how often fixes moved or turned the world before; states of different worlds must
+            not be compared.
     """
 
     time: float
@@ -35,6 +37,7 @@ class NavState:
     b_a: FloatArray
     covariance: FloatArray
     in_gap: bool = False
+    world: int = 0
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -73,8 +76,11 @@ class Health:
         refused: of these, how many were left out, by reason.
         mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
+        fixes: absolute fixes applied (of these gated), and left out by reason.
+        rests: measurements of rest (one per state at rest) applied, and left out by reason.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
+        notes: one line each on what else went on, such as a graph that fell back to the filter.
     """
 
     samples: dict[str, int] = field(default_factory=dict)
@@ -84,7 +90,10 @@ class Health:
     refused: dict[str, int] = field(default_factory=dict)
     mean_nis: float = float("nan")
     nis_expected: int = 3
+    fixes: dict[str, int] = field(default_factory=dict)
+    rests: dict[str, int] = field(default_factory=dict)
     final_sigma: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """The report for a person."""
@@ -97,8 +106,16 @@ class Health:
             f"updates {self.updates}, gated {share:.1%}, refused {self.refused or 'none'}, "
             f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
         )
+        if self.fixes:
+            text.append(f"fixes {_counted(self.fixes)}")
+        if self.rests:
+            text.append(f"at rest {_counted(self.rests)}")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
-        return [*text, f"final sigma: {sigma}"]
+        return [*text, f"final sigma: {sigma}", *self.notes]
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{reason} {n}" for reason, n in counts.items())
 
 
 @dataclass(frozen=True, eq=False)

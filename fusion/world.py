@@ -1,0 +1,184 @@
+"""Which world a track is in: its start's own, until fixes say where it is and how it is turned.
+
+A track that starts without a pose calls its first position zero and its first yaw zero: that is its
+world. The first position fix moves this world so that the track passes through the fix; what is
+known of the absolute position is then the fix's covariance. The first fix that tells the direction
+turns it about that point: a second position far enough away, a velocity, or a heading. Neither is
+a small correction, so neither goes through the filter's linearisation: the world is moved and
+turned exactly (the right-invariant error turns with it), then the filter is told that this shift or
+turn was not known at all, then the fix is an ordinary measurement.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.engine import UpdateResult
+from stario.fusion.fixes import Fix
+from stario.fusion.jacobians import yaw_twist
+from stario.fusion.lie import FloatArray, skew
+from stario.fusion.state import NavState
+
+UNKNOWN_YAW = math.pi / math.sqrt(3.0)
+"""Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
+
+KNOWN_YAW = 0.5
+"""A first yaw given to better than this [rad] is kept; a coarser one is left to the fixes."""
+
+FAR_ENOUGH = 0.3
+"""Two positions tell the yaw when it is then known to this [rad]; half its square, what the
+linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
+
+_MUCH_LARGER = 1e3
+"""An unknown shift is this many times what the measurement leaves of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorldChange:
+    """A new world: p <- R p + shift.
+
+    Attributes:
+        time: of the fix that told it [s].
+        R: (3, 3) rotation about the vertical.
+        shift: (3,) [m].
+        pivot: (3,) the point of the new world that a wrong turn would leave where it is [m].
+        yaw_sigma: of the turn [rad].
+        position_covariance: (3, 3) of the shift [m^2].
+    """
+
+    time: float
+    R: FloatArray
+    shift: FloatArray
+    pivot: FloatArray
+    yaw_sigma: float = 0.0
+    position_covariance: FloatArray | None = None
+
+
+class WorldFrame:
+    """Applies fixes to a filter, and moves and turns the filter's world where it must.
+
+    Args:
+        placed: whether the first position was given.
+        oriented: whether the first yaw was given.
+        gate: probability of the chi-square test.
+    """
+
+    def __init__(self, placed: bool, oriented: bool, gate: float) -> None:
+        self.placed, self.oriented = placed, oriented
+        self.changes: list[WorldChange] = []
+        self._pivot = np.zeros(3)
+        self._gates = {n: float(chi2.ppf(gate, n)) for n in (1, 3)}
+
+    def apply(self, ekf: StateCloningEkf, fix: Fix) -> tuple[UpdateResult, WorldChange | None]:
+        """Take in a fix at the filter's time; also the change of world it brought."""
+        change = None
+        if fix.kind == "position" and not self.placed:
+            change = self._place(ekf, fix)
+        elif not self.oriented:
+            change = self._orient(ekf, fix)
+            if change is None:
+                return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known"), None
+        result = self._update(ekf, fix)
+        if change is None:
+            return result, None
+        P = ekf.world_covariance()
+        change = replace(
+            change,
+            yaw_sigma=math.sqrt(P[2, 2]) if self.oriented else 0.0,
+            position_covariance=P[6:9, 6:9] if not self.oriented else np.zeros((3, 3)),
+        )
+        self.changes.append(change)
+        return result, change
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that `rewind` needs."""
+        return {
+            "placed": self.placed,
+            "oriented": self.oriented,
+            "pivot": self._pivot,
+            "changes": [vars(change) for change in self.changes],
+        }
+
+    def rewind(self, checkpoint: dict[str, Any]) -> None:
+        """Go back to a checkpoint."""
+        self.placed, self.oriented = checkpoint["placed"], checkpoint["oriented"]
+        self._pivot = checkpoint["pivot"]
+        self.changes = [WorldChange(**change) for change in checkpoint["changes"]]
+
+    def _place(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange:
+        shift = fix.value - ekf.p_W
+        ekf.move_world(np.eye(3), shift)
+        left = np.trace(fix.covariance) + np.trace(ekf.world_covariance()[6:9, 6:9])
+        ekf.loosen_position(_MUCH_LARGER * math.sqrt(left))
+        self.placed, self._pivot = True, fix.value
+        return WorldChange(fix.time, np.eye(3), shift, fix.value)
+
+    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange | None:
+        turn, sigma = self._turn(ekf, fix)
+        if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "heading")):
+            return None
+        c, s = math.cos(turn), math.sin(turn)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        shift = self._pivot - R @ self._pivot
+        ekf.move_world(R, shift)
+        ekf.loosen_yaw(self._pivot, UNKNOWN_YAW)
+        self.oriented = True
+        return WorldChange(fix.time, R, shift, self._pivot)
+
+    def _turn(self, ekf: StateCloningEkf, fix: Fix) -> tuple[float, float]:
+        """Turn of the world a fix asks for, and how well it tells it [rad]."""
+        if fix.kind == "heading":
+            yaw = yaw_twist(ekf.R_WB)
+            return float(fix.value[0]) - yaw, math.sqrt(fix.covariance[0, 0])
+        first, seen, ours = 3, fix.value, ekf.v_W
+        if fix.kind == "position":
+            first, seen, ours = 6, fix.value - self._pivot, ekf.p_W - self._pivot
+        P = ekf.world_covariance()[first : first + 2, first : first + 2]
+        arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
+        across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
+        turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
+        return turn, across / arm if arm > 0.0 else math.inf
+
+    def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+        gate = self._gates[len(fix.value)]
+        if fix.kind == "position":
+            return ekf.update_position_W(fix.value, fix.covariance, gate)
+        if fix.kind == "velocity":
+            return ekf.update_velocity_W(fix.value, fix.covariance, gate)
+        return ekf.update_heading(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+
+
+def in_last_world(states: list[NavState], changes: list[WorldChange]) -> list[NavState]:
+    """States of a track with every one of them given in the world the track ends in.
+
+    What is not known of a change is added to the covariance of the states before it, as if it were
+    independent of theirs; that is on the safe side, for the fix saw the track's own errors too.
+    """
+    for change in changes:
+        states = [state if state.time >= change.time else _moved(state, change) for state in states]
+    return states
+
+
+def _moved(state: NavState, change: WorldChange) -> NavState:
+    R = change.R
+    v_W, p_W = R @ state.v_W, R @ state.p_W + change.shift
+    A = np.eye(15)
+    for first in (0, 3, 6):
+        A[first : first + 3, first : first + 3] = R
+    covariance = A @ state.covariance @ A.T
+    turn = np.zeros((15, 1))
+    turn[2] = 1.0
+    turn[3:6, 0] = skew(v_W) @ [0.0, 0.0, -1.0]
+    turn[6:9, 0] = skew(p_W - change.pivot) @ [0.0, 0.0, -1.0]
+    covariance += change.yaw_sigma**2 * (turn @ turn.T)
+    if change.position_covariance is not None:
+        covariance[6:9, 6:9] += change.position_covariance
+    return replace(
+        state, R_WB=R @ state.R_WB, v_W=v_W, p_W=p_W, covariance=covariance, world=state.world + 1
+    )

@@ -1,0 +1,399 @@
+"""Absolute fixes: in time, late or ahead, in stream and batch, and the world they tell."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.fusion import Navigator, NavState, PriorPose, Track
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.fixes import Fix, cut, heading_fix, position_fix, read_fixes, velocity_fix
+from stario.fusion.intake import all_epochs
+from stario.fusion.jacobians import (
+    heading_jacobian,
+    position_jacobian,
+    velocity_jacobian,
+    yaw_twist,
+)
+from stario.fusion.lie import exp_se23, exp_so3
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulate import ImuErrors
+
+NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
+ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
+FILTER = FilterConfig(
+    update_rate=1,
+    covariance_scale=1.0,
+    gyro_bias_sigma=3e-3,
+    accel_bias_sigma=0.05,
+    accel_motion_noise=0.0,
+)
+CONFIG = NavigatorConfig(noise=NOISE, filter=FILTER)
+VELOCITY = NavigatorConfig(
+    noise=NOISE, filter=FilterConfig(update_rate=10, measurement="velocity", covariance_scale=1.0)
+)
+EYE = np.eye(3)
+
+Make = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def walk(make_walk: Make) -> ImuSequence:
+    return make_walk(7, 30.0, 100.0, ERRORS)
+
+
+@pytest.fixture(scope="module")
+def model(walk: ImuSequence, make_oracle: Make) -> Any:
+    return make_oracle(walk, walk.truth, CONFIG)
+
+
+def truth_at(walk: ImuSequence, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Position, velocity and yaw."""
+    known = walk.truth.at(np.array([time]))
+    return known.position_W[0], known.velocity_W[0], float(yaw_of(known.attitude_WB)[0])
+
+
+def fixes_of(walk: ImuSequence) -> list[Fix]:
+    """Fixes of every kind, between and at the times of states and measurements."""
+    p, v, yaw = zip(*(truth_at(walk, t) for t in (5.03, 12.0, 20.377)), strict=True)
+    return [
+        position_fix(5.03, p[0], 0.01 * EYE),
+        heading_fix(12.0, yaw[1], 0.05),
+        velocity_fix(20.377, v[2], 0.01 * EYE),
+        position_fix(20.377, p[2], 0.04 * EYE),
+    ]
+
+
+def give(navigator: Navigator, fix: Fix) -> None:
+    if fix.kind == "position":
+        navigator.update_position(fix.time, fix.value, fix.covariance)
+    elif fix.kind == "velocity":
+        navigator.update_velocity(fix.time, fix.value, fix.covariance)
+    else:
+        navigator.update_heading(fix.time, fix.value[0], float(np.sqrt(fix.covariance[0, 0])))
+
+
+def streamed(navigator: Navigator, walk: ImuSequence, fixes: list[Fix], late: float) -> NavState:
+    """The last state of a stream that hears of each fix `late` seconds after its time."""
+    waiting = sorted(fixes, key=lambda fix: fix.time)
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        while waiting and row[0] >= waiting[0].time + late:
+            give(navigator, waiting.pop(0))
+        navigator.push(*row)
+    return navigator.state
+
+
+def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
+    k = int(np.searchsorted(track.time, state.time - 1e-6))
+    assert track.time[k] == pytest.approx(state.time)
+    np.testing.assert_allclose(state.p_W, track.trajectory.position_W[k], atol=atol)
+    np.testing.assert_allclose(state.v_W, track.trajectory.velocity_W[k], atol=atol)
+    np.testing.assert_allclose(state.R_WB, track.trajectory.attitude_WB[k].as_matrix(), atol=atol)
+    np.testing.assert_allclose(state.covariance, track.covariance[k], atol=atol)
+
+
+# --- Jacobians -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["position", "velocity", "heading"])
+@pytest.mark.parametrize("seed", range(4))
+def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tilt = Rotation.from_rotvec([*rng.normal(0.0, 0.8, 2), 0.0])
+    R = (about_z(rng.uniform(-3.0, 3.0)) * tilt).as_matrix()
+    v, p = rng.normal(0.0, 2.0, 3), rng.normal(0.0, 20.0, 3)
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        turn, shift_v, shift_p = exp_se23(error)
+        if kind == "position":
+            return turn @ p + shift_p
+        return turn @ v + shift_v if kind == "velocity" else np.array([yaw_twist(turn @ R)])
+
+    step, H = 1e-6, np.zeros((1 if kind == "heading" else 3, 9))
+    jacobian = {
+        "position": lambda: position_jacobian(p),
+        "velocity": lambda: velocity_jacobian(v),
+        "heading": lambda: heading_jacobian(R),
+    }[kind]()
+    for first, block in jacobian:
+        H[:, first : first + block.shape[1]] = block
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(9)], axis=1
+    )
+    np.testing.assert_allclose(H, numeric, atol=1e-7 * max(1.0, np.abs(numeric).max()))
+
+
+def test_yaw_is_that_of_the_recordings_and_undefined_upside_down() -> None:
+    attitude = Rotation.random(50, rng=np.random.default_rng(0))
+    ours = np.array([yaw_twist(R) for R in attitude.as_matrix()])
+    known = np.isfinite(ours)
+    assert known.sum() > 45
+    off = ours[known] - yaw_of(attitude[known])
+    np.testing.assert_allclose(np.sin(off), 0.0, atol=1e-9)
+    assert np.isnan(yaw_twist(exp_so3(np.array([np.pi, 0.0, 0.0]))))
+
+
+# --- time ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [CONFIG, VELOCITY], ids=["displacement", "velocity"])
+@pytest.mark.parametrize("late", [-3.0, 0.0, 0.3, 0.85])
+def test_a_fix_counts_at_its_own_time_however_late(
+    walk: ImuSequence, make_oracle: Make, config: NavigatorConfig, late: float
+) -> None:
+    model, fixes = make_oracle(walk, walk.truth, config), fixes_of(walk)
+    track = Navigator(model, config).run(walk, fixes=fixes)
+    navigator = Navigator(model, config)
+    state = streamed(navigator, walk, fixes, late)
+    assert_same(state, track)
+    assert state.world == 2
+    assert navigator.health.fixes["applied"] == track.health.fixes["applied"] == 4
+    assert navigator.health.updates == track.health.updates
+    assert navigator.health.mean_nis == pytest.approx(track.health.mean_nis)
+    assert navigator.health.rests == track.health.rests
+
+
+def test_older_fixes_are_refused_and_counted(walk: ImuSequence, model: Any) -> None:
+    untouched, navigator = Navigator(model, CONFIG), Navigator(model, CONFIG)
+    streamed(untouched, walk, [], 0.0)
+    streamed(navigator, walk, fixes_of(walk), 1.6)
+    assert navigator.health.fixes == {"too late": 4}
+    np.testing.assert_array_equal(navigator.state.p_W, untouched.state.p_W)
+    before, after = (position_fix(t, np.zeros(3), EYE) for t in (walk.time[0] - 1.0, 1e6))
+    track = Navigator(model, CONFIG).run(walk, fixes=[after, before])
+    assert track.health.fixes == {"before the start": 1, "after the end": 1}
+
+
+def test_fixes_of_the_future_wait(walk: ImuSequence, model: Any) -> None:
+    navigator = Navigator(model, CONFIG)
+    for fix in reversed(fixes_of(walk)):
+        give(navigator, fix)
+    give(navigator, position_fix(walk.time[-1] + 60.0, np.zeros(3), EYE))
+    assert navigator.health.fixes == {"waiting": 5}
+    state = streamed(navigator, walk, [], 0.0)
+    assert navigator.health.fixes == {"applied": 4, "waiting": 1}
+    assert_same(state, Navigator(model, CONFIG).run(walk, fixes=fixes_of(walk)))
+
+
+def test_an_epoch_cut_in_two_says_the_same(walk: ImuSequence) -> None:
+    epoch = next(e for e in all_epochs(walk, CONFIG)[0] if e.window is not None)
+    for time in (epoch.start + 0.033, float(epoch.time[4]), epoch.stop - 1e-4):
+        first, second = cut(epoch, time)
+        assert first.stop == second.start == time
+        assert first.window is None
+        assert second.window is epoch.window
+        for name in ("gyro", "accel"):
+            whole = np.trapezoid(getattr(epoch, name), epoch.time, axis=0)
+            halves = [np.trapezoid(getattr(e, name), e.time, axis=0) for e in (first, second)]
+            np.testing.assert_allclose(sum(halves), whole, atol=1e-12)
+
+
+# --- the world -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, np.pi, -2.5])
+def test_two_positions_tell_where_a_track_is_and_how_it_is_turned(
+    walk: ImuSequence, model: Any, turn: float
+) -> None:
+    """The fixes' world is turned and shifted against the walk's by any amount."""
+    R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
+    fixes = [
+        position_fix(t, R @ truth_at(walk, t)[0] + shift, 1e-4 * EYE)
+        for t in (4.0, 6.0, 28.0, 29.6)
+    ]
+    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
+    error = track.trajectory.position_W - (truth.position_W @ R.T + shift)
+    assert np.linalg.norm(error[-1]) < 0.05  # half a second after a fix of 1 cm
+    assert np.linalg.norm(error, axis=1).max() < 0.5
+    yaw = yaw_of(about_z(turn) * truth.attitude_WB) - yaw_of(track.trajectory.attitude_WB)
+    assert abs(np.sin(yaw[-1])) < 0.05
+    assert track.health.fixes["applied"] >= 3
+    assert np.linalg.norm(np.diff(track.trajectory.position_W, axis=0), axis=1).max() < 0.4
+
+
+def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> None:
+    position, yaw = [], []
+    for seed in range(12):
+        walk = make_walk(seed, 30.0, 50.0, ERRORS)
+        rng = np.random.default_rng(seed)
+        oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05, seed=seed)
+        turn = about_z(rng.uniform(-np.pi, np.pi))
+        fixes = [
+            position_fix(t, turn.apply(truth_at(walk, t)[0]) + rng.normal(0.0, 0.2, 3), 0.04 * EYE)
+            for t in (3.0, 25.0)
+        ]
+        track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
+        if track.health.fixes != {"applied": 2}:
+            continue  # hardly moved
+        truth = walk.truth.at(track.time[-1:].clip(0.0, walk.time[-1]))
+        off = turn.apply(truth.position_W[0]) - track.trajectory.position_W[-1]
+        turned = turn * truth.attitude_WB * track.trajectory.attitude_WB[-1:].inv()
+        P = track.covariance[-1]
+        position.append(off @ np.linalg.solve(P[6:9, 6:9], off))
+        yaw.append(turned.as_rotvec()[0, 2] ** 2 / P[2, 2])
+    assert len(position) >= 8
+    assert 1.2 < np.mean(position) < 6.0  # expected 3
+    assert 0.25 < np.mean(yaw) < 2.5  # expected 1
+
+
+@pytest.mark.parametrize("kind", ["heading", "velocity"])
+def test_a_heading_or_a_velocity_tells_the_yaw_too(
+    walk: ImuSequence, model: Any, kind: str
+) -> None:
+    turn = about_z(2.0)
+    fixes = []
+    for t in (8.0, 20.0):
+        p, v, yaw = truth_at(walk, t)
+        fixes += [position_fix(t, turn.apply(p), 0.01 * EYE)]
+        if kind == "heading":
+            fixes += [heading_fix(t, yaw + 2.0 - 2.0 * np.pi, 0.02)]
+        else:
+            fixes += [velocity_fix(t, turn.apply(v), 1e-4 * EYE)]
+    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    assert track.health.fixes["applied"] >= 3  # a velocity does not tell it at any speed
+    truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
+    off = turn.apply(truth.position_W) - track.trajectory.position_W
+    assert np.linalg.norm(off, axis=1).max() < 1.0
+
+
+def test_a_known_start_is_corrected_and_not_moved(walk: ImuSequence, model: Any) -> None:
+    first = walk.truth.at(walk.time[:1])
+    prior = PriorPose(first.attitude_WB[0].as_matrix(), first.velocity_W[0], first.position_W[0])
+    p = truth_at(walk, 25.0)[0]
+    truth = walk.truth.position_W[-1]
+    for off, sigma, counts in (
+        (0.0, 1.0, {"applied": 1}),
+        (3.0, 0.01, {"applied": 1, "gated": 1}),
+    ):
+        fix = position_fix(25.0, [*p[:2], p[2] + off], sigma**2 * EYE)
+        track = Navigator(model, CONFIG, prior).run(walk, fixes=[fix])
+        assert track.health.fixes == counts
+        error = track.trajectory.position_W[-1] - truth
+        assert np.linalg.norm(error) < 0.5 + 0.8 * off
+
+
+def test_too_near_positions_do_not_turn_the_world(walk: ImuSequence, model: Any) -> None:
+    fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
+    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    assert track.health.fixes == {"applied": 1, "yaw not known": 2}
+
+
+def test_states_of_a_stream_say_which_world_they_are_in(walk: ImuSequence, model: Any) -> None:
+    navigator, worlds = Navigator(model, CONFIG), []
+    for fix in fixes_of(walk):
+        give(navigator, fix)
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        state = navigator.push(*row)
+        if state is not None:
+            worlds.append((state.time, state.world))
+    changed = [t for (t, w), (_, before) in zip(worlds[1:], worlds, strict=False) if w > before]
+    assert changed == pytest.approx([5.1, 12.0], abs=1e-6)
+
+
+# --- bad fixes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "covariance", "reason"),
+    [
+        ([np.nan, 0, 0], EYE, "value that is not finite"),
+        ([0, np.inf, 0], EYE, "value that is not finite"),
+        ([0, 0, 0], np.nan * EYE, "value that is not finite"),
+        ([0, 0, 0], -EYE, "covariance not positive definite"),
+        ([0, 0, 0], np.ones((3, 3)), "covariance not positive definite"),
+        ([0, 0, 0], np.triu(np.ones((3, 3))), "covariance not positive definite"),
+    ],
+)
+def test_fixes_without_meaning_are_refused_and_counted(
+    walk: ImuSequence, model: Any, value: list[float], covariance: np.ndarray, reason: str
+) -> None:
+    bad = position_fix(5.0, value, covariance)
+    assert Navigator(model, CONFIG).run(walk, fixes=[bad]).health.fixes == {reason: 1}
+    navigator = Navigator(model, CONFIG)
+    streamed(navigator, walk.slice(0.0, 6.0), [bad], 0.2)
+    assert navigator.health.fixes == {reason: 1}
+    assert np.isfinite(navigator.state.covariance).all()
+
+
+def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
+    navigator = Navigator(model, CONFIG)
+    streamed(navigator, walk.slice(0.0, 3.0), [], 0.0)
+    for time in (np.nan, np.inf):
+        navigator.update_heading(time, 0.0, 0.1)
+    navigator.update_heading(2.5, np.inf, 0.1)
+    navigator.update_heading(2.5, 0.0, np.nan)
+    assert navigator.health.fixes == {"value that is not finite": 4}
+
+
+def test_a_shape_that_does_not_fit_is_an_error_by_name(model: Any) -> None:
+    navigator = Navigator(model, CONFIG)
+    with pytest.raises(InputError, match="position"):
+        navigator.update_position(0.0, [1.0, 2.0], EYE)
+    with pytest.raises(InputError, match="covariance"):
+        navigator.update_velocity(0.0, np.zeros(3), np.ones(3))
+    with pytest.raises(InputError, match="yaw"):
+        navigator.update_heading(0.0, "north", 0.1)  # type: ignore[arg-type]
+
+
+def test_a_fix_stated_as_exact_has_a_floor(walk: ImuSequence, model: Any) -> None:
+    p = truth_at(walk, 10.0)[0]
+    track = Navigator(model, CONFIG).run(walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)])
+    assert track.health.fixes == {"applied": 1}
+    assert np.isfinite(track.covariance).all()
+    assert np.linalg.eigvalsh(track.covariance).min() > -1e-9
+
+
+# --- file ------------------------------------------------------------------------------------
+
+HEADER = "t,kind,x,y,z,sx,sy,sz\n"
+
+
+def test_a_file_of_fixes(tmp_path: Path) -> None:
+    path = tmp_path / "fixes.csv"
+    path.write_text(
+        HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,heading,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
+        encoding="utf-8",
+    )
+    position, heading, velocity = read_fixes(path)
+    assert (position.kind, heading.kind, velocity.kind) == ("position", "heading", "velocity")
+    assert (position.time, heading.time) == (1.5, 2.0)
+    np.testing.assert_allclose(position.value, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(position.covariance, np.diag([0.01, 0.01, 0.09]))
+    np.testing.assert_allclose(heading.covariance, [[0.0025]])
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "line 1.*header"),
+        ("time,kind\n", "line 1.*header"),
+        (HEADER + "1,altitude,1,2,3,1,,\n", "line 2, kind.*altitude"),
+        (HEADER + "1,position,1,2,3,1,,\nx,position,1,2,3,1,,\n", "line 3, t"),
+        (HEADER + "1,position,1,2,,1,,\n", "line 2, z"),
+        (HEADER + "1,position,1,2,3,,,\n", "line 2, sx"),
+        (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
+        (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
+        (HEADER + "1,position,1,2,3,1,1,1,1\n", "9 values"),
+    ],
+)
+def test_a_file_that_does_not_fit_names_line_and_field(
+    tmp_path: Path, text: str, match: str
+) -> None:
+    path = tmp_path / "fixes.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ReadError, match=match) as caught:
+        read_fixes(path)
+    assert "fixes.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(ReadError, match="fixes"):
+        read_fixes(tmp_path / "fixes.csv")
