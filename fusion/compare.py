@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.fixes import Fix
 from stario.fusion.navigator import Navigator, Predictor, Progress
 from stario.fusion.state import Track
 from stario.fusion.tracks import inertial_track, network_track, network_track_true_attitude
@@ -88,8 +90,9 @@ def compare(
     sequence: ImuSequence,
     config: NavigatorConfig,
     progress: Progress = lambda share: None,
+    fixes: Sequence[Fix] = (),
 ) -> Comparison:
-    """Every track of a recording; the network sees each window once.
+    """Every track of a recording; the network sees each window once, the EKF the fixes too.
 
     Raises:
         InputError: the recording is too short, or its units or rate are wrong.
@@ -105,7 +108,7 @@ def compare(
             tracks["network_true_attitude"] = network_track_true_attitude(model, sequence, config)
         except InputError as error:
             log.warning("no track with true attitude: %s", error)
-    tracks["ekf"] = navigator.track(observed, progress)
+    tracks["ekf"] = navigator.track(observed, progress, fixes)
     metrics = {name: measure(track, sequence.truth) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics)
 

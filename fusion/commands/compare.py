@@ -9,6 +9,7 @@ import typer
 
 from stario.fusion.commands.common import (
     Estimating,
+    FixesOption,
     JsonOption,
     OutOption,
     PathsArgument,
@@ -20,6 +21,7 @@ from stario.fusion.commands.common import (
     progress_bar,
     track_table,
 )
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.compare import Comparison
@@ -30,12 +32,14 @@ def compare(
     reading: Reading,
     estimating: Estimating,
     paths: PathsArgument = None,
+    fixes: FixesOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial alone, network alone, EKF. Without PATH: a simulated walk."""
     from stario.fusion.compare import compare as compare_tracks
     from stario.fusion.compare import demonstration
+    from stario.fusion.fixes import read_fixes
     from stario.fusion.results import comparison_dict, write_comparison
 
     settings, network = estimating.settings(), estimating.network()
@@ -45,10 +49,13 @@ def compare(
     else:
         typer.echo("demonstration: a simulated walk that training never saw", err=True)
         sequences = [demonstration()]
+    if fixes is not None and len(sequences) > 1:
+        raise InputError("--fixes", f"{len(sequences)} recordings", "one recording")
+    known = [] if fixes is None else read_fixes(fixes)
     comparisons = []
     for sequence in sequences:
         with progress_bar(f"compare {sequence.name}") as progress:
-            comparisons.append(compare_tracks(network, sequence, settings, progress))
+            comparisons.append(compare_tracks(network, sequence, settings, progress, known))
     folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings)
     if as_json:

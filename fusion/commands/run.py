@@ -9,6 +9,7 @@ import typer
 
 from stario.fusion.commands.common import (
     Estimating,
+    FixesOption,
     JsonOption,
     OutOption,
     Reading,
@@ -24,19 +25,22 @@ def run(
     path: Annotated[Path, typer.Argument(help="A recording: a file, or a recording's folder.")],
     reading: Reading,
     estimating: Estimating,
+    fixes: FixesOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fuse one recording into a track with attitude, velocity, biases and covariance."""
     from stario.fusion.compare import measure
+    from stario.fusion.fixes import read_fixes
     from stario.fusion.navigator import Navigator
     from stario.fusion.results import write_run
     from stario.sequences.metrics import align
 
     settings, network = estimating.settings(), estimating.network()
     sequence = reading.read(path)
+    known = [] if fixes is None else read_fixes(fixes)
     with progress_bar(f"run {sequence.name}") as progress:
-        track = Navigator(network, settings).run(sequence, progress)
+        track = Navigator(network, settings).run(sequence, progress, known)
     truth = sequence.truth
     metrics = measure(track, truth)
     folder = out or Path("runs") / sequence.name
