@@ -51,8 +51,8 @@ class FilterConfig:
             [m/s^2/sqrt(Hz) per m/s^2].
         gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
         gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
-        rest_noise: factor on a consumer sensor's densities (`ImuNoise()`) within which a second of
-            samples counts as rest; 0 never does.
+        rest_noise: factor on the white noise of a phone's IMU within which a second of samples
+            counts as rest (`rest`); 0 never does.
     """
 
     update_rate: int = 1
@@ -68,7 +68,7 @@ class FilterConfig:
     accel_motion_noise: float = 0.12
     gap_gyro_noise: float = 0.3
     gap_accel_noise: float = 1.0
-    rest_noise: float = 1.0
+    rest_noise: float = 2.0
 
     def __post_init__(self) -> None:
         if self.update_rate not in UPDATE_RATES:

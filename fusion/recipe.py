@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -23,7 +23,7 @@ from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
 from stario.fusion.innovations import InnovationLog
 from stario.fusion.intake import Epoch, IntakeCounts, Start
-from stario.fusion.rest import RestDetector, rest_measurement
+from stario.fusion.rest import RestDetector
 from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState
 from stario.fusion.world import KNOWN_YAW, WorldChange, WorldFrame
@@ -63,6 +63,15 @@ class PriorPose:
     position_sigma: float = 1e-3
 
 
+class Held(NamedTuple):
+    """A measurement of rest that the filter accepted: it stood still, and read only its bias."""
+
+    b_g: FloatArray
+    """(3,) mean rate [rad/s]."""
+    covariance: FloatArray
+    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; once per epoch, so wide as that."""
+
+
 class FilterRecipe:
     """The state-cloning EKF driven by epochs.
 
@@ -72,6 +81,10 @@ class FilterRecipe:
         prior: what is known of the first pose; None starts level, at rest, at the origin.
         streaming: True for streams: innovations are not kept, since memory must not grow, and the
             last second is, since fixes may come late.
+
+    Attributes:
+        ekf: the filter.
+        held: what the last step measured at rest, None where it moved or was refused.
     """
 
     def __init__(
@@ -93,6 +106,7 @@ class FilterRecipe:
         self._gates = {n: float(chi2.ppf(f.gate, n)) for n in (3, 6)}
         self._log = InnovationLog(keep_rows=not streaming)
         self._rest = RestDetector(per_window, f.rest_noise)
+        self.held: Held | None = None
         self._world = WorldFrame(
             placed=prior is not None,
             oriented=prior is not None and prior.yaw_sigma <= KNOWN_YAW,
@@ -161,11 +175,6 @@ class FilterRecipe:
         """Every innovation so far."""
         return self._log.stacked()
 
-    @property
-    def rests(self) -> int:
-        """How often the device was found at rest and held there."""
-        return self._log.rests.get("applied", 0)
-
     def health(self, counts: IntakeCounts, state: NavState | None = None) -> Health:
         """The report so far, with the sigmas of another estimator's state where one is given."""
         return self._log.health(counts, state or self.state())
@@ -204,8 +213,7 @@ class FilterRecipe:
                 self._propagate(piece)
             for fix in due:
                 self._take_fix(fix)
-        if self._rest.at_rest(epoch):
-            self._hold_still(epoch)
+        self.held = self._hold_still() if self._rest.at_rest(epoch) else None
         if measurement is not None:
             self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
@@ -226,11 +234,13 @@ class FilterRecipe:
             self._velocity_steps.clear()
             self._velocity_steps.extend(turned)
 
-    def _hold_still(self, epoch: Epoch) -> None:
-        ekf = self.ekf
-        residual, blocks, covariance = rest_measurement(epoch, ekf.v_W, ekf.b_g, self._config.noise)
+    def _hold_still(self) -> Held | None:
+        ekf, noise = self.ekf, self._config.noise
+        b_g = ekf.b_g
+        residual, blocks, covariance = self._rest.measurement(ekf.v_W, b_g, noise)
         result = ekf.update_linear(residual, blocks, covariance, self._gates[6], "reject")
         self._log.add_rest(result)
+        return Held(residual[3:] + b_g, covariance) if result.accepted else None
 
     def _initialise(self, start: Start, prior: PriorPose | None) -> None:
         f = self._config.filter

@@ -1,13 +1,15 @@
-"""Rest: when nothing but the sensor's own noise is in the samples, velocity and rate are zero.
+"""Rest: when little but a sensor's own noise is in the samples, velocity and rate are zero.
 
-Over the last second the scatter of both sensors is held against the white noise of a consumer
-sensor (`ImuNoise()`); a hand's tremor or a trolley's wheels exceed it. The filter's own densities
-are no measure here: they stand for errors of scale and alignment, which only motion brings. That
-an even glide looks like rest as well is left to the measurement's own chi-square test against the
-filter's velocity, by which it is refused and not inflated.
+Over the last second the scatter of both sensors is held against the white noise of a phone's IMU
+(`PHONE_IMU`), which a hand's tremor or a trolley's wheels exceed. The filter's own densities are no
+measure here: they stand for errors of scale and alignment, which only motion brings. That an even
+glide looks like rest as well is left to the measurement's own chi-square test against the filter's
+velocity and bias, by which it is refused and not inflated.
 
-Zero velocity is measured in the estimated axes, so that it says nothing of yaw. Zero rate is the
-mean rate of the samples, and measures the gyroscope's bias.
+Zero velocity is measured in the estimated axes, so that it says nothing of yaw. The mean rate in
+the middle of the second measures the gyroscope's bias; both its halves are at rest, so that a
+beginning motion is not taken for bias. What turns too slowly to be told from bias shows in how the
+means of the second's parts differ, and their variance is the measurement's, for the whole second.
 
 Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
 sensors); the scatter about the mean replaces their known gravity and bias.
@@ -24,10 +26,8 @@ from stario.fusion.intake import Epoch
 from stario.fusion.jacobians import Block
 from stario.fusion.lie import FloatArray
 from stario.sequences.noise import ImuNoise
+from stario.sequences.simulate import PHONE_IMU
 from stario.sequences.windows import WINDOW_SECONDS
-
-CONSUMER_SENSOR = ImuNoise()
-"""Densities of a consumer sensor that lies still."""
 
 _QUANTILE = 3.0902
 """Of the normal distribution at 0.999: how rarely a resting sensor looks as if it moved."""
@@ -38,7 +38,7 @@ class RestDetector:
 
     Args:
         epochs: in a second.
-        scale: factor on the densities of a consumer sensor; 0 never detects.
+        scale: factor on the densities of a phone's IMU; 0 never detects.
     """
 
     def __init__(self, epochs: int, scale: float) -> None:
@@ -66,9 +66,33 @@ class RestDetector:
         bound = self._scale**2 * count / seconds * _chi2_quantile(freedom)
         gyro, accel = float(scatter[:3].sum()), float(scatter[3:].sum())
         return (
-            gyro <= bound * CONSUMER_SENSOR.gyro_noise**2
-            and accel <= bound * CONSUMER_SENSOR.accel_noise**2
+            gyro <= bound * PHONE_IMU.noise.gyro_noise**2
+            and accel <= bound * PHONE_IMU.noise.accel_noise**2
         )
+
+    def measurement(
+        self, v_W: FloatArray, b_g: FloatArray, noise: ImuNoise
+    ) -> tuple[FloatArray, list[Block], FloatArray]:
+        """Residual (6,), Jacobian and covariance of zero velocity and zero rate.
+
+        The velocity is as uncertain as what white noise of the accelerometer hides over the second.
+        Both are measured once per epoch and count once per second.
+
+        Args:
+            v_W: (3,) estimated velocity [m/s].
+            b_g: (3,) estimated bias [rad/s].
+            noise: densities the filter assumes.
+        """
+        epochs = len(self._sums)
+        table = np.array(self._sums)
+        rates = table[:, 2:5] / table[:, :1]
+        seconds = float(table[:, 1].mean())
+        hidden = max(noise.accel_noise, PHONE_IMU.noise.accel_noise) ** 2 * WINDOW_SECONDS
+        white = PHONE_IMU.noise.gyro_noise**2 / seconds
+        spread = np.maximum(rates.var(axis=0), white)
+        covariance = np.diag([*[epochs * hidden] * 3, *(epochs * spread)])
+        residual = np.concatenate([-v_W, rates[epochs // 2] - b_g])
+        return residual, [(3, _BY_VELOCITY), (9, _BY_BIAS)], covariance
 
     def checkpoint(self) -> list[FloatArray]:
         """Everything that `rewind` needs."""
@@ -78,29 +102,6 @@ class RestDetector:
         """Go back to a checkpoint."""
         self._sums.clear()
         self._sums.extend(checkpoint)
-
-
-def rest_measurement(
-    epoch: Epoch, v_W: FloatArray, b_g: FloatArray, noise: ImuNoise
-) -> tuple[FloatArray, list[Block], FloatArray]:
-    """Residual (6,), Jacobian and covariance of zero velocity and zero rate over an epoch.
-
-    The velocity is as uncertain as what white noise of the accelerometer hides over the window of
-    the test, counted once however many epochs fall into it; the rate as the epoch's mean is.
-
-    Args:
-        epoch: at rest.
-        v_W: (3,) estimated velocity [m/s].
-        b_g: (3,) estimated bias [rad/s].
-        noise: densities the filter assumes.
-    """
-    seconds = epoch.stop - epoch.start
-    mean_rate = epoch.gyro[1:].mean(axis=0)
-    hidden = max(noise.accel_noise, CONSUMER_SENSOR.accel_noise) ** 2 * WINDOW_SECONDS
-    variance_v = hidden * WINDOW_SECONDS / seconds
-    variance_g = CONSUMER_SENSOR.gyro_noise**2 / seconds
-    covariance = np.diag([variance_v] * 3 + [variance_g] * 3)
-    return np.concatenate([-v_W, mean_rate - b_g]), [(3, _BY_VELOCITY), (9, _BY_BIAS)], covariance
 
 
 _BY_VELOCITY = np.eye(6, 3)
