@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import Trajectory
 from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.stream_cache import cached
 from stario.sequences.walks import generate_walk
 from stario.sequences.windows import WorldStream, world_streams
 
 log = logging.getLogger(__name__)
+
+_SHORTEST = 400
+"""Samples of the shortest stretch that is kept, 2 s."""
 
 _SMOOTH = 0.3
 """Deviation of the specific force's size [m/s^2] below which no gait shows."""
@@ -60,9 +65,51 @@ def gather(
     return Material(streams, weights, words)
 
 
-def recorded_streams(sequences: Iterable[ImuSequence]) -> list[WorldStream]:
-    """Stretches of real recordings."""
-    return [stream for sequence in sequences for stream in world_streams(sequence)]
+def split_off(
+    recordings: Sequence[Sequence[WorldStream]], share: float = 0.2
+) -> tuple[list[WorldStream], list[WorldStream]]:
+    """Streams of each recording without its last part, and that part; scraps below 2 s are lost.
+
+    Args:
+        recordings: the streams of each.
+        share: of a recording's samples in its last part.
+    """
+    first: list[WorldStream] = []
+    last: list[WorldStream] = []
+    for streams in recordings:
+        left = round((1.0 - share) * sum(len(stream) for stream in streams))
+        for stream in streams:
+            first.append(_cut(stream, 0, left))
+            last.append(_cut(stream, max(left, 0), len(stream)))
+            left -= len(stream)
+    return [s for s in first if len(s) >= _SHORTEST], [s for s in last if len(s) >= _SHORTEST]
+
+
+def _cut(stream: WorldStream, start: int, stop: int) -> WorldStream:
+    part = slice(start, max(stop, start))
+    return WorldStream(stream.name, stream.imu_W[part], stream.position_W[part])
+
+
+def simulated_streams(
+    kind: str,
+    build: Callable[[], list[WorldStream]],
+    folder: Path,
+    *depends_on: object,
+) -> list[WorldStream]:
+    """Simulated streams from the cache in `folder`, built where they are not there yet.
+
+    Args:
+        kind: what they are called.
+        build: makes them.
+        folder: the cache's.
+        depends_on: plain values and files that the result depends on besides the code.
+    """
+    values = [
+        [str(x.resolve()), x.stat().st_size, x.stat().st_mtime_ns] if isinstance(x, Path) else x
+        for x in depends_on
+    ]
+    key = {"kind": kind, "values": values, "module": Path(__file__).read_text(encoding="utf-8")}
+    return cached(key, build, folder)
 
 
 def captured_streams(walks: dict[str, list[Trajectory]], seed: int) -> list[WorldStream]:

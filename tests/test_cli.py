@@ -31,9 +31,15 @@ class Done:
 
 
 @pytest.fixture
-def stario(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def stario(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    capsys: pytest.CaptureFixture[str],
+):
     """Calls `stario` with arguments, in this process and in an empty folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
 
     def call(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["stario", *map(str, arguments)])
@@ -398,7 +404,7 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_batch_goes_on_past_what_fails_and_says_so(
     stario, recording: Path, tmp_path: Path, jobs: int
 ) -> None:
@@ -448,3 +454,30 @@ def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path:
     content[-1] ^= 1
     weights.write_bytes(bytes(content))
     assert_one_line_error(stario("run", recording, "--model", weights), "model.safetensors")
+
+
+def test_training_goes_on_past_what_fails_and_keeps_its_windows(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
+    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
+    call = ("train", recording, "list.txt", "--generated", 1, "--config", "tiny.json")
+    done = stario(*call, "--out", "a", "--cache", "kept")
+    assert done.code == 1
+    assert Path(done.out.strip()) == Path("a/model.safetensors")
+    lines = [line for line in done.err.splitlines() if line.startswith("stario: skipped")]
+    assert len(lines) == 2
+    assert "nosuch.csv" in lines[0]
+    assert "blind: truth" in lines[1]
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
+    assert len(kept) == 2  # the recording's and the generated walk's
+    assert stario(*call, "--out", "b", "--cache", "kept").code == 1
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()} == kept
+    first, second = ((tmp_path / out / "model.safetensors").read_bytes() for out in "ab")
+    assert first == second
+
+
+def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
+    assert_one_line_error(stario("train", "missing.csv"), "missing.csv", "nothing there")
+    assert not (tmp_path / "runs").exists()

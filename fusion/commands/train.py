@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import PathsArgument, Reading, found, grouped, progress_bar
+from stario.fusion.commands.common import (
+    JobsOption,
+    PathsArgument,
+    Reading,
+    grouped,
+    leave_with_skipped,
+    progress_bar,
+    recordings_at,
+)
 from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from stario.network.train import TrainingConfig
+    from stario.sequences.batch import Skipped
     from stario.sequences.windows import WorldStream
 
 
@@ -49,24 +62,34 @@ def train(
             help="Learn from the validation recordings too, keep the calibration of --start-from.",
         ),
     ] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that keeps windows for the next run; else STARIO_CACHE or ~/.cache."
+        ),
+    ] = None,
+    jobs: JobsOption = 1,
 ) -> None:
     """Train a network on recordings with truth and on simulated walks; resumes by itself."""
-    from stario.network.data import captured_streams, gather, generated_streams
+    from stario.network.data import gather
     from stario.network.model import load_model
     from stario.network.train import train as train_network
-    from stario.sequences.vicon import read_vicon_walks
+    from stario.sequences.stream_cache import cache_folder
 
     recipe = _recipe(config, epochs=epochs, seed=seed)
     if last_stage and start_from is None:
         raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
-    recorded, held_out = _training_recordings(reading, paths or [], validation or [], data)
+    folder = cache or cache_folder()
+    recorded, held_out, skipped = _recorded(
+        paths or [], validation or [], data, partial(_streams_of, reading, folder, jobs)
+    )
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
     material = gather(
         recorded + held_out if last_stage else recorded,
-        captured_streams(read_vicon_walks(walks), recipe.seed) if walks else [],
-        generated_streams(generated, 60.0, recipe.seed),
+        _captured(walks, recipe.seed, folder) if walks else [],
+        _generated(generated, recipe.seed, folder),
     )
-    held_out = held_out or generated_streams(10, 60.0, recipe.seed + 1)
+    held_out = held_out or _generated(10, recipe.seed + 1, folder)
     for words in material.words:
         typer.echo(words, err=True)
     with progress_bar("train", total=recipe.steps) as progress:
@@ -87,6 +110,7 @@ def train(
             keep_calibration=last_stage,
         )
     typer.echo(str(path))
+    leave_with_skipped(skipped)
 
 
 def _recipe(path: Path | None, **over: int | None) -> TrainingConfig:
@@ -103,21 +127,62 @@ def _recipe(path: Path | None, **over: int | None) -> TrainingConfig:
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
-def _training_recordings(
-    reading: Reading, paths: list[Path], validation: list[Path], data: Path | None
-) -> tuple[list[WorldStream], list[WorldStream]]:
-    from stario.network.data import recorded_streams
+def _recorded(
+    paths: list[Path],
+    validation: list[Path],
+    data: Path | None,
+    streams_of: Callable[[list[Path]], tuple[list[list[WorldStream]], list[Skipped]]],
+) -> tuple[list[WorldStream], list[WorldStream], list[Skipped]]:
+    """Streams to learn from, streams held out, and what could not be used, named at once."""
+    from stario.network.data import split_off
     from stario.sequences.splits import split_paths
 
-    training_files, validation_files = found(paths), found(validation)
+    files, missing = recordings_at(paths)
+    held_files, held_missing = recordings_at(validation)
     if data is not None:
-        training_files += split_paths(data, "training")
-        validation_files += split_paths(data, "validation")
-    sequences = [reading.read(p) for p in training_files]
-    if validation_files or not sequences:
-        held_out = [reading.read(p) for p in validation_files]
-        return recorded_streams(sequences), recorded_streams(held_out)
-    cuts = [s.time[0] + 0.8 * s.duration for s in sequences]
-    first = [s.slice(s.time[0], cut) for s, cut in zip(sequences, cuts, strict=True)]
-    last = [s.slice(cut, s.time[-1]) for s, cut in zip(sequences, cuts, strict=True)]
-    return recorded_streams(first), recorded_streams(last)
+        files += split_paths(data, "training")
+        held_files += split_paths(data, "validation")
+    recordings, failed = streams_of(files)
+    held_out, held_failed = streams_of(held_files)
+    skipped = missing + failed + held_missing + held_failed
+    if skipped and not (recordings and (held_out or not validation)):
+        leave_with_skipped(skipped)
+    if held_files or not files:
+        return list(chain(*recordings)), list(chain(*held_out)), skipped
+    return *split_off(recordings), skipped
+
+
+def _streams_of(
+    reading: Reading, folder: Path, jobs: int, files: list[Path]
+) -> tuple[list[list[WorldStream]], list[Skipped]]:
+    from stario.sequences.batch import Skipped
+    from stario.sequences.stream_cache import recorded
+
+    recordings: list[list[WorldStream]] = []
+    skipped: list[Skipped] = []
+    with progress_bar("read", len(files)) as progress:
+        outcomes = recorded(files, reading.read, asdict(reading), folder, jobs)
+        for done, outcome in enumerate(outcomes, 1):
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+            else:
+                recordings.append(outcome)
+            progress(done / len(files))
+    return recordings, skipped
+
+
+def _captured(walks: Path, seed: int, folder: Path) -> list[WorldStream]:
+    from stario.network.data import captured_streams, simulated_streams
+    from stario.sequences.vicon import read_vicon_walks
+
+    return simulated_streams(
+        "captured", lambda: captured_streams(read_vicon_walks(walks), seed), folder, walks, seed
+    )
+
+
+def _generated(count: int, seed: int, folder: Path) -> list[WorldStream]:
+    from stario.network.data import generated_streams, simulated_streams
+
+    return simulated_streams(
+        "generated", lambda: generated_streams(count, 60.0, seed), folder, count, seed
+    )

@@ -1,0 +1,217 @@
+"""World-frame streams kept on disk: built once, then memory-mapped, so that they need no memory.
+
+One file per recording and set of options, in the layout of safetensors: a header, then the numbers
+of all stretches. A file takes its name only when it is whole, so a killed writer leaves nothing
+that is read, and of two writers at once the second replaces the first by the same content. The
+folder may be deleted at any time.
+
+The key of a recording is its path, the name, size and modification time of its files, the
+options it is read with, and the code that reads it. Hashing the files' bytes instead would read
+100 hours of recordings, and the images beside some of them, at every start; what it would notice
+besides is a file that was replaced by one of the same size and the same time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import safetensors.numpy
+
+from stario.sequences.batch import Skipped, each
+from stario.sequences.checks import check_units
+from stario.sequences.errors import InputError, StarioError
+from stario.sequences.files import atomic_write
+from stario.sequences.readers import FORMATS
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.windows import WorldStream, world_streams
+
+log = logging.getLogger(__name__)
+
+_SUFFIX = ".streams"
+_ABANDONED_S = 3600.0
+
+
+def cache_folder() -> Path:
+    """The folder `STARIO_CACHE`, or `stario` in `XDG_CACHE_HOME`, or in `~/.cache`."""
+    if named := os.environ.get("STARIO_CACHE"):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stario"
+
+
+def recorded(
+    paths: Sequence[Path],
+    read: Callable[[Path], ImuSequence],
+    options: Mapping[str, object],
+    folder: Path,
+    jobs: int | None = None,
+) -> Iterator[list[WorldStream] | Skipped]:
+    """The streams of each recording, from the cache or read, checked and put there.
+
+    Args:
+        paths: recordings with truth.
+        read: how a path is read; can be pickled.
+        options: what `read` depends on besides the path, as plain values.
+        folder: the cache's; shared with the processes that read.
+        jobs: processes, as for `stario.sequences.batch.each`.
+    """
+    work = partial(_stored, read=read, options=dict(options), folder=folder)
+    for path, outcome in zip(paths, each(work, paths, jobs), strict=True):
+        # Another process hands over a file's name rather than what is in it.
+        streams = _opened(outcome) if isinstance(outcome, Path) else outcome
+        if streams is None:
+            try:
+                streams = _streams(read(path))
+            except StarioError as error:
+                streams = Skipped(str(path), str(error))
+        yield streams
+
+
+def cached(
+    key: Mapping[str, object], build: Callable[[], list[WorldStream]], folder: Path
+) -> list[WorldStream]:
+    """What `build` returns, from the cache where something of this key is there.
+
+    Args:
+        key: plain values that say all that the result depends on, but for this package's code.
+        build: makes the streams.
+        folder: the cache's.
+    """
+    file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
+    streams = _opened(file)
+    if streams is not None:
+        return streams
+    streams = build()
+    return (_opened(file) if _written(file, streams) else None) or streams
+
+
+def recording_files(path: Path) -> list[Path]:
+    """The files that a recording's content comes from, and perhaps others beside them."""
+    while path != path.parent and any(known.recognises(path.parent) for known in FORMATS.values()):
+        path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
+    if path.is_dir():
+        return sorted(p for p in path.rglob("*") if p.is_file())
+    if not FORMATS["oxiod"].recognises(path):
+        return [path]
+    number = "".join(filter(str.isdigit, path.stem))
+    siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
+    return sorted(p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number)
+
+
+def _stored(
+    path: Path,
+    read: Callable[[Path], ImuSequence],
+    options: Mapping[str, object],
+    folder: Path,
+) -> Path | list[WorldStream]:
+    """The cache's file of a recording, or its streams where nothing can be written."""
+    if not path.exists():
+        return _streams(read(path))
+    key = {"path": str(path.resolve()), "files": _stamps(path), "options": dict(options)}
+    file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
+    if _opened(file) is not None:
+        return file
+    streams = _streams(read(path))
+    return file if _written(file, streams) else streams
+
+
+def _streams(sequence: ImuSequence) -> list[WorldStream]:
+    check_units(sequence)
+    streams = world_streams(sequence)
+    if not streams:
+        raise InputError(
+            f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from"
+        )
+    return streams
+
+
+def _stamps(path: Path) -> list[tuple[str, int, int]]:
+    return [
+        (str(file), stat.st_size, stat.st_mtime_ns)
+        for file in recording_files(path)
+        for stat in (file.stat(),)
+    ]
+
+
+def _digest(key: Mapping[str, object]) -> str:
+    text = json.dumps(key, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
+
+
+@cache
+def _code() -> str:
+    """Digest of this package: streams that other code has made are not found again."""
+    digest = hashlib.blake2b(digest_size=20)
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _written(file: Path, streams: list[WorldStream]) -> bool:
+    """Whether the streams could be put into the cache, which runs do without if need be."""
+    if not streams:
+        return False
+    imu_W = np.concatenate([s.imu_W for s in streams])
+    position_W = np.concatenate([s.position_W for s in streams])
+    streams_of = json.dumps([(stream.name, len(stream)) for stream in streams])
+    content = safetensors.numpy.save(
+        {"imu_W": imu_W, "position_W": position_W}, metadata={"streams": streams_of}
+    )
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(file)
+        with atomic_write(file, "wb") as target:
+            target.write(content)
+    except OSError as error:
+        log.warning("%s: windows are not kept for the next run: %s", file.parent, error)
+        return False
+    return True
+
+
+def _sweep(file: Path) -> None:
+    """Remove what killed writers of this file have left."""
+    for left in file.parent.glob(f".{file.name}.*.tmp"):
+        if time.time() - left.stat().st_mtime > _ABANDONED_S:
+            left.unlink(missing_ok=True)
+
+
+def _opened(file: Path) -> list[WorldStream] | None:
+    """Streams whose numbers are read when they are used; None where the file is not whole."""
+    try:
+        size = file.stat().st_size
+        with file.open("rb") as source:
+            length = int.from_bytes(source.read(8), "little")
+            header = json.loads(source.read(min(length, size)))
+        names, lengths = zip(*json.loads(header["__metadata__"]["streams"]), strict=True)
+        if size != 8 + length + sum(lengths) * 9 * 4:
+            raise ValueError(f"{size} bytes")
+        imu_W, position_W = (
+            np.asarray(
+                np.memmap(
+                    file,
+                    dtype="<f4",
+                    mode="r",
+                    offset=8 + length + header[name]["data_offsets"][0],
+                    shape=tuple(header[name]["shape"]),
+                )
+            )
+            for name in ("imu_W", "position_W")
+        )
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.warning("%s: not whole, built anew: %s", file, error)
+        return None
+    ends = np.cumsum([0, *lengths]).tolist()
+    return [
+        WorldStream(name, imu_W[start:stop], position_W[start:stop])
+        for name, (start, stop) in zip(names, pairwise(ends), strict=True)
+    ]
