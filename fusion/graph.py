@@ -25,7 +25,7 @@ from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
 
-_MOST_ROUNDS = 10
+_MOST_ROUNDS = 5
 _MOVED = 1e-3
 """A round that moves no keyframe further [m] is the last."""
 
@@ -65,7 +65,7 @@ class KeyframeGraph:
         self._gate = gate
         self._values = gtsam.Values()
         self._factors: list[tuple[int, Any]] = []  # with the first keyframe each touches
-        self._terms: list[Term] = []
+        self._terms: list[_Whitened] = []
         self._time: dict[int, float] = {}
         self._tree: Any = None
         self.last = -1
@@ -91,7 +91,8 @@ class KeyframeGraph:
 
     def add(self, term: Term) -> None:
         """Take in a measurement; its covariance is positive definite."""
-        self._terms.append(term)
+        whitener = np.linalg.inv(np.linalg.cholesky(term.covariance))
+        self._terms.append(_Whitened(term, whitener, _quantile(self._gate, len(whitener))))
         self._tree = None
 
     def solve(self) -> Solution:
@@ -112,8 +113,8 @@ class KeyframeGraph:
         except IndeterminateError:
             self._values = start
             raise
-        heavy = sum(self._weighed(term)[1] < 1.0 for term in self._terms)
-        return Solution(rounds, heavy)
+        light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
+        return Solution(rounds, light)
 
     def pose(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """R_WB, v_W, p_W, b_g, b_a of a keyframe."""
@@ -143,14 +144,14 @@ class KeyframeGraph:
             touched.add(factor)
         linear = touched.linearize(self._values)
         for term in self._terms:
-            if term.keyframes[0] < before:
-                linear.push_back(self._factor(term))
+            if term.first < before:
+                linear.push_back(term.factor(self._values))
         keys = [key(k) for k in old for key in (X, V, B)]
         _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         kept = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
         self._factors = [item for item in self._factors if item[0] >= before]
         self._factors += [(before, kept.at(n)) for n in range(kept.size())]
-        self._terms = [term for term in self._terms if term.keyframes[0] >= before]
+        self._terms = [term for term in self._terms if term.first >= before]
         for key in keys:
             self._values.erase(key)
         for k in old:
@@ -170,10 +171,10 @@ class KeyframeGraph:
         fixed = gtsam.NonlinearFactorGraph()
         for _first, factor in self._factors:
             fixed.add(factor)
-        for done in range(1, _MOST_ROUNDS + 1):
+        for _round in range(_MOST_ROUNDS):
             graph = gtsam.NonlinearFactorGraph(fixed)
             for term in self._terms:
-                graph.add(gtsam.LinearContainerFactor(self._factor(term), self._values))
+                graph.add(gtsam.LinearContainerFactor(term.factor(self._values), self._values))
             before = self._positions()
             optimizer = gtsam.LevenbergMarquardtOptimizer(
                 graph, self._values, self._ordering(), _parameters()
@@ -184,7 +185,7 @@ class KeyframeGraph:
                 break
         if not np.isfinite(moved):
             raise IndeterminateError("the optimisation diverged")
-        return done
+        return _round + 1
 
     def _positions(self) -> FloatArray:
         return np.array([self._values.atPose3(X(k)).translation() for k in self._time])
@@ -195,23 +196,8 @@ class KeyframeGraph:
             graph.add(factor)
         linear = graph.linearize(self._values)
         for term in self._terms:
-            linear.push_back(self._factor(term))
+            linear.push_back(term.factor(self._values))
         return linear
-
-    def _factor(self, term: Term) -> Any:
-        """A term as gtsam's linear factor at the present values."""
-        linearised, weight, whitener = self._weighed(term)
-        scaled = weight * whitener
-        arguments = [part for key, H in linearised.blocks for part in (key, scaled @ H)]
-        unit = gtsam.noiseModel.Unit.Create(len(linearised.residual))
-        return gtsam.JacobianFactor(*arguments, scaled @ linearised.residual, unit)
-
-    def _weighed(self, term: Term) -> Any:
-        linearised = term.linearise(self._values)
-        whitener = np.linalg.inv(np.linalg.cholesky(term.covariance))
-        white = whitener @ linearised.residual
-        squared, limit = float(white @ white), _quantile(self._gate, len(white))
-        return linearised, (limit / squared) ** 0.5 if squared > limit else 1.0, whitener
 
     def _ordering(self) -> Any:
         """Time's: the graph is a chain whose longest link is a window."""
@@ -237,6 +223,35 @@ class KeyframeGraph:
         if found is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """A term with its covariance's whitener (m, m) and the squared norm that is an outlier's."""
+
+    term: Term
+    whitener: FloatArray
+    limit: float
+
+    @property
+    def first(self) -> int:
+        """The first keyframe it touches."""
+        return self.term.keyframes[0]
+
+    def weigh(self, values: Any) -> tuple[FloatArray, list[tuple[int, FloatArray]], float]:
+        """Residual, Jacobian blocks and weight at gtsam `Values`."""
+        residual, blocks = self.term.linearise(values)
+        white = self.whitener @ residual
+        squared = float(white @ white)
+        return residual, blocks, (self.limit / squared) ** 0.5 if squared > self.limit else 1.0
+
+    def factor(self, values: Any) -> Any:
+        """The linear factor, linearised and weighed at `Values`."""
+        residual, blocks, weight = self.weigh(values)
+        scaled = weight * self.whitener
+        arguments: list[Any] = [part for key, H in blocks for part in (key, scaled @ H)]
+        arguments += [scaled @ residual, gtsam.noiseModel.Unit.Create(len(residual))]
+        return gtsam.JacobianFactor(*arguments)
 
 
 def _prior(state: NavState) -> Any:

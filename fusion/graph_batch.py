@@ -9,12 +9,14 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.graph import IndeterminateError, KeyframeGraph
-from stario.fusion.graph_builder import GraphBuilder
-from stario.fusion.intake import Epoch
+from stario.fusion.graph_builder import GraphBuilder, Taken
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.preintegration import Segment
-from stario.fusion.recipe import Measurement
 from stario.fusion.state import NavState
+from stario.fusion.world import UNKNOWN_YAW
+
+_UNKNOWN_POSITION = 1e4
+"""Standard deviation of a position that only fixes tell [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,37 +36,51 @@ class Smoothed:
 
 def smooth(
     filtered: Sequence[NavState],
-    epochs: Sequence[Epoch],
-    measurements: Sequence[Measurement | None],
+    prior: NavState,
+    taken: Sequence[Taken],
     config: NavigatorConfig,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
     Args:
-        filtered: the filter's states: the start and one for each epoch.
-        epochs: of the recording.
-        measurements: one for each epoch, None where there is none.
+        filtered: the filter's states in one world: the start and one for each epoch.
+        prior: the start before any fix moved or turned the world.
+        taken: what the filter took in, epoch by epoch.
         config: noise, filter and graph settings.
 
     Returns:
         The graph's states with their marginal covariances; the filter's own where the graph does
         not determine one.
     """
-    builder = GraphBuilder(config, filtered[0])
-    for epoch, measurement, state in zip(epochs, measurements, filtered[1:], strict=True):
-        builder.step(epoch, measurement, state)
-    builder.close()
+    builder = GraphBuilder(config, _loosened(filtered[0], prior))
+    for (epoch, measurement, fixes, held), state in zip(taken, filtered[1:], strict=True):
+        builder.step(epoch, measurement, fixes, held, guess=state)
+    builder.close(filtered[-1])
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:
         return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
-    states = filled(builder.graph, builder.segments)
-    marked = [replace(s, in_gap=f.in_gap) for s, f in zip(states, filtered, strict=True)]
+    solved = {state.time: state for state in filled(builder.graph, builder.segments)}
+    states = [replace(solved[f.time], in_gap=f.in_gap, world=f.world) for f in filtered]
     note = (
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
         f"{solution.weighed_down} measurements weighed down"
     )
-    return Smoothed(marked, note)
+    return Smoothed(states, note)
+
+
+def _loosened(first: NavState, prior: NavState) -> NavState:
+    """The prior in the last world: what fixes told of position and yaw is theirs to tell again."""
+    if first.world == prior.world:
+        return prior
+    turn = first.R_WB @ prior.R_WB.T
+    to_last = np.kron(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), turn)
+    to_last[9:, 9:] = np.eye(6)
+    covariance = to_last @ prior.covariance @ to_last.T
+    covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
+    if not np.allclose(turn, np.eye(3)):
+        covariance[2, 2] += UNKNOWN_YAW**2
+    return replace(first, covariance=covariance)
 
 
 def filled(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:

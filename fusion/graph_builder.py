@@ -4,109 +4,241 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.fixes import Fix, cut
 from stario.fusion.graph import KeyframeGraph
-from stario.fusion.graph_terms import Displacement
+from stario.fusion.graph_terms import Displacement, GyroBias, Heading, Position, Term, Velocity
+from stario.fusion.history import Measurement
 from stario.fusion.intake import Epoch
-from stario.fusion.lie import FloatArray
+from stario.fusion.jacobians import yaw_twist
+from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.preintegration import Segment
-from stario.fusion.recipe import Measurement
+from stario.fusion.recipe import Held
 from stario.fusion.segments import segment_of
 from stario.fusion.state import NavState
 from stario.sequences.windows import WINDOW_SECONDS
+
+_SAME_TIME = 1e-6
+"""A fix this close to a keyframe [s] measures it."""
+
+Pose = tuple[FloatArray, FloatArray, FloatArray]
+"""R_WB (3, 3), v_W (3,), p_W (3,)."""
+
+
+class Taken(NamedTuple):
+    """An epoch and what was measured in it."""
+
+    epoch: Epoch
+    measurement: Measurement | None
+    fixes: Sequence[Fix]
+    held: Held | None
 
 
 class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
-    Keyframes stand at the grid's times, `keyframe_rate` a second, and at both ends of a gap.
+    Keyframes stand at the grid's times, `keyframe_rate` a second, at both ends of a gap and at the
+    times of fixes that come in time.
 
     Args:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
+        count: epochs since the start or the last gap, where a graph is begun anew.
 
     Attributes:
         graph: the graph so far.
         segments: by keyframe, the epochs' segments from it to the next (or to now).
+        count: epochs since the start or the last gap.
     """
 
-    def __init__(self, config: NavigatorConfig, first: NavState) -> None:
+    def __init__(self, config: NavigatorConfig, first: NavState, count: int = 0) -> None:
         self._config = config
         self.graph = KeyframeGraph(first, config.filter.gate)
         self.segments: dict[int, list[Segment]] = {0: []}
-        self._stride = config.filter.output_rate // config.graph.keyframe_rate
+        self.count = count
+        output_rate = config.filter.output_rate
+        self._stride = output_rate // config.graph.keyframe_rate
+        self._window = round(output_rate * WINDOW_SECONDS)
         # Overlapping windows see the same motion again, as in the filter's settings.
         rate = min(config.filter.update_rate, config.graph.keyframe_rate)
         self._scale = rate * WINDOW_SECONDS * config.filter.covariance_scale
-        self._window = round(config.filter.output_rate * WINDOW_SECONDS)
         self._pending: list[Epoch] = []
-        self._guess = first
-        self._count = 0  # epochs since the start or the last gap
-        self._keyframe_at = {0: 0}  # count to keyframe, as far back as a window reaches
+        self._keyframe_at = {count: 0}  # as far back as a window reaches
 
-    def step(self, epoch: Epoch, measurement: Measurement | None, guess: NavState) -> bool:
-        """Take in an epoch and the measurement of the window that ends with it.
+    @property
+    def newest(self) -> Segment:
+        """The segment that ends now, behind the last keyframe."""
+        return self.segments[self.graph.last][-1]
+
+    def step(
+        self,
+        epoch: Epoch,
+        measurement: Measurement | None,
+        fixes: Sequence[Fix] = (),
+        held: Held | None = None,
+        guess: NavState | None = None,
+    ) -> bool:
+        """Take in an epoch and what was measured in it.
 
         Args:
             epoch: the next one.
-            measurement: displacement and covariance, None where there is none.
-            guess: the state at the epoch's end, from where the optimisation starts.
+            measurement: of the window that ends with it, None where there is none.
+            fixes: within the epoch, in order.
+            held: what was measured at rest, None where the device moved.
+            guess: state at its end from where the optimisation starts, None: by the IMU.
 
         Returns:
             Whether a keyframe was made.
         """
-        made = epoch.gap and self.close()
-        graph = self.graph
-        R, _, _, b_g, b_a = graph.pose(graph.last)
-        self.segments[graph.last].append(segment_of(epoch, R, b_g, b_a, self._config))
-        self._pending.append(epoch)
-        self._guess = guess
+        before = self.graph.last
         if epoch.gap:
-            self._count = 0
+            self.close()
             self._keyframe_at.clear()
-        else:
-            self._count += 1
-        if self._count % self._stride:
-            return made
-        self.close()
-        self._keyframe_at[self._count] = graph.last
-        self._keyframe_at.pop(self._count - self._window - self._stride, None)
-        if measurement is not None:
-            self._measure(epoch, *measurement)
-        return True
+        self.count = 0 if epoch.gap else self.count + 1
+        self._append(epoch)
+        inside = [fix for fix in fixes if fix.time < epoch.stop - _SAME_TIME]
+        for fix in inside:
+            self.fix(fix)
+        due = self.count % self._stride == 0
+        if due or len(inside) < len(fixes):
+            self.close(guess)
+        if due:
+            self._keyframe_at[self.count] = self.graph.last
+            self._keyframe_at.pop(self.count - self._window - self._stride, None)
+            if measurement is not None:
+                self._measure(epoch, *measurement)
+            if held is not None:
+                self._hold_still(held)
+        for fix in fixes[len(inside) :]:
+            self.fix(fix)
+        return self.graph.last > before
 
-    def close(self) -> bool:
-        """Make a keyframe of the epochs since the last one; False where there are none."""
+    def close(self, guess: NavState | None = None) -> None:
+        """Make a keyframe of the epochs since the last one, where there are any."""
         if not self._pending:
-            return False
+            return
         graph = self.graph
         pieces = self.segments[graph.last]
         whole = pieces[0]
         if len(pieces) > 1:
             R, _, _, b_g, b_a = graph.pose(graph.last)
             whole = segment_of(_merged(self._pending), R, b_g, b_a, self._config)
+        if guess is None:
+            _, _, _, b_g, b_a = graph.pose(graph.last)
+            guess = NavState(whole.stop, *self.reckoned(graph.last), b_g, b_a, np.empty(0))
         self._pending = []
-        self.segments[graph.add_keyframe(whole, self._guess)] = []
+        self.segments[graph.add_keyframe(whole, guess)] = []
+
+    def fix(self, fix: Fix) -> bool:
+        """Take in a fix; False where it is older than the graph.
+
+        Behind the last keyframe it makes one of its own; between older ones it measures the one
+        before it, the IMU telling what lies between.
+        """
+        graph = self.graph
+        if fix.time > graph.time(graph.last) + _SAME_TIME:
+            self._split(fix.time)
+        held = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
+        if not held:
+            return False
+        graph.add(self._fix_term(fix, held[-1]))
         return True
 
+    def forget(self, before: int) -> None:
+        """Marginalise the keyframes before one."""
+        self.graph.marginalise(before)
+        for k in [k for k in self.segments if k < before]:
+            del self.segments[k]
+        self._keyframe_at = {n: k for n, k in self._keyframe_at.items() if k >= before}
+
+    def reckoned(self, k: int, time: float = math.inf) -> Pose:
+        """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
+        R, v, p, b_g, b_a = self.graph.pose(k)
+        for segment in self.segments[k]:
+            ahead = segment.predict(R, v, p, b_g, b_a)
+            if segment.stop > time:
+                share = (time - segment.start) / segment.duration
+                return _part_of_way((R, v, p), ahead, share, segment.duration)
+            R, v, p = ahead
+        return R, v, p
+
+    def _append(self, epoch: Epoch) -> None:
+        R, _, _, b_g, b_a = self.graph.pose(self.graph.last)
+        self.segments[self.graph.last].append(segment_of(epoch, R, b_g, b_a, self._config))
+        self._pending.append(epoch)
+
+    def _split(self, time: float) -> None:
+        """Make a keyframe at a time within the epochs since the last one."""
+        before, after = _cut_at(self._pending, time)
+        self._pending = []
+        self.segments[self.graph.last] = []
+        for epoch in before:
+            self._append(epoch)
+        self.close()
+        for epoch in after:
+            self._append(epoch)
+
     def _measure(self, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
-        i = self._keyframe_at.get(self._count - self._window)
+        i = self._keyframe_at.get(self.count - self._window)
         covariance = covariance_N * self._scale
-        if i is None or not usable(d_N, covariance):
+        if i is None or not _usable(d_N, covariance):
             return
         assert epoch.R_NB_window is not None  # a window always comes with its first attitude
         self.graph.add(Displacement(i, self.graph.last, d_N, epoch.R_NB_window, covariance))
 
+    def _hold_still(self, held: Held) -> None:
+        zero, k = np.zeros(3), self.graph.last
+        # One keyframe stands for the epochs since the one before.
+        covariance = held.covariance / self._stride
+        self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
+        self.graph.add(GyroBias(k, held.b_g, covariance[3:, 3:]))
 
-def usable(value: FloatArray, covariance: FloatArray) -> bool:
+    def _fix_term(self, fix: Fix, k: int) -> Term:
+        graph = self.graph
+        dt = fix.time - graph.time(k)
+        R_k, v_k, p_k, _, _ = graph.pose(k)
+        R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.reckoned(k, fix.time)
+        if fix.kind == "position":
+            return Position(k, fix.value, fix.covariance, dt, p - p_k - dt * v_k)
+        if fix.kind == "velocity":
+            return Velocity(k, fix.value, fix.covariance, v - v_k)
+        turn = np.array([0.0, 0.0, fix.value[0] - yaw_twist(R)])
+        return Heading(k, exp_so3(turn) @ R_k, fix.covariance)
+
+
+def _usable(value: FloatArray, covariance: FloatArray) -> bool:
     """Whether a measurement is finite and its covariance positive definite."""
     with np.errstate(invalid="ignore", over="ignore"):
         finite = math.isfinite(float(np.vdot(value, value) + np.vdot(covariance, covariance)))
     return finite and dpotrf(covariance, lower=1)[1] == 0
+
+
+def _part_of_way(start: Pose, end: Pose, share: float, duration: float) -> Pose:
+    """Between two poses a tenth of a second apart, with constant rate and acceleration."""
+    (R0, v0, p0), (R1, v1, _) = start, end
+    v = v0 + share * (v1 - v0)
+    return exp_so3(share * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * share * duration * (v0 + v)
+
+
+def _cut_at(epochs: Sequence[Epoch], time: float) -> tuple[list[Epoch], list[Epoch]]:
+    """Epochs before and after a time [s]; the one it falls into is cut."""
+    before: list[Epoch] = []
+    after: list[Epoch] = []
+    for epoch in epochs:
+        if epoch.stop <= time + _SAME_TIME:
+            before.append(epoch)
+        elif epoch.start >= time - _SAME_TIME:
+            after.append(epoch)
+        else:
+            first, second = cut(epoch, time)
+            before.append(first)
+            after.append(second)
+    return before, after
 
 
 def _merged(epochs: Sequence[Epoch]) -> Epoch:

@@ -1,0 +1,120 @@
+"""The fixed-lag graph for streams: the last seconds optimised anew at every keyframe.
+
+What leaves the lag is marginalised. The filter runs alongside: it judges measurements, fixes and
+rest for both, and where the graph does not determine a state the stream goes on from the filter's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.fixes import Fix
+from stario.fusion.graph import IndeterminateError
+from stario.fusion.graph_builder import GraphBuilder
+from stario.fusion.history import Measurement
+from stario.fusion.intake import Epoch, IntakeCounts, Start
+from stario.fusion.recipe import FilterRecipe, PriorPose
+from stario.fusion.state import Health, Innovations, NavState
+
+
+class GraphRecipe:
+    """A `FilterRecipe` whose states are those of a fixed-lag graph.
+
+    Between keyframes the state is that of the last one, carried on by the IMU.
+
+    Args:
+        config: noise, filter and graph settings.
+        start: time and levelled attitude of the first sample.
+        prior: what is known of the first pose; None starts level, at rest, at the origin.
+    """
+
+    def __init__(
+        self, config: NavigatorConfig, start: Start, prior: PriorPose | None = None
+    ) -> None:
+        self._config = config
+        self._filter = FilterRecipe(config, start, prior, streaming=True)
+        self._fallbacks = 0
+        self._why = ""
+        self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
+        self._begin(self._filter.state(), 0)
+
+    def step(
+        self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
+    ) -> NavState:
+        """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
+        state = self._filter.step(epoch, measurement, fixes)
+        if state.world != self._world:
+            self._begin(state, 0 if epoch.gap else self._builder.count + 1)
+            return self.state(in_gap=epoch.gap)
+        if self._builder.step(epoch, measurement, fixes, self._filter.held):
+            self._solve()
+        else:
+            self._ahead.propagate(self._builder.newest)
+        return self.state(in_gap=epoch.gap)
+
+    def late_fix(self, fix: Fix) -> bool:
+        """Take in a fix at a time before now; False where it is more than a window late."""
+        if not self._filter.late_fix(fix):
+            return False
+        state = self._filter.state()
+        if state.world != self._world:
+            self._begin(state, self._builder.count)
+        elif self._builder.fix(fix):
+            self._solve()
+        return True
+
+    def state(self, in_gap: bool = False) -> NavState:
+        """The estimate now."""
+        ahead = self._ahead
+        return NavState(
+            time=ahead.time,
+            R_WB=ahead.R_WB,
+            v_W=ahead.v_W,
+            p_W=ahead.p_W,
+            b_g=ahead.b_g,
+            b_a=ahead.b_a,
+            covariance=ahead.world_covariance(),
+            in_gap=in_gap,
+            world=self._world,
+        )
+
+    def innovations(self) -> Innovations:
+        """Those of the filter alongside."""
+        return self._filter.innovations()
+
+    def health(self, counts: IntakeCounts) -> Health:
+        """The filter's report with the graph's sigmas, and how often the graph fell back."""
+        health = self._filter.health(counts, self.state())
+        if self._fallbacks == 0:
+            return health
+        note = f"graph fell back to the filter {self._fallbacks} times, last for {self._why}"
+        return replace(health, notes=[*health.notes, note])
+
+    def _begin(self, first: NavState, count: int) -> None:
+        """A new graph from a state of the filter."""
+        self._world = first.world
+        self._builder = GraphBuilder(self._config, first, count)
+        self._take(first)
+
+    def _solve(self) -> None:
+        builder = self._builder
+        graph = builder.graph
+        try:
+            graph.solve()
+            newest = graph.state(graph.last)
+            oldest = newest.time - self._config.graph.lag
+            builder.forget(next(k for k in graph.keyframes if graph.time(k) >= oldest))
+        except IndeterminateError as error:
+            self._fallbacks += 1
+            self._why = str(error)
+            self._begin(self._filter.state(), builder.count)
+            return
+        self._take(newest)
+        for segment in builder.segments[graph.last]:
+            self._ahead.propagate(segment)
+
+    def _take(self, s: NavState) -> None:
+        self._ahead.initialise(s.time, s.R_WB, s.v_W, s.p_W, s.b_g, s.b_a, s.covariance)
