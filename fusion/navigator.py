@@ -11,13 +11,16 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
+from stario.fusion.graph_batch import smooth
+from stario.fusion.graph_builder import Taken
+from stario.fusion.graph_lag import GraphRecipe
 from stario.fusion.intake import Epoch, Intake, Start, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.state import Health, NavState, Track, track_from_states
@@ -32,6 +35,9 @@ Vector = Sequence[float] | FloatArray
 
 _START_FORCE = (5.0, 15.0)
 """Average force [m/s^2] of a first second that may hold a jump, but neither g nor deg/s."""
+
+Backend = Literal["ekf", "graph"]
+"""The filter; or the factor graph, fixed-lag for streams and of the whole for recordings."""
 
 Progress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
@@ -71,6 +77,10 @@ class Navigator:
         model: a `DisplacementModel`, or anything with its `predict`.
         config: noise, filter, gravity; the defaults are those of handheld devices.
         prior: what is known of the first pose; None starts level by gravity, yaw and position zero.
+        backend: "ekf", or "graph" for the factor graph, which is more accurate and takes more time.
+
+    Raises:
+        InputError: there is no such back end.
     """
 
     def __init__(
@@ -78,12 +88,16 @@ class Navigator:
         model: Predictor,
         config: NavigatorConfig | None = None,
         prior: PriorPose | None = None,
+        backend: Backend = "ekf",
     ) -> None:
+        if backend not in get_args(Backend):
+            raise InputError("backend", repr(backend), f"one of {', '.join(get_args(Backend))}")
+        self.backend = backend
         self.model = model
         self.prior = prior
         self.config = config or NavigatorConfig()
         self._intake = Intake(self.config)
-        self._recipe: FilterRecipe | None = None
+        self._recipe: FilterRecipe | GraphRecipe | None = None
         self._fixes = FixQueue()
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
@@ -201,26 +215,34 @@ class Navigator:
         progress: Progress = lambda share: None,
         fixes: Iterable[Fix] = (),
     ) -> Track:
-        """The filter's track of a prepared recording; fixes as for `run`."""
+        """The back end's track of a prepared recording; fixes as for `run`."""
         began = perf_counter()
         start = observed.intake.start
         assert start is not None  # observe() refuses recordings without one
         recipe = FilterRecipe(self.config, start, self.prior)
         queue = FixQueue(fixes)
         queue.start(start.time)
-        states = [recipe.state()]
+        states, taken = [recipe.state()], []
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
         ):
-            states.append(recipe.step(epoch, measurement, queue.due(epoch.stop)))
+            due = queue.due(epoch.stop)
+            states.append(recipe.step(epoch, measurement, due))
+            taken.append(Taken(epoch, measurement, due, recipe.held))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
         queue.refuse("after the end", len(queue.due(math.inf)))
+        prior, states = states[0], in_last_world(states, recipe.world_changes)
+        notes = []
+        if self.backend == "graph":
+            smoothed = smooth(states, prior, taken, self.config)
+            states, notes = smoothed.states, [smoothed.note]
+        health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
         return track_from_states(
-            in_last_world(states, recipe.world_changes),
+            states,
             recipe.innovations(),
-            _with_refused(recipe.health(observed.intake.counts), queue),
+            _with_refused(health, queue),
             seconds_network=observed.seconds_network,
             seconds_filter=observed.seconds_intake + perf_counter() - began,
         )
@@ -239,7 +261,10 @@ class Navigator:
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
             start = self._checked_start()
-            self._recipe = FilterRecipe(self.config, start, self.prior, streaming=True)
+            if self.backend == "graph":
+                self._recipe = GraphRecipe(self.config, start, self.prior)
+            else:
+                self._recipe = FilterRecipe(self.config, start, self.prior, streaming=True)
             self._fixes.start(start.time)
         measurement = None
         if epoch.window is not None:
