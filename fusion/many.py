@@ -10,6 +10,7 @@ from pathlib import Path
 
 from stario.fusion.compare import Comparison, compare
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.fixes import Fix
 from stario.fusion.navigator import Predictor, Progress
 from stario.sequences.batch import Skipped, each
 from stario.sequences.errors import InputError
@@ -23,6 +24,7 @@ def compare_recordings(
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence] = read_recording,
     jobs: int | None = None,
+    fixes: Sequence[Fix] = (),
     truth_needed: bool = False,
     progress: Progress = lambda share: None,
 ) -> Iterator[Comparison | Skipped]:
@@ -37,13 +39,29 @@ def compare_recordings(
         config: the navigator's settings.
         read: how a path is read; can be pickled.
         jobs: processes, as for `stario.sequences.batch.each`.
+        fixes: known to the EKF of every recording.
         truth_needed: skip recordings without truth.
-        progress: called with the share of the recordings that are done.
+        progress: called with the share of the work that is done; within a recording too where
+            one process works.
     """
-    work = partial(_compare, model=model, config=config, read=read, truth_needed=truth_needed)
+    done = 0
+
+    def within(share: float) -> None:
+        progress((done + share) / len(paths))
+
+    work = partial(
+        _compare,
+        model=model,
+        config=config,
+        read=read,
+        fixes=fixes,
+        truth_needed=truth_needed,
+        progress=within if jobs == 1 else _unseen,
+    )
     names: set[str] = set()
-    for done, outcome in enumerate(each(work, paths, jobs), 1):
-        progress(done / len(paths))
+    for outcome in each(work, paths, jobs):
+        done += 1
+        within(0.0)
         if isinstance(outcome, Comparison):
             name = distinct_name(outcome.sequence.name, names)
             names.add(name)
@@ -62,9 +80,15 @@ def _compare(
     model: Predictor,
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence],
+    fixes: Sequence[Fix],
     truth_needed: bool,
+    progress: Progress,
 ) -> Comparison:
     sequence = read(path)
     if truth_needed and sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
-    return compare(model, sequence, config)
+    return compare(model, sequence, config, progress, fixes)
+
+
+def _unseen(share: float) -> None:
+    """Progress that another process makes."""

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from stario.fusion.cli import app, main
-from stario.fusion.commands.common import distinct
 from stario.fusion.config import read_config
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
@@ -363,14 +362,6 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
         assert name in done.out
 
 
-def test_recordings_of_one_name_get_folders_of_their_own(recording: Path) -> None:
-    walk = read_own_csv(recording)
-    given = [replace(walk, name=name) for name in ("walk", "walk", "walk-2", "walk")]
-    names = [sequence.name for sequence in distinct(given)]
-    assert names[:2] == ["walk", "walk-2"]
-    assert len(set(names)) == 4
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
     for folder in ("a", "b"):
@@ -381,16 +372,22 @@ def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: 
     assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
 
 
-def test_one_bad_recording_in_the_list_leaves_nothing(
+@pytest.mark.usefixtures("undrawn")
+def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     sequence = read_own_csv(recording)
     write_csv(tmp_path / "short.csv", sequence.slice(0.0, 1.0))
     (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
     for bad in ("short.csv", "broken.csv"):
-        done = stario("compare", recording, bad, "--out", "out")
-        assert_one_line_error(done, bad.removesuffix(".csv"))
-        assert not (tmp_path / "out").exists()
+        done = stario("compare", bad, recording, "--out", "out", "--json")
+        assert done.code == 1
+        assert set(json.loads(done.out)["recordings"]) == {"walk"}
+        (line,) = done.err.splitlines()
+        assert line.startswith("stario: skipped: ")
+        assert bad.removesuffix(".csv") in line
+        assert_one_line_error(stario("compare", bad, "--out", "none"), bad.removesuffix(".csv"))
+        assert not (tmp_path / "none").exists()
 
 
 def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_path: Path) -> None:

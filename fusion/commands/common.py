@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import sys
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -152,13 +151,6 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return flat
 
 
-def found(paths: Iterable[Path]) -> list[Path]:
-    """Recordings at the paths, in folders or in lists."""
-    from stario.sequences.readers import find_recordings
-
-    return [file for path in paths for file in find_recordings(path)]
-
-
 def recordings_at(paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
     """Recordings at the paths, in folders or in lists, and what leads to none."""
     from stario.sequences.batch import Skipped
@@ -181,18 +173,6 @@ def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
         typer.echo(f"stario: skipped: {where}{one.reason}", err=True)
     if skipped:
         raise typer.Exit(1)
-
-
-def distinct(sequences: Iterable[ImuSequence]) -> list[ImuSequence]:
-    """Recordings under names of their own, since a name is a folder of the results."""
-    from dataclasses import replace
-
-    result: dict[str, ImuSequence] = {}
-    for sequence in sequences:
-        names = (f"{sequence.name}-{k}" if k > 1 else sequence.name for k in itertools.count(1))
-        name = next(name for name in names if name not in result)
-        result[name] = replace(sequence, name=name)
-    return list(result.values())
 
 
 @contextmanager

@@ -10,15 +10,16 @@ import typer
 from stario.fusion.commands.common import (
     Estimating,
     FixesOption,
+    JobsOption,
     JsonOption,
     OutOption,
     PathsArgument,
     Reading,
-    distinct,
-    found,
     grouped,
+    leave_with_skipped,
     print_json,
     progress_bar,
+    recordings_at,
     track_table,
 )
 from stario.sequences.errors import InputError
@@ -33,37 +34,44 @@ def compare(
     estimating: Estimating,
     paths: PathsArgument = None,
     fixes: FixesOption = None,
+    jobs: JobsOption = 1,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare tracks: inertial alone, network alone, EKF. Without PATH: a simulated walk."""
+    """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
+    from stario.fusion.compare import Comparison, demonstration
     from stario.fusion.compare import compare as compare_tracks
-    from stario.fusion.compare import demonstration
     from stario.fusion.fixes import read_fixes
+    from stario.fusion.many import compare_recordings
     from stario.fusion.results import comparison_dict, write_comparison
 
     settings, network = estimating.settings(), estimating.network()
-    if paths:
-        files = found(paths)
-        sequences = distinct(reading.read(file) for file in files)
-    else:
-        typer.echo("demonstration: a simulated walk that training never saw", err=True)
-        sequences = [demonstration()]
-    if fixes is not None and len(sequences) > 1:
-        raise InputError("--fixes", f"{len(sequences)} recordings", "one recording")
     known = [] if fixes is None else read_fixes(fixes)
-    comparisons = []
-    for sequence in sequences:
-        with progress_bar(f"compare {sequence.name}") as progress:
-            comparisons.append(compare_tracks(network, sequence, settings, progress, known))
+    comparisons: list[Comparison] = []
+    files, skipped = recordings_at(paths or [])
+    if fixes is not None and len(files) > 1:
+        raise InputError("--fixes", f"{len(files)} recordings", "one recording")
+    with progress_bar("compare", 100 * max(len(files), 1)) as progress:
+        if not paths:
+            typer.echo("demonstration: a simulated walk that training never saw", err=True)
+            made = compare_tracks(network, demonstration(), settings, progress, known)
+            comparisons.append(made)
+        for outcome in compare_recordings(
+            files, network, settings, reading.read, jobs, known, progress=progress
+        ):
+            if isinstance(outcome, Comparison):
+                comparisons.append(outcome)
+            else:
+                skipped.append(outcome)
     folder = out or Path("runs") / "compare"
-    written = write_comparison(folder, comparisons, settings)
-    if as_json:
+    written = write_comparison(folder, comparisons, settings) if comparisons else []
+    if as_json and comparisons:
         print_json(comparison_dict(comparisons))
-        return
-    for comparison in comparisons:
-        _print_comparison(comparison)
-    typer.echo(f"{len(written)} files in {folder}")
+    elif comparisons:
+        for comparison in comparisons:
+            _print_comparison(comparison)
+        typer.echo(f"{len(written)} files in {folder}")
+    leave_with_skipped(skipped)
 
 
 def _print_comparison(comparison: Comparison) -> None:

@@ -45,7 +45,7 @@ def evaluate(
     settings, network = estimating.settings(), estimating.network()
     files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
     recordings = []
-    with progress_bar("evaluate", len(files)) as progress:
+    with progress_bar("evaluate", 100 * len(files)) as progress:
         for outcome in compare_recordings(
             files, network, settings, reading.read, jobs, truth_needed=True, progress=progress
         ):
