@@ -19,7 +19,7 @@ from stario.sequences.walks import WalkStyle, generate_walk
 
 log = logging.getLogger(__name__)
 
-TRACKS = ("inertial", "network", "network_true_attitude", "ekf")
+TRACKS = ("inertial", "network", "network_true_attitude", "ekf", "graph")
 
 DEMONSTRATION_SEED = 2**31 + 2026
 """Of the bundled demonstration; training draws its seeds below 2^31, so it never saw this walk."""
@@ -92,7 +92,7 @@ def compare(
     progress: Progress = lambda share: None,
     fixes: Sequence[Fix] = (),
 ) -> Comparison:
-    """Every track of a recording; the network sees each window once, the EKF the fixes too.
+    """Every track of a recording; the network sees each window once, EKF and graph the fixes.
 
     Raises:
         InputError: the recording is too short, or its units or rate are wrong.
@@ -109,6 +109,7 @@ def compare(
         except InputError as error:
             log.warning("no track with true attitude: %s", error)
     tracks["ekf"] = navigator.track(observed, progress, fixes)
+    tracks["graph"] = Navigator(model, config, backend="graph").track(observed, fixes=fixes)
     metrics = {name: measure(track, sequence.truth) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics)
 

@@ -15,8 +15,10 @@ _COLUMNS = (
     ("network_true_attitude", "ate_m", "network, true attitude"),
     ("network", "ate_m", "network, own attitude"),
     ("ekf", "ate_m", "EKF"),
+    ("graph", "ate_m", "graph"),
     ("ekf", "nis", "EKF NIS"),
     ("ekf", "nees", "EKF NEES"),
+    ("graph", "nees", "graph NEES"),
 )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from stario.fusion.compare import METRIC_WORDS, Comparison, Metrics
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluate import Scores, scores_of
+from stario.fusion.navigator import Backend
 from stario.fusion.state import Innovations, Track
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
@@ -24,18 +25,19 @@ def write_run(
     aligned: Trajectory,
     metrics: Metrics,
     config: NavigatorConfig,
+    backend: Backend = "ekf",
 ) -> list[Path]:
     """Write one fused track; returns the files.
 
     `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
-    `config.json`, `health.json`, and the figures.
+    `config.json`, `health.json`, and the figures; the graph's track is called `graph`.
 
     Raises:
         InputError: the folder cannot be made.
     """
     make_folder(folder)
-    written = _track_files(folder, "ekf", track)
-    record = {"recording": name, "ekf": metrics, "conventions": METRIC_WORDS}
+    written = _track_files(folder, backend, track)
+    record = {"recording": name, backend: metrics, "conventions": METRIC_WORDS}
     for file, content in (
         ("metrics.json", record),
         ("config.json", asdict(config)),
@@ -43,7 +45,7 @@ def write_run(
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    return written + _figures(folder, name, {"ekf": aligned}, truth, track.innovations, config)
+    return written + _figures(folder, name, {backend: aligned}, truth, track.innovations, config)
 
 
 def write_comparison(

@@ -26,6 +26,7 @@ def run(
     reading: Reading,
     estimating: Estimating,
     fixes: FixesOption = None,
+    backend: Annotated[str, typer.Option(help="What fuses: ekf, or graph.")] = "ekf",
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -38,21 +39,24 @@ def run(
 
     settings, network = estimating.settings(), estimating.network()
     sequence = reading.read(path)
+    navigator = Navigator(network, settings, backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
     with progress_bar(f"run {sequence.name}") as progress:
-        track = Navigator(network, settings).run(sequence, progress, known)
+        track = navigator.run(sequence, progress, known)
     truth = sequence.truth
     metrics = measure(track, truth)
     folder = out or Path("runs") / sequence.name
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, "first")
-    written = write_run(folder, sequence.name, track, truth, aligned, metrics, settings)
+    written = write_run(
+        folder, sequence.name, track, truth, aligned, metrics, settings, navigator.backend
+    )
     if as_json:
-        print_json({"recording": sequence.name, "ekf": metrics, "folder": str(folder)})
+        print_json({"recording": sequence.name, backend: metrics, "folder": str(folder)})
         return
     way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     typer.echo(f"{way} travelled by the estimate")
     if truth is not None:
-        typer.echo(track_table({"ekf": metrics}))
+        typer.echo(track_table({backend: metrics}))
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")

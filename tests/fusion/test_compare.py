@@ -70,7 +70,13 @@ def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> 
     assert set(content["recordings"]) == {walk.name, "blind"}
     for entry in content["recordings"].values():
         assert set(entry) == {"duration_s", "path_m", "tracks"}
-        assert set(entry["tracks"]) == {"inertial", "network", "network_true_attitude", "ekf"}
+        assert set(entry["tracks"]) == {
+            "inertial",
+            "network",
+            "network_true_attitude",
+            "ekf",
+            "graph",
+        }
         for figures in entry["tracks"].values():
             assert set(figures) == KEYS
     entry = content["recordings"][walk.name]
@@ -173,7 +179,7 @@ def test_truth_too_scarce_for_a_window_costs_one_track_only(
 ) -> None:
     scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
     result = compare(model, scarce, CONFIG)
-    assert set(result.tracks) == {"inertial", "network", "ekf"}
+    assert set(result.tracks) == {"inertial", "network", "ekf", "graph"}
     assert "no track with true attitude" in caplog.text
 
 
