@@ -1,8 +1,9 @@
 """Training: one recipe for every network, on CPU or GPU, resumable from its checkpoint.
 
-The mean is learned by squared error first; then the Gaussian likelihood e^2 / (2 sigma^2) +
-log sigma takes over, weighted by sigma (detached), because the bare likelihood starves the mean of
-gradient wherever sigma is large (Seitzer et al. 2022, beta-NLL with beta = 1/2).
+The mean is learned by squared error from first to last. Sigma joins later, by the Gaussian
+likelihood e^2 / (2 sigma^2) + log sigma of the mean's error as it stands (detached): the joint
+likelihood, also weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
+sigma is large, and it is the large errors that a track is made of.
 
 The rate warms up and falls along a cosine as a function of the step alone, so a run that is killed
 and resumed follows the same schedule. What is evaluated and saved is the running average of the
@@ -37,6 +38,9 @@ log = logging.getLogger(__name__)
 
 VALIDATION_STRIDE = 20
 
+SIGMA_WEIGHT = 0.05
+"""Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
+
 _RANGES = (
     ("rate", 1e-8, 1.0),
     ("warm_up", 0.0, 1.0),
@@ -60,7 +64,8 @@ class TrainingConfig:
         rate: peak learning rate (Adam with decoupled weight decay).
         warm_up: share of the steps with a rising rate.
         weight_decay: decoupled.
-        likelihood_from: share of the steps after which the likelihood replaces the squared error.
+        dropout: share of the head's features that is silenced; None leaves it to the network.
+        likelihood_from: share of the steps after which sigma is learned too.
         clip: largest norm of the gradient.
         average: decay of the running average of the weights per step.
         patience: epochs without a better validation error after which training stops.
@@ -80,6 +85,7 @@ class TrainingConfig:
     rate: float = 1e-3
     warm_up: float = 0.05
     weight_decay: float = 1e-4
+    dropout: float | None = None
     likelihood_from: float = 0.6
     clip: float = 1.0
     average: float = 0.998
@@ -98,6 +104,8 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and low <= value <= high):
                 raise ConfigError(name, repr(value), f"a number from {low} to {high}")
+        if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
+            raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
         if self.precision not in ("float32", "bfloat16"):
             raise ConfigError("precision", repr(self.precision), "float32 or bfloat16")
         if self.device not in ("auto", "cpu", "cuda"):
@@ -188,6 +196,8 @@ class _Run:
         self.config, self.sampler, self.folder = config, sampler, folder
         self.device = _device(config.device)
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
+        if config.dropout is not None:
+            _set_dropout(self.network, config.dropout)
         self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self.averaged.load_state_dict(self.network.state_dict())
         self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
@@ -232,7 +242,7 @@ class _Run:
             mean, log_sigma = self.network(windows)
         squared = (mean - target) ** 2
         likelihood = self.step >= self.config.likelihood_from * self.config.steps
-        loss = weighted_likelihood(squared, log_sigma) if likelihood else squared.sum(1).mean()
+        loss = loss_with_sigma(squared, log_sigma) if likelihood else squared.sum(1).mean()
         self.optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -383,10 +393,16 @@ class _ValidationSet:
         return {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
 
 
-def weighted_likelihood(squared: Tensor, log_sigma: Tensor) -> Tensor:
-    """Gaussian negative log-likelihood of squared errors (B, 3), weighted by sigma."""
-    sigma = log_sigma.exp()
-    return (sigma.detach() * (0.5 * squared / sigma**2 + log_sigma)).sum(1).mean()
+def _set_dropout(network: nn.Module, share: float) -> None:
+    for module in network.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = share
+
+
+def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
+    """Squared errors (B, 3) [m^2] and the likelihood of sigma given them, side by side."""
+    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
+    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
