@@ -78,6 +78,7 @@ class InnovationLog:
         }
         return Health(
             samples=counts.samples(),
+            flagged=counts.flagged(),
             gaps=list(counts.gaps),
             updates=self.offered,
             gated=self.gated,

@@ -4,21 +4,26 @@ Samples are checked, brought into strictly increasing time and cut at an even gr
 the IMU interpolated exactly there (so that nothing is integrated twice or left out). Each epoch
 carries its samples; at the times of a network update also the window that ends there, once a
 second of unbroken samples is there.
-Nothing here depends on the filter: batch runs may therefore hand all windows to the
-network at once and still give the streamed track.
+Samples that jump ahead in time wait until others confirm them, so that one wild timestamp does not
+make all that follow look late.
+
+Nothing here depends on the filter: batch runs may therefore hand all windows to the network at once
+and still give the streamed track.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.attitude import LevelledAttitude, start_from_gravity
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.suspects import FINE, Flags, Screen
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     MAX_IMU_GAP,
@@ -30,11 +35,30 @@ from stario.sequences.windows import (
 START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
 
+LONG_GAP = 10.0
+"""Behind a gap longer than this [s] nothing of attitude and speed is left: it begins anew there."""
+
+CONFIRMED, CONFIRMED_FAR = 2, 20
+"""Samples that confirm a jump ahead in time, and one by more than `LONG_GAP`, with none before."""
+
+_TAIL = 4
+"""Samples kept of the epoch before: half a step of the window's grid at the fastest rate."""
+
 _ABSURD = 1e5
 """No sensor reads this much in any unit used here; also catches infinities."""
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the filter begins: the first sample's time, and what `GravityStart` knows of it."""
+
+    time: float
+    R_WB: FloatArray
+    still: bool
+    force: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +70,9 @@ class Epoch:
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
+        anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
+        flags: whether samples of either sensor are saturated or were spikes.
+        suspect: whether samples of the window's are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
         update: whether windows begin and end at this epoch's end.
@@ -62,6 +89,9 @@ class Epoch:
     update: bool = False
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
+    anew: Start | None = None
+    flags: Flags = FINE
+    suspect: bool = False
 
     @property
     def start(self) -> float:
@@ -74,16 +104,6 @@ class Epoch:
         return float(self.time[-1])
 
 
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Where the filter begins: the first sample's time, and what `GravityStart` knows of it."""
-
-    time: float
-    R_WB: FloatArray
-    still: bool
-    force: float
-
-
 @dataclass
 class IntakeCounts:
     """What became of the samples.
@@ -93,6 +113,9 @@ class IntakeCounts:
         not_finite: dropped for a value that is not a number, infinite or absurdly large.
         duplicate: dropped for repeating the newest time.
         out_of_order: dropped for a time before the newest.
+        future: dropped for a time ahead of those that followed.
+        spike: used, but replaced for standing off its neighbours.
+        saturated: used, but at the sensor's limit.
         gaps: (start, length) [s] of the stretches without samples that were not bridged.
     """
 
@@ -100,11 +123,19 @@ class IntakeCounts:
     not_finite: int = 0
     duplicate: int = 0
     out_of_order: int = 0
+    future: int = 0
+    spike: int = 0
+    saturated: int = 0
     gaps: list[tuple[float, float]] = field(default_factory=list)
 
     def samples(self) -> dict[str, int]:
-        """Samples by what became of them."""
-        return {k: v for k, v in vars(self).items() if k != "gaps"}
+        """Samples by what became of them: used, or why they were dropped."""
+        names = ("used", "not_finite", "duplicate", "out_of_order", "future")
+        return {name: getattr(self, name) for name in names}
+
+    def flagged(self) -> dict[str, int]:
+        """Samples that were used but are not to be trusted."""
+        return {"spike": self.spike, "saturated": self.saturated}
 
 
 class Intake:
@@ -127,6 +158,11 @@ class Intake:
         self._newest = -math.inf
         self._window: deque[NDArray[np.float32]] = deque(maxlen=self._blocks)
         self._starts: deque[FloatArray] = deque(maxlen=self._blocks)
+        self._suspect: deque[bool] = deque(maxlen=self._blocks)
+        self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the epoch
+        self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
+        self._before_long_gap: Sample | None = None
+        self._screen = Screen()
         self.counts = IntakeCounts()
         self.start: Start | None = None
 
@@ -136,12 +172,46 @@ class Intake:
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < _ABSURD):
             self.counts.not_finite += 1
             return []
-        if time <= self._newest:
-            if time == self._newest:
-                self.counts.duplicate += 1
-            else:
-                self.counts.out_of_order += 1
+        if self._ahead and time > self._newest:
+            self._drop_ahead(time)
+        newest = self._ahead[-1][0] if self._ahead and time > self._newest else self._newest
+        if time == newest:
+            self.counts.duplicate += 1
+        elif time < newest:
+            self.counts.out_of_order += 1
+        elif self._ahead or time - newest > MAX_IMU_GAP:
+            return self._confirm(sample)
+        else:
+            return self._accept(sample)
+        return []
+
+    def finish(self) -> None:
+        """Nothing follows: what still waits for others to confirm its time is dropped."""
+        self.counts.future += len(self._ahead)
+        self._ahead = []
+
+    def _drop_ahead(self, time: float) -> None:
+        """Drop those of the samples that wait which a sample shows to have come from the future."""
+        ahead = self._ahead
+        known = len(ahead)
+        if time < ahead[0][0]:
+            ahead.clear()
+        while len(ahead) > 1 and ahead[-1][0] > max(time, ahead[-2][0] + MAX_IMU_GAP):
+            ahead.pop()
+        self.counts.future += known - len(ahead)
+
+    def _confirm(self, sample: Sample) -> list[Epoch]:
+        """A jump ahead in time, or a sample after one: enough of them confirm the jump."""
+        ahead = self._ahead
+        ahead.append(sample)
+        far = ahead[0][0] - self._newest > LONG_GAP
+        if len(ahead) < (CONFIRMED_FAR if far else CONFIRMED):
             return []
+        self._ahead = []
+        return [epoch for waiting in ahead for epoch in self._accept(waiting)]
+
+    def _accept(self, sample: Sample) -> list[Epoch]:
+        time = sample[0]
         gap = time - self._newest > MAX_IMU_GAP and bool(self._samples)
         self._newest = time
         self.counts.used += 1
@@ -160,24 +230,39 @@ class Intake:
             return []
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
-        self.start = Start(first, gravity.R_WB, gravity.still, gravity.force)
+        start = Start(first, gravity.R_WB, gravity.still, gravity.force)
         self._attitude = LevelledAttitude(gravity.R_WB, self._config.levelling_rate)
         self._restart_grid(first)
-        return self._complete()
+        epochs = []
+        if self.start is None:
+            self.start = start
+        elif self._before_long_gap is not None:
+            ends = np.array([self._before_long_gap, self._samples[0]])
+            epochs.append(replace(_epoch(ends, self._attitude, gap=True), anew=start))
+            self._before_long_gap = None
+        return epochs + self._complete()
 
     def _bridge_gap(self, sample: Sample) -> list[Epoch]:
         """End the epoch in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
         self.counts.gaps.append((before[-1][0], sample[0] - before[-1][0]))
+        self._window.clear()
+        self._starts.clear()
+        self._suspect.clear()
+        self._tail = None
         if self._attitude is None:
             self._next = -math.inf
             return []
         epochs = []
         if len(before) > 1:
-            epochs.append(_epoch(np.array(before), self._attitude))
-        self._window.clear()
-        self._starts.clear()
+            table = np.array(before)
+            flags = self._look(table)
+            epochs.append(replace(_epoch(table, self._attitude), flags=flags))
+        if sample[0] - before[-1][0] > LONG_GAP:
+            self._attitude, self._before_long_gap = None, before[-1]
+            self._next = -math.inf
+            return epochs
         self._attitude.restart()
         epochs.append(_epoch(np.array([before[-1], sample]), self._attitude, gap=True))
         self._restart_grid(sample[0])
@@ -190,34 +275,95 @@ class Intake:
     def _complete(self) -> list[Epoch]:
         epochs = []
         while self._newest >= self._next:
-            epochs.append(self._with_window(self._cut()))
+            epochs.append(self._with_window(*self._cut()))
         return epochs
 
-    def _cut(self) -> FloatArray:
+    def _cut(self) -> tuple[FloatArray, Flags]:
         """Samples of one period, the last one interpolated at its end; the rest stays."""
         stop = self._next
         later = next(k for k, sample in enumerate(self._samples) if sample[0] >= stop)
-        end = _interpolated(self._samples[later - 1], self._samples[later], stop)
-        inside, rest = self._samples[:later], self._samples[later:]
+        table = np.array(self._samples[: later + 1])
+        flags = self._look(table)
+        if flags.spikes:
+            self._samples[later] = tuple(table[later].tolist())
+        after = self._samples[later]
+        end = after if after[0] == stop else _interpolated(table[later - 1], table[later], stop)
+        rest = self._samples[later:]
         self._samples = rest if rest[0][0] == stop else [end, *rest]
         self._index += 1
         self._next = self._origin + self._index * self._period
-        return np.array([*inside, end])
+        table[later] = end
+        return table, flags
 
-    def _with_window(self, table: FloatArray) -> Epoch:
+    def _look(self, table: FloatArray) -> Flags:
+        flags = self._screen.look(table)
+        self.counts.spike += flags.spikes
+        self.counts.saturated += flags.saturated
+        return flags
+
+    def _with_window(self, table: FloatArray, flags: Flags) -> Epoch:
         attitude = self._attitude
         assert attitude is not None  # no epoch is cut before the start
         self._starts.append(attitude.R_NB)
+        self._suspect.append(flags.gyro or flags.accel)
         # _cut() has counted this epoch already.
         update = (self._index - 1) % self._config.filter.epochs_per_update == 0
-        epoch = replace(_epoch(table, attitude), update=update)
-        imu_N = _turned(epoch.attitudes, epoch.gyro, epoch.accel)
-        grid = epoch.start + self._block_grid
-        self._window.append(resample(epoch.time, imu_N, grid).astype(np.float32).T)
+        epoch = replace(_epoch(table, attitude), update=update, flags=flags)
+        self._window.append(self._block(epoch))
         if not update or len(self._window) < self._blocks:
             return epoch
         window = np.concatenate(self._window, axis=1)
-        return replace(epoch, window=window, R_NB_window=self._starts[0])
+        suspect = any(self._suspect)
+        return replace(epoch, window=window, R_NB_window=self._starts[0], suspect=suspect)
+
+    def _block(self, epoch: Epoch) -> NDArray[np.float32]:
+        """The epoch's part (6, n) of a window; averages reach half a step back, hence the tail."""
+        imu_N = _turned(epoch.attitudes, epoch.gyro, epoch.accel)
+        time, tail = epoch.time, self._tail
+        self._tail = np.column_stack([time[-_TAIL - 1 : -1], imu_N[-_TAIL - 1 : -1]])
+        if tail is not None:
+            time, imu_N = np.append(tail[:, 0], time), np.vstack([tail[:, 1:], imu_N])
+        grid = epoch.start + self._block_grid
+        return resample(time, imu_N, grid).astype(np.float32).T
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that `rewind` needs: arrays, numbers, text, lists and dictionaries."""
+        return {
+            "samples": np.array(self._samples).reshape(-1, 7),
+            "ahead": np.array(self._ahead).reshape(-1, 7),
+            "before_long_gap": self._before_long_gap and list(self._before_long_gap),
+            "attitude": self._attitude and vars(self._attitude),
+            "grid": [self._origin, self._index, self._next, self._newest],
+            "window": list(self._window),
+            "starts": list(self._starts),
+            "suspect": list(self._suspect),
+            "tail": self._tail,
+            "largest": self._screen.largest,
+            "counts": asdict(self.counts),
+            "start": self.start and vars(self.start),
+        }
+
+    def rewind(self, checkpoint: dict[str, Any]) -> None:
+        """Go back to a checkpoint."""
+        self._samples, self._ahead = (
+            [tuple(row) for row in checkpoint[name].tolist()] for name in ("samples", "ahead")
+        )
+        last = checkpoint["before_long_gap"]
+        self._before_long_gap = None if last is None else tuple(last)
+        self._attitude = None
+        if checkpoint["attitude"] is not None:
+            self._attitude = LevelledAttitude(np.eye(3), self._config.levelling_rate)
+            vars(self._attitude).update(checkpoint["attitude"])
+        self._origin, self._index, self._next, self._newest = checkpoint["grid"]
+        for name in ("window", "starts", "suspect"):
+            values = getattr(self, f"_{name}")
+            values.clear()
+            values.extend(checkpoint[name])
+        self._tail, self._screen.largest = checkpoint["tail"], checkpoint["largest"]
+        counts = checkpoint["counts"]
+        gaps = [(float(start), float(length)) for start, length in counts["gaps"]]
+        self.counts = IntakeCounts(**(counts | {"gaps": gaps}))
+        self.start = None if checkpoint["start"] is None else Start(**checkpoint["start"])
 
 
 def all_epochs(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[Epoch], Intake]:
@@ -226,6 +372,7 @@ def all_epochs(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[Epo
     epochs: list[Epoch] = []
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
         epochs += intake.push(tuple(sample))
+    intake.finish()
     return epochs, intake
 
 
@@ -244,7 +391,7 @@ def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
     return rows.reshape(-1, 6)
 
 
-def _interpolated(before: Sample, after: Sample, time: float) -> Sample:
+def _interpolated(before: FloatArray, after: FloatArray, time: float) -> Sample:
     weight = (time - before[0]) / (after[0] - before[0])
-    values = [b + weight * (a - b) for b, a in zip(before[1:], after[1:], strict=True)]
-    return (time, *values)  # type: ignore[return-value]  # seven numbers, as in a sample
+    values = before[1:] + weight * (after[1:] - before[1:])
+    return (time, *values.tolist())

@@ -16,6 +16,7 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
 from stario.fusion.graph_batch import smooth
@@ -38,6 +39,12 @@ _START_FORCE = (5.0, 15.0)
 
 Backend = Literal["ekf", "graph"]
 """The filter; or the factor graph, fixed-lag for streams and of the whole for recordings."""
+
+LEAST_SIGMA = 5e-3
+"""No network knows a second's displacement better than this [m], whatever it says."""
+
+SUSPECT_SCALE = 4.0
+"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
 
 Progress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
@@ -254,7 +261,7 @@ class Navigator:
             part = with_window[begin : begin + 512]
             mean, covariance = self.model.predict(np.stack([_window(epochs[k]) for k in part]))
             for k, d_N, cov_N in zip(part, mean, covariance, strict=True):
-                measurements[k] = (d_N, cov_N)
+                measurements[k] = _measurement(epochs[k], d_N, cov_N)
             progress(0.1 + 0.5 * (begin + len(part)) / len(with_window))
         return measurements
 
@@ -269,7 +276,7 @@ class Navigator:
         measurement = None
         if epoch.window is not None:
             mean, covariance = self.model.predict(epoch.window[None])
-            measurement = (mean[0], covariance[0])
+            measurement = _measurement(epoch, mean[0], covariance[0])
         return self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
 
     def _take(self, fix: Fix) -> None:
@@ -301,6 +308,13 @@ def _with_refused(health: Health, queue: FixQueue) -> Health:
 def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     assert epoch.window is not None  # only epochs that have one are asked
     return epoch.window
+
+
+def _measurement(epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> Measurement:
+    """What the network says of a window, as far as it can be trusted."""
+    if epoch.suspect:
+        covariance_N = SUSPECT_SCALE * covariance_N
+    return d_N, floored(covariance_N, LEAST_SIGMA)
 
 
 def _three(name: str, value: Vector) -> tuple[float, float, float]:

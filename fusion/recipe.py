@@ -21,12 +21,14 @@ from stario.fusion.engine import UpdateResult
 from stario.fusion.fixes import Fix, parts
 from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
-from stario.fusion.innovations import InnovationLog
+from stario.fusion.innovations import InnovationLog, count
 from stario.fusion.intake import Epoch, IntakeCounts, Start
+from stario.fusion.jacobians import yaw_twist
+from stario.fusion.lie import exp_so3
 from stario.fusion.rest import RestDetector
 from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState
-from stario.fusion.world import KNOWN_YAW, WorldChange, WorldFrame
+from stario.fusion.world import KNOWN_YAW, UNKNOWN_YAW, WorldChange, WorldFrame
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -35,6 +37,12 @@ STILL_TILT_SIGMA = 0.01
 
 SMALLEST_SIGMA = 1e-6
 """What is known exactly is given this much, so that the covariance stays positive definite."""
+
+WALKING_SPEED = 1.5
+"""How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
+
+FARTHEST = 1e4
+"""No gap is taken to have led farther than this [m]: the covariance must keep its digits."""
 
 _CHECKPOINT_SECONDS = 0.2
 """A late fix takes at most this much more filtering than its own lateness [s]."""
@@ -206,9 +214,13 @@ class FilterRecipe:
     ) -> None:
         if epoch.gap:
             self._forget_window()
-        if not fixes:
+        if epoch.anew is not None:
+            self._begin_anew(epoch, epoch.anew)
+            for _ in fixes:
+                count(self._log.fixes, "in a long gap")
+        elif not fixes:
             self._propagate(epoch)
-        for piece, due in parts(epoch, fixes) if fixes else ():
+        for piece, due in parts(epoch, fixes) if fixes and epoch.anew is None else ():
             if piece is not None:
                 self._propagate(piece)
             for fix in due:
@@ -218,6 +230,28 @@ class FilterRecipe:
             self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
             self._clone(epoch.stop)
+
+    def _begin_anew(self, epoch: Epoch, start: Start) -> None:
+        """Behind a long gap: tilt from gravity, speed and yaw unknown, somewhere in walking reach.
+
+        Fixes within the gap are of no use: nothing ties their time to the samples behind it.
+        """
+        ekf, f = self.ekf, self._config.filter
+        P, seconds = ekf.world_covariance(), epoch.stop - epoch.start
+        covariance = np.zeros_like(P)
+        tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+        covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
+        covariance[3:6, 3:6] = max(f.velocity_sigma, SMALLEST_SIGMA) ** 2 * np.eye(3)
+        reach = min(WALKING_SPEED * seconds, FARTHEST)
+        covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
+        walks = np.repeat([self._config.noise.gyro_walk, self._config.noise.accel_walk], 3)
+        turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
+        drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
+        covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
+        yaw = yaw_twist(ekf.R_WB)
+        turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
+        R_WB, b_g, b_a = turn @ start.R_WB, ekf.b_g, ekf.b_a
+        ekf.initialise(epoch.stop, R_WB, np.zeros(3), ekf.p_W, b_g, b_a, covariance)
 
     def _propagate(self, epoch: Epoch) -> None:
         ekf = self.ekf

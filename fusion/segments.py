@@ -49,6 +49,11 @@ def _unseen(
 def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:
     """White noise that grows with motion: scale and alignment errors act like it."""
     noise, f = config.noise, config.filter
+    # What a saturated sensor missed is as unknown as what happens in a gap.
+    if epoch.flags.gyro:
+        noise = replace(noise, gyro_noise=max(noise.gyro_noise, f.gap_gyro_noise))
+    if epoch.flags.accel:
+        noise = replace(noise, accel_noise=max(noise.accel_noise, f.gap_accel_noise))
     if f.gyro_motion_noise == 0.0 and f.accel_motion_noise == 0.0:
         return noise
     rate = math.sqrt(float(np.square(epoch.gyro).sum() / len(epoch.gyro)))

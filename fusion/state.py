@@ -70,6 +70,7 @@ class Health:
 
     Attributes:
         samples: used, and dropped by reason.
+        flagged: of those used, spikes that were replaced and samples at the sensor's limit.
         gaps: start and length [s] of each stretch without samples.
         updates: network measurements offered.
         gated: of these, how many had their covariance inflated.
@@ -84,6 +85,7 @@ class Health:
     """
 
     samples: dict[str, int] = field(default_factory=dict)
+    flagged: dict[str, int] = field(default_factory=dict)
     gaps: list[tuple[float, float]] = field(default_factory=list)
     updates: int = 0
     gated: int = 0
@@ -99,6 +101,8 @@ class Health:
         """The report for a person."""
         dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
         text = [f"samples used {self.samples.get('used', 0)}, dropped {dropped or 'none'}"]
+        if any(self.flagged.values()):
+            text.append(f"samples flagged: {_counted(self.flagged)}")
         longest = max((length for _, length in self.gaps), default=0.0)
         text.append(f"gaps {len(self.gaps)}, longest {longest:.2f} s")
         share = self.gated / self.updates if self.updates else 0.0

@@ -1,0 +1,95 @@
+"""Samples that cannot be right though they are finite: single spikes, and a sensor at its limit.
+
+A spike is one sample that stands off both its neighbours by more than a carried device can; it is
+replaced by their mean. Saturation shows in values that repeat exactly at the largest size the axis
+ever had, while it moves; what the sensor missed nobody knows, so such samples are only flagged.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stario.sequences.sequence import BoolArray, FloatArray
+
+SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
+"""Off both neighbours by more than this, a sample is a spike [rad/s], [m/s^2]: heel strikes stay
+below half of it at 50 Hz."""
+
+_MOVES = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+_LARGE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
+"""An axis that varies, or reads, no more than this may repeat itself: coarse digits at rest."""
+
+
+class Flags(NamedTuple):
+    """What is wrong with a stretch of samples.
+
+    Attributes:
+        gyro: whether a sample of the gyroscope is saturated or was a spike.
+        accel: likewise of the accelerometer.
+        spikes: number of samples replaced.
+        saturated: number of samples at the limit.
+    """
+
+    gyro: bool = False
+    accel: bool = False
+    spikes: int = 0
+    saturated: int = 0
+
+
+class Screen:
+    """Looks through the samples of one stream, epoch by epoch."""
+
+    def __init__(self) -> None:
+        self.largest = np.zeros(6)
+
+    def look(self, table: FloatArray) -> Flags:
+        """Mend spikes in place and say what is wrong.
+
+        Args:
+            table: (n, 7) samples: time, gyroscope, accelerometer; the first was looked at before.
+        """
+        values = table[:, 1:]
+        steps = values[1:] - values[:-1]
+        spiky = np.abs(steps).max(axis=0) > SPIKE
+        spikes = self._mend(values) if spiky.any() else _NO_AXES
+        self.largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+        stuck = _NO_AXES
+        if not steps.all():
+            stuck = self._stuck(values)
+        wrong = (spikes + stuck) > 0
+        if not wrong.any():
+            return FINE
+        return Flags(
+            bool(wrong[:3].any()), bool(wrong[3:].any()), int(spikes.max()), int(stuck.max())
+        )
+
+    @staticmethod
+    def _mend(values: FloatArray) -> FloatArray:
+        """Number of spikes per axis (6,), replaced by the mean of their neighbours."""
+        found = np.zeros(6)
+        n = len(values)
+        for k in range(1, n):
+            before = values[k - 1]
+            # The last sample has no neighbour behind it yet: it is held against the two before.
+            after = values[k + 1] if k + 1 < n else values[max(k - 2, 0)]
+            off = np.minimum(np.abs(values[k] - before), np.abs(values[k] - after)) > SPIKE
+            if off.any():
+                mean = 0.5 * (before + after) if k + 1 < n else before
+                values[k, off] = mean[off]
+                found += off
+        return found
+
+    def _stuck(self, values: FloatArray) -> FloatArray:
+        """Number of samples per axis (6,) that repeat at the axis's limit."""
+        size = np.abs(values)
+        moving = (np.ptp(values, axis=0) > _MOVES) | (self.largest > _LARGE)
+        repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
+        return np.asarray(repeated.sum(axis=0), dtype=np.float64)
+
+
+FINE = Flags()
+"""Nothing is wrong."""
+
+_NO_AXES = np.zeros(6)

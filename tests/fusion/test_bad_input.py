@@ -1,0 +1,354 @@
+"""What the navigator does with input that is wrong, on simulated walks."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.fusion import Navigator, NavState, Track
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import align, evaluate_track, pose_errors
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import ImuSequence
+
+# Settings that fit the oracle and the simulated phone; the defaults fit networks and real ones.
+FILTER = FilterConfig(
+    update_rate=10,
+    covariance_scale=1.0,
+    gyro_bias_sigma=3e-3,
+    accel_bias_sigma=0.05,
+    accel_motion_noise=0.0,
+)
+NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
+CONFIG = NavigatorConfig(NOISE, FILTER)
+VELOCITY = NavigatorConfig(NOISE, replace(FILTER, measurement="velocity"))
+
+Make = Callable[..., Any]
+
+
+def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
+    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
+    states = [navigator.push(*row) for row in rows]
+    return [state for state in states if state is not None]
+
+
+def streamed_off(states: list[NavState], track: Track) -> float:
+    """Largest distance [m] between a stream's states and the track, at the stream's times."""
+    rows = np.searchsorted(track.time, [s.time for s in states])
+    np.testing.assert_array_equal(track.time[rows], [s.time for s in states])
+    position = np.array([s.p_W for s in states])
+    return float(np.linalg.norm(track.trajectory.position_W[rows] - position, axis=1).max())
+
+
+def ate(track: Track, sequence: ImuSequence) -> float:
+    return evaluate_track(track.trajectory, sequence.truth).ate_m
+
+
+def final_error(track: Track, sequence: ImuSequence) -> float:
+    error = pose_errors(align(track.trajectory, sequence.truth, "first"), sequence.truth)
+    return float(np.linalg.norm(error.position_W[-1]))
+
+
+@pytest.fixture(scope="module")
+def track(walk: ImuSequence, make_oracle: Make) -> Track:
+    return Navigator(make_oracle(walk, walk.truth, CONFIG)).run(walk)
+
+
+def test_health_counts_what_was_put_in(walk: ImuSequence, make_oracle: Make) -> None:
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    gyro[200:230, 1], accel[700] = np.nan, np.inf
+    time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
+    bad = replace(walk, time=time, gyro=gyro, accel=accel)
+    oracle = make_oracle(bad, walk.truth, CONFIG)
+    track = Navigator(oracle).run(bad)
+    health = track.health
+    assert health.samples == {
+        "used": len(walk) - 34,
+        "not_finite": 31,
+        "duplicate": 1,
+        "out_of_order": 2,
+        "future": 0,
+    }
+    ((start, length),) = health.gaps
+    assert start == pytest.approx(time[199])
+    assert length == pytest.approx(time[230] - time[199])
+    assert health.updates == len(track.innovations.time)
+    assert health.refused == {}
+    assert health.gated == int(track.innovations.gated.sum())
+    assert health.mean_nis == pytest.approx(track.innovations.nis.mean())
+    assert health.final_sigma["position_m"] == pytest.approx(
+        np.sqrt(np.diag(track.covariance[-1])[6:9].max())
+    )
+    assert all("\n" not in line for line in health.lines())
+
+
+def test_states_stay_finite_under_bursts_of_nan(walk: ImuSequence, make_oracle: Make) -> None:
+    rng = np.random.default_rng(0)
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    for start in rng.integers(0, len(walk), 30):
+        (gyro if rng.random() < 0.5 else accel)[start : start + rng.integers(1, 60)] = np.nan
+    bad = replace(walk, gyro=gyro, accel=accel)
+    navigator = Navigator(make_oracle(bad, walk.truth, CONFIG))
+    for state in stream(navigator, bad):
+        for value in (state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a, state.covariance):
+            assert np.isfinite(value).all()
+        assert np.linalg.eigvalsh(state.covariance).min() > -1e-9
+    assert len(navigator.health.gaps) > 5
+
+
+class Broken:
+    """A network that answers with what no filter can use, one window in three."""
+
+    def __init__(self, inner: Any, mean: float, variance: float) -> None:
+        self.inner, self.mean, self.variance, self.count = inner, mean, variance, 0
+
+    def predict(self, windows):
+        mean, covariance = self.inner.predict(windows)
+        for k in range(len(mean)):
+            self.count += 1
+            if self.count % 3 == 0:
+                mean[k, 0] += self.mean
+                covariance[k, 0, 0] = self.variance
+        return mean, covariance
+
+
+@pytest.mark.parametrize(
+    ("mean", "variance", "reason"),
+    [
+        (np.nan, 1e-4, "value that is not finite"),
+        (0.0, np.inf, "value that is not finite"),
+        (0.0, -1.0, "covariance not positive definite"),
+    ],
+)
+def test_measurements_without_meaning_are_refused_and_counted(
+    walk: ImuSequence, make_oracle: Make, mean: float, variance: float, reason: str
+) -> None:
+    model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
+    track = Navigator(model).run(walk)
+    assert track.health.refused == {reason: track.health.updates // 3}
+    assert ate(track, walk) < 0.3
+
+
+def test_outliers_are_gated_and_do_little_harm(walk: ImuSequence, make_oracle: Make) -> None:
+    model = Broken(make_oracle(walk, walk.truth, CONFIG), 5.0, 0.02**2)
+    track = Navigator(model, CONFIG).run(walk)
+    assert 0.5 * track.health.updates / 3 < track.health.gated
+    open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16))
+    model = Broken(make_oracle(walk, walk.truth, open_gate), 5.0, 0.02**2)
+    assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate).run(walk), walk)
+
+
+@pytest.mark.parametrize("config", [CONFIG, VELOCITY], ids=["displacement", "velocity"])
+@pytest.mark.parametrize("length", [0.5, 3.0])
+def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
+    make_walk: Make, make_oracle: Make, without: Make, length: float, config: NavigatorConfig
+) -> None:
+    covered, slow = [], []
+    for seed in range(4):
+        walk = make_walk(seed, 20.0)
+        holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
+        track = Navigator(make_oracle(holed, walk.truth, config), config).run(holed)
+        assert (~track.trajectory.valid).sum() == 1
+        assert track.health.gaps[0][1] == pytest.approx(length, abs=0.03)
+        truth = walk.truth.at(np.clip(track.time, 0.0, walk.time[-1]))
+        aligned = align(track.trajectory, walk.truth, "first")
+        error = aligned.position_W - truth.position_W
+        late = track.time > 8.0 + length + 4.0
+        sigma = np.sqrt(np.trace(track.covariance[late, 6:9, 6:9], axis1=1, axis2=2))
+        covered.append(np.linalg.norm(error[late], axis=1) / sigma)
+        # How far the walker turned meanwhile nobody saw: the speed comes back, not the direction.
+        speed, true_speed = (
+            np.linalg.norm(v[late, :2], axis=1) for v in (aligned.velocity_W, truth.velocity_W)
+        )
+        slow.append(np.abs(speed - true_speed).mean())
+        before, after = (
+            np.sqrt(np.trace(track.covariance[k, 6:9, 6:9]))
+            for k in (np.searchsorted(track.time, 8.0) - 1, -1)
+        )
+        assert after > before
+    assert np.max(np.mean(covered, axis=1)) < 2.0
+    assert np.max(slow) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("scale_gyro", "scale_accel", "option"),
+    [(180 / np.pi, 1.0, "--gyro-unit deg/s"), (1.0, 1 / 9.80665, "--accel-unit g")],
+)
+def test_wrong_units_are_refused_with_the_option_that_mends_them(
+    walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, option: str
+) -> None:
+    wrong = replace(walk, gyro=scale_gyro * walk.gyro, accel=scale_accel * walk.accel)
+    with pytest.raises(InputError, match=option) as caught:
+        Navigator(still_model).run(wrong.without_truth())
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_gravity_is_refused(walk: ImuSequence, still_model: Any) -> None:
+    up_B = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
+    with pytest.raises(InputError, match="accelerometer"):
+        Navigator(still_model).run(replace(walk, accel=walk.accel - up_B))
+
+
+@pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])
+def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
+    walk: ImuSequence, make_oracle: Make, scale: float
+) -> None:
+    navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
+    with pytest.raises(InputError, match="accel: found an average"):
+        stream(navigator, replace(walk, accel=scale * walk.accel))
+    assert navigator.state is None
+    assert streamed_off(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.02, 0.9, 1.4])
+def test_a_recording_that_is_too_short_is_a_clear_error(
+    walk: ImuSequence, still_model: Any, seconds: float
+) -> None:
+    with pytest.raises(InputError, match="at least") as caught:
+        Navigator(still_model).run(walk.slice(0.0, seconds))
+    assert walk.name in str(caught.value)
+
+
+def test_a_recording_of_pieces_shorter_than_a_window_is_a_clear_error(
+    walk: ImuSequence, still_model: Any, without: Make
+) -> None:
+    holed = without(walk, walk.time % 0.9 > 0.7)
+    with pytest.raises(InputError, match="unbroken stretch"):
+        Navigator(still_model).run(holed)
+
+
+@pytest.mark.parametrize("vector", [(1.0, 2.0), 3.0, "abc", (1, 2, None), None])
+def test_a_sample_that_is_no_vector_is_refused_by_name(still_model: Any, vector: Any) -> None:
+    navigator = Navigator(still_model)
+    with pytest.raises(InputError, match="gyro"):
+        navigator.push(0.0, vector, (0.0, 0.0, 9.8))
+    with pytest.raises(InputError, match="accel"):
+        navigator.push(0.0, (0.0, 0.0, 0.0), vector)
+
+
+def test_before_its_first_second_a_stream_has_no_state_but_a_report(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    navigator = Navigator(still_model)
+    assert stream(navigator, walk.slice(0.0, 0.5)) == []
+    assert navigator.state is None
+    assert navigator.health.samples["used"] == 51
+    assert navigator.health.lines()
+
+
+# --- time ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wild", [1e9, 300.0, 2.0])
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_wild_timestamp_does_not_starve_a_stream(
+    walk: ImuSequence, make_oracle: Make, without: Make, wild: float, count: int
+) -> None:
+    time = walk.time.copy()
+    jumped = np.zeros(len(walk), dtype=bool)
+    # Alone each, or (far ahead) several in a row.
+    jumped[1000 : 1000 + 50 * count : 50] = True
+    if wild > 100.0:
+        jumped[1300 : 1300 + count] = True
+    time[jumped] += wild
+    bad, expected = replace(walk, time=time), without(walk, jumped)
+    oracle = make_oracle(expected, walk.truth, CONFIG)
+    navigator = Navigator(oracle)
+    states = stream(navigator, bad)
+    assert streamed_off(states, Navigator(oracle).run(expected)) < 1e-9
+    assert navigator.health.samples["future"] == jumped.sum()
+    assert navigator.health.samples["out_of_order"] == 0
+    assert navigator.health.gaps == []
+
+
+@pytest.mark.parametrize("first", [1e9, 5.0])
+def test_a_stream_may_start_with_a_wild_timestamp(
+    walk: ImuSequence, make_oracle: Make, without: Make, first: float
+) -> None:
+    time = walk.time.copy()
+    time[0] = time[7] = first
+    gone = np.zeros(len(walk), dtype=bool)
+    gone[[0, 7]] = True
+    expected = without(walk, gone)
+    oracle = make_oracle(expected, walk.truth, CONFIG)
+    navigator = Navigator(oracle)
+    states = stream(navigator, replace(walk, time=time))
+    assert streamed_off(states, Navigator(oracle).run(expected)) < 1e-9
+    assert navigator.health.samples["future"] == 2
+
+
+@pytest.mark.parametrize("config", [CONFIG, VELOCITY], ids=["displacement", "velocity"])
+@pytest.mark.parametrize("seconds", [60.0, 1e6])
+def test_behind_a_long_gap_it_begins_anew_where_it_was(
+    walk: ImuSequence, make_oracle: Make, config: NavigatorConfig, seconds: float
+) -> None:
+    """Meanwhile the device was turned over: its first second tells the tilt again."""
+    late = walk.time > 10.0
+    turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    gyro[late], accel[late] = turn.apply(gyro[late]), turn.apply(accel[late])
+    time = walk.time + seconds * late
+    attitude = [*walk.truth.attitude_WB[~late]] + [
+        R * turn.inv() for R in walk.truth.attitude_WB[late]
+    ]
+    truth = replace(walk.truth, time=time, attitude_WB=Rotation.concatenate(attitude))
+    broken = replace(walk, time=time, gyro=gyro, accel=accel, truth=truth)
+    oracle = make_oracle(broken, truth, config)
+    track, navigator = Navigator(oracle, config).run(broken), Navigator(oracle, config)
+    assert streamed_off(stream(navigator, broken), track) < 1e-9
+    assert track.health.gaps == [(pytest.approx(10.0), pytest.approx(seconds + 0.01, rel=1e-6))]
+    after = track.time > 10.0 + seconds + 4.0
+    ours, theirs = track.trajectory, truth.at(track.time)
+    speed, true_speed = (np.linalg.norm(t.velocity_W[after, :2], axis=1) for t in (ours, theirs))
+    assert np.abs(speed - true_speed).mean() < 0.25
+    up, true_up = (t.attitude_WB[after].inv().apply([0.0, 0.0, 1.0]) for t in (ours, theirs))
+    assert np.degrees(np.linalg.norm(up - true_up, axis=1)).mean() < 4.0
+    sigma = np.sqrt(np.diag(track.covariance[-1]))
+    assert sigma[2] > 1.0
+    assert sigma[6] > min(seconds, 9e3)
+    assert np.isfinite(track.covariance).all()
+
+
+# --- values ----------------------------------------------------------------------------------
+
+
+def test_spikes_are_replaced_and_counted(walk: ImuSequence, make_oracle: Make) -> None:
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    gyro[405, 0] += 300.0
+    gyro[800, 2] -= 50.0  # at an epoch's end
+    accel[1203] += 500.0
+    spiky = replace(walk, gyro=gyro, accel=accel)
+    oracle = make_oracle(spiky, walk.truth, CONFIG)
+    track, navigator = Navigator(oracle).run(spiky), Navigator(oracle)
+    assert streamed_off(stream(navigator, spiky), track) < 1e-9
+    assert track.health.flagged == {"spike": 3, "saturated": 0}
+    assert track.health.samples["used"] == len(walk)
+    assert ate(track, walk) < 0.3
+    assert any("spike 3" in line for line in track.health.lines())
+
+
+def test_a_clipped_sensor_is_flagged_and_trusted_less(walk: ImuSequence, make_oracle: Make) -> None:
+    limit = float(np.quantile(np.abs(walk.accel).max(axis=1), 0.9))
+    clipped = replace(walk, accel=np.clip(walk.accel, -limit, limit))
+    oracle = make_oracle(clipped, walk.truth, CONFIG)
+    track = Navigator(oracle, CONFIG).run(clipped)
+    stuck = (np.abs(clipped.accel[1:]) == limit) & (clipped.accel[1:] == clipped.accel[:-1])
+    assert 0.3 * stuck.sum() < track.health.flagged["saturated"] <= stuck.sum()
+    whole = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG).run(walk)
+    assert whole.health.flagged == {"spike": 0, "saturated": 0}
+    assert np.trace(track.covariance[-1, 3:6, 3:6]) > np.trace(whole.covariance[-1, 3:6, 3:6])
+    assert ate(track, walk) < ate(whole, walk) + 0.2
+
+
+def test_a_network_that_claims_to_be_exact_is_not_believed(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.01, sigma=1e-9)
+    track = Navigator(oracle, CONFIG).run(walk)
+    assert np.isfinite(track.covariance).all()
+    assert np.sqrt(track.covariance[-1, 6, 6]) > 5e-3
+    assert ate(track, walk) < 0.3
