@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from stario.network.displacement import DisplacementNetwork
 from stario.network.inference import inference_form
-from stario.network.model import DisplacementNetwork
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES

@@ -104,18 +104,10 @@ def read_card(weights: Path) -> Card:
         if not needed.is_file():
             raise WeightsError(needed, "file", "nothing there", "weights and card side by side")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        calibration = _calibration(content.pop("calibration"))
-        unknown = set(content) - {f.name for f in fields(Card)}
-        if unknown:
-            raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
-        card = Card(calibration=calibration, **content)
-        for name in ("architecture", "sha256"):
-            if not isinstance(getattr(card, name), str):
-                raise ValueError(f"{name} {getattr(card, name)!r}")
-    except (ValueError, TypeError, KeyError, AttributeError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
-    _check(card, path)
+    card = parse_card(text, path)
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
     if digest != card.sha256:
         raise WeightsError(
@@ -125,6 +117,32 @@ def read_card(weights: Path) -> Card:
             f"{card.sha256[:12]} as on the card",
             "the file is cut short or belongs to another card",
         )
+    return card
+
+
+def parse_card(text: str, path: Path) -> Card:
+    """A card from its JSON text.
+
+    Args:
+        text: as `dump_card` gives it.
+        path: of the file it came from, for the error.
+
+    Raises:
+        WeightsError: the text is no card, or one of another kind of windows.
+    """
+    try:
+        content = json.loads(text)
+        calibration = _calibration(content.pop("calibration"))
+        unknown = set(content) - {f.name for f in fields(Card)}
+        if unknown:
+            raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
+        card = Card(calibration=calibration, **content)
+        for name in ("architecture", "sha256"):
+            if not isinstance(getattr(card, name), str):
+                raise ValueError(f"{name} {getattr(card, name)!r}")
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
+    _check(card, path)
     return card
 
 

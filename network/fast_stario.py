@@ -45,7 +45,7 @@ class FastStarIO(nn.Module):
 
     def __init__(self, network: StarIO) -> None:
         super().__init__()
-        self._stages: list[_Stage] = []
+        self.stages: list[Stage] = []
         layers = list(network.trunk)
         length, offset = WINDOW_SAMPLES, torch.zeros(6, dtype=torch.float64)
         while layers:
@@ -53,10 +53,10 @@ class FastStarIO(nn.Module):
             blocks = []
             while layers and isinstance(layers[0], Block):
                 blocks.append(layers.pop(0))
-            stage = _Stage(convolution, norm, blocks, length, offset)
-            self._stages.append(stage)
+            stage = Stage(convolution, norm, blocks, length, offset)
+            self.stages.append(stage)
             length, offset = stage.length, stage.offset
-        self._head = _head(network.head, length, offset)
+        self.head = _head(network.head, length, offset)
         self._local = threading.local()
 
     def forward(self, windows: Tensor) -> Tensor:
@@ -70,7 +70,7 @@ class FastStarIO(nn.Module):
         if found is None:
             # Buffers made in inference mode could not be written outside of it.
             with torch.inference_mode(False):
-                found = _Recording(self._stages, self._head, batch)
+                found = _Recording(self.stages, self.head, batch)
         known[batch] = found  # the newest is the last
         while len(known) > _RECORDINGS:
             del known[next(iter(known))]
@@ -88,7 +88,7 @@ class FastStarIO(nn.Module):
 class _Recording:
     """The operations on a batch of one size, in order, with everything they write to."""
 
-    def __init__(self, stages: list[_Stage], head: list[_Product], batch: int) -> None:
+    def __init__(self, stages: list[Stage], head: list[Product], batch: int) -> None:
         self._operations: list[Callable[[], Any]] = []
         self._windows = torch.zeros(batch, 6, WINDOW_SAMPLES)
         padded = torch.zeros(batch, WINDOW_SAMPLES + 2, 6)
@@ -113,7 +113,7 @@ class _Recording:
         return self._outputs.clone()
 
 
-class _Product:
+class Product:
     """Product of rows (N, C) with a weight (D, C), plus a bias (D,) if there is one."""
 
     def __init__(self, weight: Tensor, bias: Tensor | None = None) -> None:
@@ -135,7 +135,7 @@ class _Product:
         recording.do(torch.addmm, flat, rows, self.weight, out=flat)
 
 
-class _Stage:
+class Stage:
     """Strided convolution with its norm, and the blocks behind it.
 
     Args:
@@ -160,38 +160,38 @@ class _Stage:
     ) -> None:
         assert isinstance(convolution, nn.Conv1d)
         assert isinstance(norm, nn.BatchNorm1d)
-        self._stride = convolution.stride[0]
+        self.stride = convolution.stride[0]
         # Only the stem pads; its input lacks nothing.
-        self.length = (length + 2 * int(convolution.padding[0]) - 3) // self._stride + 1
+        self.length = (length + 2 * int(convolution.padding[0]) - 3) // self.stride + 1
         scale, shift = affine(norm)
         weight = convolution.weight.double() * scale[:, None, None]
         bias = shift + weight.sum(2) @ offset
-        self._taps = _Product(weight.transpose(1, 2).flatten(1), bias)
+        self.taps = Product(weight.transpose(1, 2).flatten(1), bias)
         self.offset = torch.zeros(len(bias), dtype=torch.float64)
-        self._layers: list[_Star | _Gate] = []
+        self.layers: list[Star | Gate] = []
         for block in blocks:
             assert isinstance(block, Block)
-            self._add(_Star(block.star, self.length, self.offset))
+            self._add(Star(block.star, self.length, self.offset))
             if block.gated is not None:
-                self._add(_Gate(block.gated, self.length, self.offset))
+                self._add(Gate(block.gated, self.length, self.offset))
 
-    def _add(self, layer: _Star | _Gate) -> None:
-        self._layers.append(layer)
+    def _add(self, layer: Star | Gate) -> None:
+        self.layers.append(layer)
         self.offset = self.offset + layer.left_out
 
     def record(self, recording: _Recording, x: Tensor) -> Tensor:
         """The buffer (B, L, C) of the result for an input buffer, padded already."""
-        taps = x.unfold(1, 3, self._stride)[:, : self.length].transpose(2, 3)
-        if x.shape[1] == self._stride * self.length and self._stride == 3:
+        taps = x.unfold(1, 3, self.stride)[:, : self.length].transpose(2, 3)
+        if x.shape[1] == self.stride * self.length and self.stride == 3:
             rows = x  # the taps lie there one after the other
         else:
             rows = torch.empty(taps.shape)
             recording.do(rows.copy_, taps)
         batch = len(x)
-        y = self._taps.record(recording, rows.view(batch * self.length, -1))
+        y = self.taps.record(recording, rows.view(batch * self.length, -1))
         y = y.view(batch, self.length, -1)
         scratch = _Scratch(y)
-        for layer in self._layers:
+        for layer in self.layers:
             layer.record(recording, y, scratch)
         return y
 
@@ -210,7 +210,7 @@ class _Scratch:
         self.energy = torch.empty(batch, 1)
 
 
-class _Depthwise:
+class Depthwise:
     """Depthwise convolution of width 3, zero-padded, with norms before and after it folded in.
 
     Args:
@@ -235,17 +235,17 @@ class _Depthwise:
         reach[0, 0] = reach[2, -1] = 0.0  # the padding is zero, it has no offset
         bias = bias + (reach * (taps * before[1])[:, None]).sum(0)
         taps = taps * before[0] * after[0]
-        self._bias = _own(bias * after[0] + after[1])
-        self._taps = [_own(tap) for tap in taps]
+        self.bias = _own(bias * after[0] + after[1])
+        self.taps = [_own(tap) for tap in taps]
 
     def record(self, recording: _Recording, x: Tensor, y: Tensor) -> None:
         """From buffer to buffer, both (B, L, C)."""
-        previous, present, following = self._taps
-        recording.do(torch.addcmul, self._bias, x, present, out=y)
+        previous, present, following = self.taps
+        recording.do(torch.addcmul, self.bias, x, present, out=y)
         _record_neighbours(recording, x, previous, following, y)
 
 
-class _Star:
+class Star:
     """DWSB and its shortcut.
 
     Attributes:
@@ -254,37 +254,37 @@ class _Star:
 
     def __init__(self, block: DualWingStarBlock, length: int, offset: Tensor) -> None:
         before = torch.ones_like(offset), offset
-        self._depthwise = _Depthwise(block.depthwise, before, affine(block.norm), length)
+        self.depthwise = Depthwise(block.depthwise, before, affine(block.norm), length)
         branches = block.branch_gate, block.branch_value
         weight = torch.cat([branch.weight.squeeze(2) for branch in branches])
-        self._branches = _Product(weight, torch.cat([_bias(branch) for branch in branches]))
-        self._wings = _Wings(block, length)
-        weight = block.project.weight.squeeze(2).double() * self._wings.factor
-        self._project = _Product(weight)
+        self.branches = Product(weight, torch.cat([_bias(branch) for branch in branches]))
+        self.wings = Wings(block, length)
+        weight = block.project.weight.squeeze(2).double() * self.wings.factor
+        self.project = Product(weight)
         self.left_out = _bias(block.project).double()
 
     def record(self, recording: _Recording, x: Tensor, scratch: _Scratch) -> None:
         """Change x (B, L, C)."""
         do = recording.do
-        self._depthwise.record(recording, x, scratch.depthwise)
+        self.depthwise.record(recording, x, scratch.depthwise)
         rows = scratch.depthwise.flatten(0, 1)
         star, square = scratch.powers.flatten(1, 2).unbind()
         inner = star.shape[1]
-        branches = self._branches.record(recording, rows)
+        branches = self.branches.record(recording, rows)
         gate, value = branches[:, :inner], branches[:, inner:]
         do(torch.clamp, gate, 0.0, 6.0, out=gate)
         do(torch.mul, gate, value, out=star)
         do(torch.mul, star, star, out=square)
         do(torch.sum, scratch.powers, 2, out=scratch.sums[:, :, :inner])
         do(torch.sum, scratch.powers, 3, out=scratch.sums[:, :, inner:])
-        self._wings.record(recording, scratch)
+        self.wings.record(recording, scratch)
         channel, time = scratch.wings[:, :inner], scratch.wings[:, inner:]
         do(torch.add, channel.unsqueeze(1), time.unsqueeze(2), out=scratch.powers[1])
         do(torch.mul, star, square, out=star)
-        self._project.onto(recording, star, x)
+        self.project.onto(recording, star, x)
 
 
-class _Wings:
+class Wings:
     """Weights of both wings from the pooled star operation, before its normalisation.
 
     With q the mean square, r = 1 / sqrt(q + eps), and mean m and variance v before normalising,
@@ -298,7 +298,7 @@ class _Wings:
 
     def __init__(self, block: DualWingStarBlock, length: int) -> None:
         inner = block.branch_gate.out_channels
-        self._inner = inner
+        self.inner = inner
         size = inner * length
         self.factor = size**0.5
 
@@ -308,41 +308,41 @@ class _Wings:
 
         channel, time = block.channel_wing, block.time_wing
         count = side_by_side(torch.tensor(length), torch.tensor(inner))
-        self._count = _own(count)
-        self._floor = _own(count**2 * EPSILON / size)
-        self._epsilon = torch.full((1,), size * EPSILON)
-        self._mu = _own(side_by_side(channel.mu, time.mu) / count)
-        self._xi = _own(side_by_side(channel.xi, time.xi) / count)
+        self.count = _own(count)
+        self.floor = _own(count**2 * EPSILON / size)
+        self.epsilon = torch.full((1,), size * EPSILON)
+        self.mu = _own(side_by_side(channel.mu, time.mu) / count)
+        self.xi = _own(side_by_side(channel.xi, time.xi) / count)
         kernels = channel.convolution.weight.view(3), time.convolution.weight.view(3)
         taps = [side_by_side(a, b) * self.factor for a, b in zip(*kernels, strict=True)]
         seam = torch.ones(inner + length - 1)
         seam[inner - 1] = 0.0  # neither wing sees the other
-        self._previous = _own(taps[0][1:] * seam)
-        self._present = _own(taps[1])
-        self._following = _own(taps[2][:-1] * seam)
+        self.previous = _own(taps[0][1:] * seam)
+        self.present = _own(taps[1])
+        self.following = _own(taps[2][:-1] * seam)
 
     def record(self, recording: _Recording, scratch: _Scratch) -> None:
         """From `scratch.sums` of star and square to `scratch.wings`: weights x r / factor."""
         do = recording.do
         (total, square), weights, energy = scratch.sums.unbind(), scratch.wings, scratch.energy
-        do(torch.sum, square[:, self._inner :], 1, keepdim=True, out=energy)
-        do(torch.add, energy, self._epsilon, out=energy)
-        do(torch.mul, square, self._count, out=square)
+        do(torch.sum, square[:, self.inner :], 1, keepdim=True, out=energy)
+        do(torch.add, energy, self.epsilon, out=energy)
+        do(torch.mul, square, self.count, out=square)
         do(torch.addcmul, square, total, total, value=-1.0, out=square)
         do(torch.clamp_min, square, 0.0, out=square)
-        do(torch.addcmul, square, energy, self._floor, out=square)
+        do(torch.addcmul, square, energy, self.floor, out=square)
         do(torch.sqrt, square, out=square)
-        do(torch.mul, total, self._mu, out=total)
-        do(torch.addcmul, total, square, self._xi, out=total)
-        do(torch.mul, total, self._present, out=weights)
-        _record_neighbours(recording, total, self._previous, self._following, weights)
+        do(torch.mul, total, self.mu, out=total)
+        do(torch.addcmul, total, square, self.xi, out=total)
+        do(torch.mul, total, self.present, out=weights)
+        _record_neighbours(recording, total, self.previous, self.following, weights)
         do(torch.rsqrt, energy, out=energy)
         do(torch.mul, weights, energy, out=weights)
         do(torch.sigmoid, weights, out=weights)
         do(torch.mul, weights, energy, out=weights)
 
 
-class _Gate:
+class Gate:
     """MSGCU and its shortcut.
 
     Attributes:
@@ -354,13 +354,13 @@ class _Gate:
         shift = shift + scale * offset
         channels = len(shift)
         none = torch.ones(channels), torch.zeros(channels)
-        self._value = _Depthwise(unit.value, (scale, shift), none, length)
+        self.value = Depthwise(unit.value, (scale, shift), none, length)
         squeeze = unit.squeeze.weight.double()
-        self._squeeze = _Product(squeeze * scale / length, squeeze @ shift)
-        self._excite = _Product(unit.excite.weight)
+        self.squeeze = Product(squeeze * scale / length, squeeze @ shift)
+        self.excite = Product(unit.excite.weight)
         size = length * channels
-        self._epsilon = torch.full((1,), size * EPSILON)
-        self._project = _Product(unit.project.weight.squeeze(2).double() * size**0.5)
+        self.epsilon = torch.full((1,), size * EPSILON)
+        self.project = Product(unit.project.weight.squeeze(2).double() * size**0.5)
         self.left_out = _bias(unit.project).double()
 
     def record(self, recording: _Recording, x: Tensor, scratch: _Scratch) -> None:
@@ -368,26 +368,26 @@ class _Gate:
         do = recording.do
         pooled = torch.empty(len(x), x.shape[2])
         do(torch.sum, x, 1, out=pooled)
-        hidden = self._squeeze.record(recording, pooled)
+        hidden = self.squeeze.record(recording, pooled)
         do(torch.clamp_min, hidden, 0.0, out=hidden)
-        gate = self._excite.record(recording, hidden)
+        gate = self.excite.record(recording, hidden)
         do(torch.softmax, gate, 1, out=gate)
         value, energy = scratch.depthwise, scratch.energy
-        self._value.record(recording, x, value)
+        self.value.record(recording, x, value)
         do(torch.mul, value, gate.unsqueeze(1), out=value)
         do(torch.linalg.vector_norm, value.flatten(1), dim=1, keepdim=True, out=energy)
-        do(torch.addcmul, self._epsilon, energy, energy, out=energy)
+        do(torch.addcmul, self.epsilon, energy, energy, out=energy)
         do(torch.rsqrt, energy, out=energy)
         do(torch.mul, value, energy.unsqueeze(2), out=value)
-        self._project.onto(recording, value.flatten(0, 1), x)
+        self.project.onto(recording, value.flatten(0, 1), x)
 
 
-def _head(head: nn.Sequential, length: int, offset: Tensor) -> list[_Product]:
+def _head(head: nn.Sequential, length: int, offset: Tensor) -> list[Product]:
     """Linear layers; the first reads the channels of a time step together, not the reverse."""
     first, *others = [layer for layer in head if isinstance(layer, nn.Linear)]
     weight = first.weight.double().view(len(first.weight), -1, length)
-    products = [_Product(weight.transpose(1, 2).flatten(1), first.bias + weight.sum(2) @ offset)]
-    return products + [_Product(layer.weight, layer.bias) for layer in others]
+    products = [Product(weight.transpose(1, 2).flatten(1), first.bias + weight.sum(2) @ offset)]
+    return products + [Product(layer.weight, layer.bias) for layer in others]
 
 
 def _record_neighbours(

@@ -9,7 +9,7 @@ from stario.network.folding import folded
 from stario.network.stario import StarIO
 
 if TYPE_CHECKING:
-    from stario.network.model import DisplacementNetwork
+    from stario.network.displacement import DisplacementNetwork
 
 
 def inference_form(network: DisplacementNetwork) -> DisplacementNetwork:

@@ -1,7 +1,6 @@
-"""Displacement and covariance from windows: what every network is wrapped in.
+"""Displacement and covariance from windows: what callers use, NumPy in and NumPy out.
 
-`DisplacementNetwork` is the trainable module (windows to displacement and log sigma);
-`DisplacementModel` is what callers use: NumPy in, NumPy out, covariance calibrated.
+A `DisplacementModel` is an engine that computes a network and the card with its calibration.
 """
 
 from __future__ import annotations
@@ -13,60 +12,55 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import safetensors.torch
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor, nn
 
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
-from stario.network.inference import inference_form
+from stario.network.displacement import DisplacementNetwork as DisplacementNetwork
+from stario.network.engines import Engine, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES, WINDOW_SECONDS
-
-_BATCH = 64
-_LOG_SIGMA_RANGE = (-6.0, 3.0)
-
-
-class DisplacementNetwork(nn.Module):
-    """A network with its input centred: gravity is taken off the vertical specific force.
-
-    Args:
-        network: (B, 6, 200) to (B, 6).
-    """
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-        self.gravity: Tensor
-        gravity = torch.zeros(6, 1)
-        gravity[5] = STANDARD_GRAVITY
-        self.register_buffer("gravity", gravity, persistent=False)
-
-    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
-        output = self.network(windows - self.gravity).float()
-        return output[:, :3], output[:, 3:].clamp(*_LOG_SIGMA_RANGE)
 
 
 class DisplacementModel:
     """Displacements with calibrated covariance from windows of IMU data.
 
     Args:
-        network: trained weights.
-        card: their description.
+        engine: computes the network.
+        card: description of its weights.
     """
 
-    def __init__(self, network: DisplacementNetwork, card: Card) -> None:
+    def __init__(self, engine: Engine, card: Card) -> None:
         self.card = card
-        self.training_form = network.eval()
-        self._network = inference_form(network)
+        self._engine = engine
 
     @property
     def name(self) -> str:
         """The architecture's name."""
         return self.card.architecture
+
+    @property
+    def training_form(self) -> DisplacementNetwork:
+        """The network as it is trained, in evaluation mode.
+
+        Raises:
+            InputError: the model is an exported graph.
+        """
+        return self._engine.training_form
+
+    def along_track(self, updates: int = 1) -> DisplacementModel | TrackModel:
+        """What predicts the windows of one unbroken track, in the order of time.
+
+        Args:
+            updates: windows that begin within the length of one: a window follows the one so many
+                before it.
+
+        Returns:
+            The model itself, or a `TrackModel` if the network remembers earlier windows.
+        """
+        return TrackModel(self, updates) if self._engine.remembers else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Displacement over each window, from its start to one second later.
@@ -82,9 +76,24 @@ class DisplacementModel:
             InputError: the shape does not fit or a value is not finite.
         """
         batch = _checked_windows(windows)
-        mean, log_sigma = self._run(batch)
-        variance = self.card.calibration.variance(log_sigma)
-        return mean, variance[:, :, None] * np.eye(3)
+        if len(batch) == 0:
+            return np.zeros((0, 3)), np.zeros((0, 3, 3))
+        mean, log_sigma, _ = self._engine.run(batch)
+        return self._calibrated(mean, log_sigma)
+
+    def predict_after(
+        self, window: NDArray[np.float32], state: NDArray[np.float32] | None
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
+        """Of a network that remembers: one window (1, 6, 200) after the one that left the state.
+
+        Returns:
+            displacement (1, 3) [m], covariance (1, 3, 3) [m^2], and the state that it leaves.
+        """
+        if state is None:
+            state = self._engine.first_state()
+        mean, log_sigma, after = self._engine.run(window, state)
+        assert after is not None  # a state that is given comes back
+        return *self._calibrated(mean, log_sigma), after
 
     def predict_velocity(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Mean velocity over each window (B, 3) [m/s] and covariance (B, 3, 3) [m^2/s^2].
@@ -94,13 +103,38 @@ class DisplacementModel:
         displacement, covariance = self.predict(windows)
         return displacement / WINDOW_SECONDS, covariance / WINDOW_SECONDS**2
 
-    def _run(self, windows: NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
-        if len(windows) == 0:
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        with torch.inference_mode():
-            parts = [self._network(part) for part in torch.split(torch.from_numpy(windows), _BATCH)]
-        mean = torch.cat([m for m, _ in parts]).numpy().astype(np.float64)
-        return mean, torch.cat([s for _, s in parts]).numpy().astype(np.float64)
+    def _calibrated(
+        self, mean: NDArray[np.float32], log_sigma: NDArray[np.float32]
+    ) -> tuple[FloatArray, FloatArray]:
+        variance = self.card.calibration.variance(log_sigma.astype(np.float64))
+        return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
+
+
+class TrackModel:
+    """A model whose network remembers earlier windows, along one track.
+
+    Args:
+        model: whose network remembers.
+        updates: windows that begin within the length of one; each such series of windows, one
+            second apart, has a memory of its own, as in training.
+    """
+
+    def __init__(self, model: DisplacementModel, updates: int) -> None:
+        self._model = model
+        self._states: list[NDArray[np.float32] | None] = [None] * updates
+        self._count = 0
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The track's next windows; arguments, results and errors as of `DisplacementModel`."""
+        batch = _checked_windows(windows)
+        mean, covariance = np.zeros((len(batch), 3)), np.zeros((len(batch), 3, 3))
+        for k in range(len(batch)):
+            series = self._count % len(self._states)
+            mean[k : k + 1], covariance[k : k + 1], self._states[series] = (
+                self._model.predict_after(batch[k : k + 1], self._states[series])
+            )
+            self._count += 1
+        return mean, covariance
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
@@ -121,12 +155,21 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
 
 
 def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
-    """Load weights by name ("default": those in the package) or by path of a safetensors file.
+    """Load a model by name or path.
+
+    Args:
+        name_or_path: "default" for the weights in the package, a safetensors file with its card
+            beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then computes.
 
     Raises:
         WeightsError: the file or its card is missing, cut short, or they do not match.
+        InputError: an ONNX file, but onnxruntime is not installed.
     """
     path = Path(name_or_path)
+    if path.suffix == ".onnx":
+        from stario.network.export import load_onnx
+
+        return DisplacementModel(*load_onnx(path))
     if str(name_or_path) == "default":
         folder = importlib.resources.files("stario.network.weights")
         path = Path(str(folder.joinpath("default.safetensors")))
@@ -143,7 +186,7 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
         raise WeightsError(
             path, "weights", lines[min(1, len(lines) - 1)], f"tensors of {card.architecture}"
         ) from error
-    return DisplacementModel(network, card)
+    return DisplacementModel(TorchEngine(network), card)
 
 
 def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:

@@ -1,0 +1,59 @@
+"""The trainable module around every network: windows to displacement and log sigma."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from stario.sequences.sequence import STANDARD_GRAVITY
+
+_LOG_SIGMA_RANGE = (-6.0, 3.0)
+
+
+class DisplacementNetwork(nn.Module):
+    """A network with its input centred: gravity is taken off the vertical specific force.
+
+    Args:
+        network: (B, 6, 200) to (B, 6); one that remembers also has `first_state` and `step`, and
+            takes (B, K, 6, 200) to (B, K, 6).
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+        self.gravity: Tensor
+        gravity = torch.zeros(6, 1)
+        gravity[5] = STANDARD_GRAVITY
+        self.register_buffer("gravity", gravity, persistent=False)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the network has a state that goes from window to window."""
+        return hasattr(self.network, "step")
+
+    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """Windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
+        return _parted(self.network(windows - self.gravity))
+
+    def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `forward`, for a network that remembers, after its state (2, B, H).
+
+        Returns:
+            displacement, log sigma, and the state after these windows.
+        """
+        network: Any = self.network
+        output, after = network.step(windows - self.gravity, state)
+        return *_parted(output), after
+
+    def first_state(self, batch: int) -> Tensor:
+        """The state (2, B, H) of a network that remembers, before the first window."""
+        network: Any = self.network
+        state: Tensor = network.first_state(self.gravity.new_zeros(batch, 0))
+        return state
+
+
+def _parted(output: Tensor) -> tuple[Tensor, Tensor]:
+    output = output.float()
+    return output[..., :3], output[..., 3:].clamp(*_LOG_SIGMA_RANGE)
