@@ -10,6 +10,7 @@ Sources: C. Forster et al., "On-manifold preintegration for real-time visual-ine
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +21,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.stats import chi2
 
-from stario.fusion.graph_terms import Term
+from stario.fusion.graph_terms import KeyframeState, Prior, Term
 from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
@@ -70,7 +71,7 @@ class KeyframeGraph:
         self._tree: Any = None
         self.last = -1
         self._insert(first)
-        self._factors.append((0, _prior(first)))
+        self._add_prior(_prior(first))
 
     @property
     def keyframes(self) -> list[int]:
@@ -116,16 +117,9 @@ class KeyframeGraph:
         light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
         return Solution(rounds, light)
 
-    def pose(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """R_WB, v_W, p_W, b_g, b_a of a keyframe."""
-        pose, bias = self._values.atPose3(X(k)), self._values.atConstantBias(B(k))
-        return (
-            pose.rotation().matrix(),
-            self._values.atVector(V(k)),
-            pose.translation(),
-            bias.gyroscope(),
-            bias.accelerometer(),
-        )
+    def pose(self, k: int) -> KeyframeState:
+        """A keyframe without its covariance."""
+        return KeyframeState.of(self._values, k)
 
     def state(self, k: int) -> NavState:
         """A keyframe with its marginal covariance, after `solve`."""
@@ -148,15 +142,37 @@ class KeyframeGraph:
                 linear.push_back(term.factor(self._values))
         keys = [key(k) for k in old for key in (X, V, B)]
         _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
-        kept = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
         self._factors = [item for item in self._factors if item[0] >= before]
-        self._factors += [(before, kept.at(n)) for n in range(kept.size())]
         self._terms = [term for term in self._terms if term.first >= before]
+        self._add_prior(self._marginal(rest))
         for key in keys:
             self._values.erase(key)
         for k in old:
             del self._time[k]
         self._tree = None
+
+    def _marginal(self, rest: Any) -> Prior:
+        """What elimination left of the keyframes it did not eliminate."""
+        keys = rest.keyVector()
+        touched = tuple(k for k in self._time if X(k) in keys or V(k) in keys or B(k) in keys)
+        columns = {}
+        for n, k in enumerate(touched):
+            for key, first, width in ((X(k), 0, 6), (V(k), 6, 3), (B(k), 9, 6)):
+                if key in keys:
+                    columns[key] = np.arange(width) + CORE * n + first
+        A, b = rest.jacobian(_ordering(list(columns)))
+        table = np.zeros((len(b), CORE * len(touched) + 1))
+        table[:, np.concatenate(list(columns.values()))] = A
+        table[:, -1] = b
+        table = np.asarray(np.linalg.qr(table, mode="r"))[: table.shape[1] - 1]
+        about = tuple(self.pose(k) for k in touched)
+        for n, state in enumerate(about):
+            part = slice(CORE * n, CORE * (n + 1))
+            table[:, part] = table[:, part] @ np.linalg.inv(state.invariant_from_local())
+        return Prior(touched, about, table[:, :-1], table[:, -1])
+
+    def _add_prior(self, prior: Prior) -> None:
+        self._terms.append(_Whitened(prior, prior.covariance, math.inf))
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
@@ -254,18 +270,13 @@ class _Whitened:
         return gtsam.JacobianFactor(*arguments)
 
 
-def _prior(state: NavState) -> Any:
-    """The state's covariance as a linear factor on its pose, velocity and biases together."""
-    to_local = np.linalg.inv(_world_from_local(state.R_WB))
-    local = to_local @ state.covariance @ to_local.T
-    whitener = np.linalg.inv(np.linalg.cholesky(local))
-    blocks = (X(0), whitener[:, :6], V(0), whitener[:, 6:9], B(0), whitener[:, 9:])
-    unit = gtsam.noiseModel.Unit.Create(CORE)
-    point = gtsam.Values()
-    point.insert(X(0), gtsam.Pose3(gtsam.Rot3(state.R_WB), state.p_W))
-    point.insert(V(0), state.v_W)
-    point.insert(B(0), gtsam.imuBias.ConstantBias(state.b_a, state.b_g))
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*blocks, np.zeros(CORE), unit), point)
+def _prior(state: NavState) -> Prior:
+    """A state's covariance as what is known of keyframe 0."""
+    about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
+    to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
+    covariance = to_invariant @ state.covariance @ to_invariant.T
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    return Prior((0,), (about,), root, np.zeros(CORE))
 
 
 def _world_from_local(R_WB: FloatArray) -> FloatArray:

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from stario.fusion.lie import FloatArray
+from stario.fusion.lie import FloatArray, log_se23, skew
+from stario.fusion.preintegration import CORE
 from stario.fusion.recipe import yaw_between
 
 _EYE = np.eye(3)
@@ -47,6 +48,89 @@ class Term(Protocol):
     def linearise(self, values: Any) -> Linearised:
         """At gtsam `Values`."""
         ...
+
+
+class KeyframeState(NamedTuple):
+    """A keyframe's state."""
+
+    R_WB: FloatArray
+    """(3, 3)."""
+    v_W: FloatArray
+    """(3,) [m/s]."""
+    p_W: FloatArray
+    """(3,) [m]."""
+    b_g: FloatArray
+    """(3,) [rad/s]."""
+    b_a: FloatArray
+    """(3,) [m/s^2]."""
+
+    @classmethod
+    def of(cls, values: Any, k: int) -> KeyframeState:
+        """Keyframe k in gtsam `Values`."""
+        pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
+        return cls(
+            pose.rotation().matrix(),
+            values.atVector(V(k)),
+            pose.translation(),
+            bias.gyroscope(),
+            bias.accelerometer(),
+        )
+
+    def error_from(self, other: KeyframeState) -> FloatArray:
+        """Right-invariant error (15,) about another: theta, rho_v, rho_p, b_g, b_a."""
+        R = self.R_WB @ other.R_WB.T
+        pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
+        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
+
+    def invariant_from_local(self) -> FloatArray:
+        """(15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
+        matrix = np.zeros((CORE, CORE))
+        matrix[0:3, 0:3] = self.R_WB
+        matrix[3:6, 0:3] = skew(self.v_W) @ self.R_WB
+        matrix[3:6, 6:9] = _EYE
+        matrix[6:9, 0:3] = skew(self.p_W) @ self.R_WB
+        matrix[6:9, 3:6] = self.R_WB
+        matrix[9:12, 12:15] = _EYE
+        matrix[12:15, 9:12] = _EYE
+        return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of some keyframes together: root error = offset, with white noise of 1.
+
+    The error is right-invariant, so that a turn about the vertical and a shift are the same
+    directions wherever the keyframes have moved since: what was marginalised cannot come to know
+    yaw by being linearised elsewhere than the rest of the graph. In gtsam's own tangent it does,
+    and a stream's yaw then is reported twice as certain as it is.
+
+    Attributes:
+        keyframes: n of them.
+        about: the states the error is counted from.
+        root: (m, 15 n).
+        offset: (m,).
+    """
+
+    keyframes: tuple[int, ...]
+    about: tuple[KeyframeState, ...]
+    root: FloatArray
+    offset: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """It is white already."""
+        return np.eye(len(self.offset))
+
+    def linearise(self, values: Any) -> Linearised:
+        """In the rows of the root."""
+        residual, blocks = self.offset, []
+        for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
+            state = KeyframeState.of(values, k)
+            root = self.root[:, CORE * n : CORE * (n + 1)]
+            residual = residual - root @ state.error_from(about)
+            H = root @ state.invariant_from_local()
+            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
+        return Linearised(residual, blocks)
 
 
 @dataclass(frozen=True, eq=False)
