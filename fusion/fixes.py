@@ -154,6 +154,15 @@ class FixQueue:
         """Refuse what lies before the first state's time [s]."""
         self.refuse("before the start", len(self.due(np.nextafter(time, -math.inf))))
 
+    def checkpoint(self) -> dict[str, Any]:
+        """Everything that `rewind` needs."""
+        return {"held": [vars(fix) for fix in self._held], "refused": dict(self.refused)}
+
+    def rewind(self, checkpoint: dict[str, Any]) -> None:
+        """Go back to a checkpoint."""
+        self._held = [Fix(**fix) for fix in checkpoint["held"]]
+        self.refused = dict(checkpoint["refused"])
+
     @property
     def held(self) -> list[Fix]:
         """Those that wait, in the order of their times."""

@@ -81,6 +81,32 @@ class History:
             k -= 1
         yield from steps[k:]
 
+    def dump(self) -> dict[str, Any]:
+        """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
+        steps = [
+            {
+                "epoch": step.epoch.dump(),
+                "measurement": step.measurement and list(step.measurement),
+                "fixes": [vars(fix) for fix in step.fixes],
+                "before": step.before,
+            }
+            for step in self.steps
+        ]
+        return {"steps": steps, "since": self._since}
+
+    def load(self, dump: dict[str, Any]) -> None:
+        """Become what was dumped."""
+        self._since = dump["since"]
+        self.steps = deque(
+            Step(
+                Epoch.loaded(step["epoch"]),
+                step["measurement"] and (step["measurement"][0], step["measurement"][1]),
+                [Fix(**fix) for fix in step["fixes"]],
+                step["before"],
+            )
+            for step in dump["steps"]
+        )
+
     def _second_checkpoint(self) -> int:
         """Index of the second step that has a checkpoint, 0 where there is none."""
         for k in range(1, len(self.steps)):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,20 @@ class Epoch:
     anew: Start | None = None
     flags: Flags = FINE
     suspect: bool = False
+
+    def dump(self) -> dict[str, Any]:
+        """What an estimator needs of it, as arrays, numbers and None, for `loaded`."""
+        known = {item.name: getattr(self, item.name) for item in fields(self)}
+        anew = None if self.anew is None else vars(self.anew)
+        dropped = {"attitudes": None, "window": None}
+        return known | {"anew": anew, "flags": list(self.flags)} | dropped
+
+    @staticmethod
+    def loaded(dump: dict[str, Any]) -> Epoch:
+        """The epoch of a `dump`; its window and attitudes, which the network saw, are gone."""
+        anew = None if dump["anew"] is None else Start(**dump["anew"])
+        seen = {"anew": anew, "flags": Flags(*dump["flags"]), "attitudes": np.empty((0, 3, 3))}
+        return Epoch(**(dump | seen))
 
     @property
     def start(self) -> float:

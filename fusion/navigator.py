@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,7 @@ from stario.fusion.graph_builder import Taken
 from stario.fusion.graph_lag import GraphRecipe
 from stario.fusion.intake import Epoch, Intake, Start, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
+from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, Track, track_from_states
 from stario.fusion.world import in_last_world
 from stario.sequences.checks import check_units
@@ -173,6 +174,56 @@ class Navigator:
             health = self._recipe.health(counts)
         return _with_refused(health, self._fixes)
 
+    def snapshot(self) -> bytes:
+        """The stream as it is now, to be continued by `restore`, in another process if need be.
+
+        The bytes' format is documented in `stario.fusion.snapshot`; nothing in it is pickled. They
+        hold neither configuration files nor weights, only what tells them.
+
+        Raises:
+            InputError: the back end cannot be continued.
+        """
+        recipe = self._recipe
+        if recipe is not None and not isinstance(recipe, _Continued):
+            raise InputError(
+                "snapshot", f"the back end {self.backend}", "one that can be continued"
+            )
+        return pack(
+            {
+                "backend": self.backend,
+                "config": asdict(self.config),
+                "model": _fingerprint(self.model),
+                "prior": None if self.prior is None else vars(self.prior),
+                "intake": self._intake.checkpoint(),
+                "fixes": self._fixes.checkpoint(),
+                "recipe": None if recipe is None else recipe.dump(),
+            }
+        )
+
+    def restore(self, data: bytes) -> None:
+        """Continue the stream of a `snapshot`: the states are the same as without the break.
+
+        The navigator must have the same back end, configuration and weights; its own stream, and
+        its prior, are given up for the snapshot's.
+
+        Raises:
+            InputError: the bytes are no whole snapshot of this version, or one of another back end,
+                configuration or model. The navigator is then as it was before.
+        """
+        tree = unpack(data)
+        check_same("backend", tree["backend"], self.backend)
+        check_same("config", tree["config"], asdict(self.config))
+        check_same("model", tree["model"], _fingerprint(self.model))
+        prior = None if tree["prior"] is None else PriorPose(**tree["prior"])
+        intake, fixes, recipe = Intake(self.config), FixQueue(), None
+        intake.rewind(tree["intake"])
+        fixes.rewind(tree["fixes"])
+        if tree["recipe"] is not None:
+            assert intake.start is not None  # there is no recipe without one
+            recipe = self._new_recipe(intake.start, prior)
+            recipe.load(tree["recipe"])
+        self.prior, self._intake, self._fixes, self._recipe = prior, intake, fixes, recipe
+
     def run(
         self,
         sequence: ImuSequence,
@@ -268,16 +319,18 @@ class Navigator:
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
             start = self._checked_start()
-            if self.backend == "graph":
-                self._recipe = GraphRecipe(self.config, start, self.prior)
-            else:
-                self._recipe = FilterRecipe(self.config, start, self.prior, streaming=True)
+            self._recipe = self._new_recipe(start, self.prior)
             self._fixes.start(start.time)
         measurement = None
         if epoch.window is not None:
             mean, covariance = self.model.predict(epoch.window[None])
             measurement = _measurement(epoch, mean[0], covariance[0])
         return self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
+
+    def _new_recipe(self, start: Start, prior: PriorPose | None) -> Any:
+        if self.backend == "graph":
+            return GraphRecipe(self.config, start, prior)
+        return FilterRecipe(self.config, start, prior, streaming=True)
 
     def _take(self, fix: Fix) -> None:
         if self._recipe is None or fix.fault() or fix.time > self._recipe.state().time:
@@ -303,6 +356,20 @@ class Navigator:
 def _with_refused(health: Health, queue: FixQueue) -> Health:
     waiting = {"waiting": len(queue)} if len(queue) else {}
     return replace(health, fixes=health.fixes | queue.refused | waiting)
+
+
+@runtime_checkable
+class _Continued(Protocol):
+    """A recipe that can be stopped and continued."""
+
+    def dump(self) -> dict[str, Any]: ...
+
+    def load(self, dump: dict[str, Any]) -> None: ...
+
+
+def _fingerprint(model: Predictor) -> str:
+    """What tells a model's weights, empty where it has no card."""
+    return str(getattr(getattr(model, "card", None), "sha256", ""))
 
 
 def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

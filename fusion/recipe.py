@@ -209,6 +209,17 @@ class FilterRecipe:
         self._rest.rewind(checkpoint["rest"])
         self._world.rewind(checkpoint["world"])
 
+    def dump(self) -> dict[str, Any]:
+        """A stream's recipe for `load`: arrays, numbers, text, lists and dictionaries."""
+        history = None if self._history is None else self._history.dump()
+        return {"now": self.checkpoint(), "history": history}
+
+    def load(self, dump: dict[str, Any]) -> None:
+        """Become what was dumped by a recipe of the same configuration."""
+        self.rewind(dump["now"])
+        if self._history is not None:
+            self._history.load(dump["history"])
+
     def _step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
     ) -> None:

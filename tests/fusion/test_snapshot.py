@@ -1,0 +1,181 @@
+"""A stream stopped and continued elsewhere gives the states it would have given."""
+
+import io
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
+from stario.fusion.config import FilterConfig
+from stario.fusion.snapshot import pack, unpack
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence
+
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
+VELOCITY = NavigatorConfig(filter=FilterConfig(update_rate=10, measurement="velocity"))
+
+Make = Callable[..., Any]
+
+
+def push(navigator: Navigator, walk: ImuSequence, start: float, stop: float) -> list[NavState]:
+    part = walk.slice(start, stop - 1e-9)
+    rows = zip(part.time, part.gyro, part.accel, strict=True)
+    return [state for row in rows if (state := navigator.push(*row)) is not None]
+
+
+def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
+    assert len(ours) == len(theirs) > 0
+    for a, b in zip(ours, theirs, strict=True):
+        for name in ("time", "R_WB", "v_W", "p_W", "b_g", "b_a", "covariance", "world"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize("config", [CONFIG, VELOCITY], ids=["displacement", "velocity"])
+@pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
+def test_a_stream_continues_to_the_bit(
+    walk: ImuSequence, make_oracle: Make, without: Make, config: NavigatorConfig, stop: float
+) -> None:
+    """Before the first second, in between, beside a gap; fixes wait or come late."""
+    holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
+    accel = holed.accel.copy()
+    accel[300] += 400.0
+    holed = replace(holed, accel=accel)
+    model = make_oracle(holed, walk.truth, config)
+
+    def late_fix(navigator: Navigator) -> None:
+        if navigator.state is not None:
+            p = walk.truth.at(np.array([stop - 0.4])).position_W[0]
+            navigator.update_position(stop - 0.4, p, 0.01 * np.eye(3))
+
+    whole, first, second = (Navigator(model, config) for _ in range(3))
+    for navigator in (whole, first):
+        navigator.update_position(stop + 0.5, np.ones(3), np.eye(3))
+        navigator.update_position(4.0, np.zeros(3), 0.01 * np.eye(3))
+        navigator.update_position(1.0, [np.nan, 0.0, 0.0], np.eye(3))
+    push(whole, holed, 0.0, stop)
+    push(first, holed, 0.0, stop)
+    data = first.snapshot()
+    assert isinstance(data, bytes)
+    second.restore(data)
+    for navigator in (whole, second):
+        late_fix(navigator)
+    assert_same(push(second, holed, stop, 20.1), push(whole, holed, stop, 20.1))
+    assert second.health == whole.health
+    assert second.health.fixes["value that is not finite"] == 1
+
+
+def test_the_prior_goes_with_it(walk: ImuSequence, make_oracle: Make) -> None:
+    model = make_oracle(walk, walk.truth, CONFIG)
+    prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
+    whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)
+    push(whole, walk, 0.0, 0.4)
+    other.restore(whole.snapshot())
+    assert_same(push(other, walk, 0.4, 5.0), push(whole, walk, 0.4, 5.0))
+
+
+SCRIPT = """
+import sys
+import numpy as np
+from stario.fusion import Navigator
+from stario.sequences.simulate import simulate_imu
+from stario.sequences.walks import generate_walk
+
+class Still:
+    def predict(self, windows):
+        return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
+
+walk = simulate_imu(generate_walk(0, 6.0), 100.0)
+rows = list(zip(walk.time, walk.gyro, walk.accel))
+navigator = Navigator(Still())
+if len(sys.argv) > 2:
+    navigator.restore(open(sys.argv[1], "rb").read())
+    rows = rows[350:]
+else:
+    rows = rows[:350]
+for row in rows:
+    navigator.push(*row)
+if len(sys.argv) > 2:
+    np.save(sys.argv[2], np.hstack([navigator.state.p_W, navigator.state.covariance.ravel()]))
+else:
+    open(sys.argv[1], "wb").write(navigator.snapshot())
+"""
+
+
+def test_another_process_continues_it(tmp_path: Path, still_model: Any) -> None:
+    from stario.sequences.simulate import simulate_imu
+    from stario.sequences.walks import generate_walk
+
+    data, result = str(tmp_path / "stream.npz"), str(tmp_path / "result.npy")
+    for arguments in ([data], [data, result]):
+        subprocess.run([sys.executable, "-c", SCRIPT, *arguments], check=True, timeout=60)
+    navigator = Navigator(still_model)
+    walk = simulate_imu(generate_walk(0, 6.0), 100.0)
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        navigator.push(*row)
+    expected = np.hstack([navigator.state.p_W, navigator.state.covariance.ravel()])
+    np.testing.assert_allclose(np.load(result), expected, atol=1e-9)
+
+
+# --- refused ---------------------------------------------------------------------------------
+
+
+class Carded:
+    def __init__(self, sha256: str) -> None:
+        self.card = type("Card", (), {"sha256": sha256})()
+
+    def predict(self, windows):
+        return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
+
+
+def test_another_configuration_or_model_is_refused_by_name(walk: ImuSequence) -> None:
+    navigator = Navigator(Carded("abc"), CONFIG)
+    push(navigator, walk, 0.0, 2.0)
+    data = navigator.snapshot()
+    coarser = replace(CONFIG, filter=replace(CONFIG.filter, yaw_sigma=0.5))
+    with pytest.raises(InputError, match=r"config\.filter\.yaw_sigma: found 0\.001, expected 0\.5"):
+        Navigator(Carded("abc"), coarser).restore(data)
+    with pytest.raises(InputError, match="model: found 'abc'"):
+        Navigator(Carded("def"), CONFIG).restore(data)
+    other = Navigator(Carded("abc"), CONFIG, backend="graph")
+    with pytest.raises(InputError, match="backend"):
+        other.restore(data)
+    assert other.state is None
+
+
+def test_bytes_that_are_no_snapshot_are_refused(walk: ImuSequence, still_model: Any) -> None:
+    navigator = Navigator(still_model, CONFIG)
+    push(navigator, walk, 0.0, 3.0)
+    data, before = navigator.snapshot(), navigator.state.p_W
+    flipped = bytearray(data)
+    flipped[len(data) // 2] ^= 0xFF
+    other = io.BytesIO()
+    np.savez(other, tree=np.frombuffer(b'{"format": "else"}', dtype=np.uint8))
+    for bad in (b"", b"nonsense", data[:1000], data[:-30], bytes(flipped), other.getvalue()):
+        with pytest.raises(InputError, match="snapshot") as caught:
+            navigator.restore(bad)
+        assert "\n" not in str(caught.value)
+        np.testing.assert_array_equal(navigator.state.p_W, before)
+
+
+def test_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
+    navigator = Navigator(still_model, CONFIG)
+    data = pack(unpack(navigator.snapshot()) | {"version": 2})
+    with pytest.raises(InputError, match="version: found 2, expected 1"):
+        navigator.restore(data)
+
+
+def test_nothing_in_it_is_pickled(walk: ImuSequence, still_model: Any) -> None:
+    navigator = Navigator(still_model, CONFIG)
+    push(navigator, walk, 0.0, 3.0)
+    with zipfile.ZipFile(io.BytesIO(navigator.snapshot())) as file:
+        for name in file.namelist():
+            header = file.read(name)[:128]
+            assert header.startswith(b"\x93NUMPY")
+            assert b"|O" not in header
