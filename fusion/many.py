@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from stario.fusion.compare import Comparison, compare
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix
 from stario.fusion.navigator import Predictor, Progress
+from stario.network.model import DisplacementModel, load_model
 from stario.sequences.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
@@ -20,7 +21,7 @@ from stario.sequences.sequence import ImuSequence
 
 def compare_recordings(
     paths: Sequence[Path],
-    model: Predictor,
+    model: Predictor | str,
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence] = read_recording,
     jobs: int | None = None,
@@ -35,7 +36,8 @@ def compare_recordings(
 
     Args:
         paths: recordings.
-        model: the network.
+        model: the network, or the name of weights, which each process loads once: better than
+            handing over the network with every recording.
         config: the navigator's settings.
         read: how a path is read; can be pickled.
         jobs: processes, as for `stario.sequences.batch.each`.
@@ -77,7 +79,7 @@ def distinct_name(name: str, taken: set[str]) -> str:
 
 def _compare(
     path: Path,
-    model: Predictor,
+    model: Predictor | str,
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence],
     fixes: Sequence[Fix],
@@ -87,7 +89,13 @@ def _compare(
     sequence = read(path)
     if truth_needed and sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
-    return compare(model, sequence, config, progress, fixes)
+    network = _loaded(model) if isinstance(model, str) else model
+    return compare(network, sequence, config, progress, fixes)
+
+
+@cache
+def _loaded(name: str) -> DisplacementModel:
+    return load_model(name)
 
 
 def _unseen(share: float) -> None:

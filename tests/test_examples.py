@@ -17,7 +17,7 @@ def load(name: str) -> ModuleType:
 
 
 def test_every_example_is_tested_here():
-    tested = {"run_recording", "compare_tracks", "streaming", "train_own"}
+    tested = {"run_recording", "compare_tracks", "streaming", "train_own", "cluster"}
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
 
 
@@ -44,3 +44,13 @@ def test_train_own_leaves_weights_that_predict(tmp_path):
     mean, covariance = model.predict(np.zeros((2, 6, 200)))
     assert mean.shape == (2, 3)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken_one(tmp_path):
+    scores, skipped, workers = load("cluster").main(tmp_path, seconds=8.0)
+    assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
+    for recording in scores:
+        assert recording.metrics["ekf"]["ate_m"] > 0.0
+    assert [one.item for one in skipped] == [str(tmp_path / "walk-2.csv")]
+    assert "line 2" in skipped[0].reason
+    assert len(workers) == 2

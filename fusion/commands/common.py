@@ -111,6 +111,11 @@ class Estimating:
 
         return load_model(self.model)
 
+    def network_for(self, jobs: int) -> DisplacementModel | str:
+        """The network, or, once it is known to load, its name for processes to load it by."""
+        network = self.network()
+        return network if jobs == 1 else self.model
+
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """A command for typer whose parameters `Reading` and `Estimating` become their fields' options.

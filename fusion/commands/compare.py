@@ -45,7 +45,7 @@ def compare(
     from stario.fusion.many import compare_recordings
     from stario.fusion.results import comparison_dict, write_comparison
 
-    settings, network = estimating.settings(), estimating.network()
+    settings, network = estimating.settings(), estimating.network_for(jobs)
     known = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
     files, skipped = recordings_at(paths or [])
@@ -54,7 +54,8 @@ def compare(
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
         if not paths:
             typer.echo("demonstration: a simulated walk that training never saw", err=True)
-            made = compare_tracks(network, demonstration(), settings, progress, known)
+            model = estimating.network()
+            made = compare_tracks(model, demonstration(), settings, progress, known)
             comparisons.append(made)
         for outcome in compare_recordings(
             files, network, settings, reading.read, jobs, known, progress=progress

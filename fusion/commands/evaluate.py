@@ -42,7 +42,7 @@ def evaluate(
     from stario.sequences.batch import Skipped
     from stario.sequences.splits import split_paths
 
-    settings, network = estimating.settings(), estimating.network()
+    settings, network = estimating.settings(), estimating.network_for(jobs)
     files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
     recordings = []
     with progress_bar("evaluate", 100 * len(files)) as progress:

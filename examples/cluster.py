@@ -1,0 +1,60 @@
+"""Evaluate many recordings on a cluster: here two workers of this machine, a real one by address.
+
+joblib hands the recordings to whatever `joblib.parallel_config` names: with Ray installed
+`backend="ray"` after `ray.util.joblib.register_ray()` does the same. The workers need to see the
+recordings' paths. Needs `pip install 'stario[cluster]'`.
+
+    python examples/cluster.py
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import joblib
+from distributed import Client, LocalCluster
+
+from stario.fusion import NavigatorConfig
+from stario.fusion.evaluate import Scores, scores_of, summary_table
+from stario.fusion.many import compare_recordings
+from stario.sequences import generate_walk, simulate_imu
+from stario.sequences.batch import Skipped
+from stario.sequences.readers.own_csv import write_csv
+
+
+def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skipped]]:
+    """Figures of the recordings, in their order, and those that could not be used."""
+    scores, skipped = [], []
+    with joblib.parallel_config(backend="dask", client=client):
+        for outcome in compare_recordings(paths, "default", NavigatorConfig(), truth_needed=True):
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+            else:
+                scores.append(scores_of(outcome))
+    return scores, skipped
+
+
+def main(folder: Path, seconds: float = 20.0) -> tuple[list[Scores], list[Skipped], set[str]]:
+    """Simulate four recordings, spoil one, evaluate them on two workers.
+
+    Returns:
+        Figures, what was skipped, and the workers that computed something.
+    """
+    paths = [folder / f"walk-{seed}.csv" for seed in range(4)]
+    for seed, path in enumerate(paths):
+        write_csv(path, simulate_imu(generate_walk(seed, seconds), 100.0, seed=seed))
+    paths[2].write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0\n")
+    workers = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with workers as cluster, Client(cluster) as client:
+        client.get_task_stream()  # from here on the scheduler notes who computes what
+        scores, skipped = evaluate(paths, client)
+        tasks = client.get_task_stream()
+    return scores, skipped, {task["worker"] for task in tasks}
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as temporary:
+        scores, skipped, workers = main(Path(temporary))
+    print(summary_table(scores))
+    print(f"computed by {len(workers)} workers; skipped: {skipped[0].reason}")
