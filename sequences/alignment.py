@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
+from stario.sequences.mount_heading import heading_turn
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -28,6 +29,8 @@ _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
 _MIN_PIECE_S = 1.0
 _MIN_FIT_S = 10.0
+_LAG_STEP_S = 0.0025
+_CORRELATED_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class BodyAlignment:
 
     Attributes:
         lag: to be added to the truth's time [s].
-        correlation: between the gyroscope and the differentiated attitude, both in V.
+        correlation: between the gyroscope and the attitude's rate, both over 0.1 s, in B.
         attitude_WB: the IMU's attitude at the truth's samples, level and mount applied.
         leveling_WW: the rotation that made the world level, to be applied to positions.
         valid: truth samples whose attitude agrees with the gyroscope.
@@ -58,6 +61,7 @@ def align_tracked_body(
     truth_time: FloatArray,
     attitude_WV: Rotation,
     valid: BoolArray,
+    position_WV: FloatArray | None = None,
     max_lag: float = 0.15,
 ) -> BodyAlignment:
     """Estimate lag, mount (anew after every flip) and the world's tilt.
@@ -69,6 +73,8 @@ def align_tracked_body(
         truth_time: (M,) [s], evenly sampled, on the IMU's clock but for the lag.
         attitude_WV: M rotations of the tracked body.
         valid: (M,) samples to be trusted at all.
+        position_WV: (M, 3) of the tracked body [m]; with it the accelerometer helps to find the
+            mount's turn about the vertical, which the gyroscope misses on wheels.
         max_lag: largest lag looked for, either way [s].
 
     Raises:
@@ -85,18 +91,20 @@ def align_tracked_body(
     start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
     _check_length("capture that agrees with the gyroscope", time[start:stop])
     mounts = _mounts(time, attitude_WV, attitude_B, pieces)
-    quat_WB = attitude_WV.as_quat()
     kept = np.zeros_like(valid)
-    for (start, stop), mount in zip(pieces, mounts, strict=True):
-        quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
+    for start, stop in pieces:
         kept[start:stop] = valid[start:stop]
-    attitude_WB = Rotation.from_quat(quat_WB)
-    force_B = np.stack([np.interp(time, imu_time, accel[:, k]) for k in range(3)], axis=1)
-    leveling = tilt_aligning(attitude_WB[kept].apply(force_B[kept]).mean(axis=0))
+    force_B, rate_B = _sampled(time, imu_time, accel), _sampled(time, imu_time, gyro)
+    attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
+    if position_WV is not None:
+        inside = kept & (time >= imu_time[0]) & (time <= imu_time[-1])
+        turn = heading_turn(time, rate_B, force_B, leveling.apply(position_WV), attitude_WB, inside)
+        mounts = [mount * turn for mount in mounts]
+        attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     return BodyAlignment(
         lag=lag,
         correlation=_correlation(time, attitude_WB, gyro_B, kept),
-        attitude_WB=leveling * attitude_WB,
+        attitude_WB=attitude_WB,
         leveling_WW=leveling,
         valid=kept,
         mounts=tuple(
@@ -104,6 +112,28 @@ def align_tracked_body(
             for (start, stop), mount in zip(pieces, mounts, strict=True)
         ),
     )
+
+
+def _sampled(time: FloatArray, imu_time: FloatArray, values: FloatArray) -> FloatArray:
+    return np.stack([np.interp(time, imu_time, values[:, k]) for k in range(3)], axis=1)
+
+
+def _mounted(
+    attitude_WV: Rotation, pieces: list[tuple[int, int]], mounts: list[Rotation]
+) -> Rotation:
+    """The IMU's attitude in the capture's world, each piece with its mount."""
+    quat_WB = attitude_WV.as_quat()
+    for (start, stop), mount in zip(pieces, mounts, strict=True):
+        quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
+    return Rotation.from_quat(quat_WB)
+
+
+def _level(
+    attitude_WB: Rotation, force_B: FloatArray, kept: BoolArray
+) -> tuple[Rotation, Rotation]:
+    """The attitude in a world whose mean force points up, and the rotation that made it so."""
+    leveling = tilt_aligning(attitude_WB[kept].apply(force_B[kept]).mean(axis=0))
+    return leveling * attitude_WB, leveling
 
 
 def _check_length(what: str, time: FloatArray) -> None:
@@ -131,23 +161,36 @@ class _GyroIntegral:
             self._rate[left] * tau[:, None]
         )
 
-    def mean_rate(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        """Mean rate over intervals (M, 3) [rad/s]."""
-        ends = [
-            np.stack([np.interp(t, self.time, self.angle[:, k]) for k in range(3)], axis=1)
-            for t in (start, stop)
-        ]
-        return np.asarray((ends[1] - ends[0]) / (stop - start)[:, None], dtype=np.float64)
+    def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
+        """Mean rate [rad/s] from each of M times to the one `stride` later (M - stride, 3)."""
+        angle = _sampled(time, self.time, self.angle)
+        lengths = time[stride:] - time[:-stride]
+        return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
 
 
 def cumulative_rotations(steps: Rotation) -> FloatArray:
-    """Products q_0 q_1 ... q_k as (N + 1, 4), in log2(N) vectorised passes."""
-    product = Rotation.concatenate([Rotation.identity(), steps])
-    shift = 1
-    while shift < len(product):
-        product = Rotation.concatenate([product[:shift], product[:-shift] * product[shift:]])
-        shift *= 2
-    return np.asarray(product.as_quat(), dtype=np.float64)
+    """Products q_0 q_1 ... q_k as (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
+    count = len(steps) + 1
+    width = int(np.ceil(np.sqrt(count)))
+    padded = np.tile([0.0, 0.0, 0.0, 1.0], (width * width, 1))
+    padded[1:count] = steps.as_quat()
+    blocks = padded.reshape(width, width, 4)
+    for k in range(1, width):
+        blocks[:, k] = _product(blocks[:, k - 1], blocks[:, k])
+    starts = blocks[:, -1].copy()
+    for k in range(1, width):
+        starts[k] = _product(starts[k - 1], starts[k])
+    blocks[1:] = _product(starts[:-1, None], blocks[1:])
+    products = blocks.reshape(-1, 4)[:count]
+    return np.asarray(products / np.linalg.norm(products, axis=1)[:, None], dtype=np.float64)
+
+
+def _product(p: FloatArray, q: FloatArray) -> FloatArray:
+    """Products of quaternions (..., 4), xyzw; SciPy's composition costs far more than this."""
+    a, b = p[..., :3], q[..., :3]
+    vector = p[..., 3:] * b + q[..., 3:] * a + np.cross(a, b)
+    scalar = p[..., 3] * q[..., 3] - np.sum(a * b, axis=-1)
+    return np.concatenate([vector, scalar[..., None]], axis=-1)
 
 
 def _rates(
@@ -169,19 +212,22 @@ def _lag(
     stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
     rates_V, good = _rates(time, attitude_WV, valid, stride)
     speed_V = np.linalg.norm(rates_V, axis=1)
-    lags = np.arange(-max_lag, max_lag + 1e-9, 0.0025)
-    scores = []
-    for lag in lags:
-        rate_B = gyro_B.mean_rate(time[:-stride] + lag, time[stride:] + lag)
-        speed_B = np.linalg.norm(rate_B, axis=1)
+
+    def score(lag: float) -> float:
+        speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
         # Glitches are rare but huge: compare where the two do not contradict each other grossly.
         use = good & (np.abs(speed_V - speed_B) < 3.0)
-        scores.append(np.corrcoef(speed_V[use], speed_B[use])[0, 1] if use.sum() > 2 else 0.0)
+        return float(np.corrcoef(speed_V[use], speed_B[use])[0, 1]) if use.sum() > 2 else 0.0
+
+    coarse = np.arange(-max_lag, max_lag + 1e-9, 4 * _LAG_STEP_S)
+    centre = coarse[int(np.argmax([score(lag) for lag in coarse]))]
+    lags = centre + _LAG_STEP_S * np.arange(-4, 5)
+    scores = [score(lag) for lag in lags]
     best = int(np.clip(np.argmax(scores), 1, len(lags) - 2))
     before, peak, after = scores[best - 1 : best + 2]
     curvature = before - 2 * peak + after
     offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return float(lags[best] + np.clip(offset, -1, 1) * 0.0025)
+    return float(lags[best] + np.clip(offset, -1, 1) * _LAG_STEP_S)
 
 
 def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
@@ -199,9 +245,11 @@ def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) 
 
 def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
     """Difference of the rotation angles over `stride` samples, which no mount changes."""
-    angle_V = (attitude_WV[:-stride].inv() * attitude_WV[stride:]).magnitude()
-    angle_B = (attitude_B[:-stride].inv() * attitude_B[stride:]).magnitude()
-    return np.asarray(np.abs(angle_V - angle_B), dtype=np.float64)
+    half_V, half_B = (
+        np.arccos(np.clip(np.abs(np.sum(quat[:-stride] * quat[stride:], axis=1)), 0.0, 1.0))
+        for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
+    )
+    return np.asarray(2.0 * np.abs(half_V - half_B), dtype=np.float64)
 
 
 def _pieces(
@@ -270,9 +318,10 @@ def _fit(
 def _correlation(
     time: FloatArray, attitude_WB: Rotation, gyro_B: _GyroIntegral, valid: BoolArray
 ) -> float:
-    stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
+    """Correlation of both rates over 0.1 s; below, the capture's noise drowns a trolley's turns."""
+    stride = max(1, round(_CORRELATED_S / float(np.median(np.diff(time)))))
     rates, good = _rates(time, attitude_WB, valid, stride)
-    measured = gyro_B.mean_rate(time[:-stride], time[stride:])
+    measured = gyro_B.mean_rate(time, stride)
     good &= np.linalg.norm(rates - measured, axis=1) < 3.0
     if good.sum() < 2:
         return 0.0

@@ -152,7 +152,7 @@ def _samples(file: Path, known_units: dict[str, float]) -> tuple[IntArray, Float
         raise ReadError(file, "header", repr((first_lines(file, 1) or [""])[0][:60]), expected)
     used = [layout.time, *layout.values]
     table = read_table(file, max(used) + 1, layout.skip, layout.delimiter, used)
-    values = checked(file, "values", table.values[:, 1:], table.line_numbers[0])
+    values = checked(file, "values", table.values[:, 1:], table.first_row)
     unit = unit_named(layout.value_unit) or next(iter(known_units))
     if unit not in known_units:
         raise ReadError(file, "header", f"unit {layout.value_unit!r}", ", ".join(known_units))

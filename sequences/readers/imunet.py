@@ -56,7 +56,7 @@ def is_imunet(path: Path) -> bool:
 
 def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:
     table = read_table(path, columns=1 + width, delimiter=None)
-    return table.stamps_ns(), checked(path, "values", table.values[:, 1:], table.line_numbers[0])
+    return table.stamps_ns(), checked(path, "values", table.values[:, 1:], table.first_row)
 
 
 def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray) -> Trajectory:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
+import numpy as np
+
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.text import Table, first_line, read_lines, read_table
@@ -29,16 +31,18 @@ class NamedColumns:
     """
 
     def __init__(self, path: Path, names: Collection[str]) -> None:
-        read_lines(path)  # a missing or empty file is told from a missing column
         header = header_names(path)
+        if header == [""]:
+            read_lines(path)  # a missing or empty file is told from a missing column
         missing = [name for name in names if name not in header]
         if missing:
             raise ReadError(path, "header", f"no {', '.join(missing)}", "one column of that name")
         self._places = {name: k for k, name in enumerate(names)}
         self._columns = [header.index(name) for name in names]
         self.table: Table = read_table(path, max(self._columns) + 1, skip=1, used=self._columns)
-        for name in names:
-            checked(path, name, self[name], self.table.line_numbers[0])
+        if not np.isfinite(self.table.values).all():
+            for name in names:
+                checked(path, name, self[name], self.table.first_row)
 
     def __getitem__(self, name: str) -> FloatArray:
         """A column (N,)."""

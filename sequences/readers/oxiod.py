@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, median_filter
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.alignment import align_tracked_body
@@ -156,7 +156,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
         valid &= ~_position_glitches(time, position)
         if phone.stamps_ns is not None:
             time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
-        aligned = align_tracked_body(*imu, time, attitude_WV, valid)
+        aligned = align_tracked_body(*imu, time, attitude_WV, valid, position)
     except InputError as error:
         if isinstance(error, ReadError):
             raise
@@ -184,10 +184,8 @@ def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
 
 def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
     """Rows at either end of an impossible step or far from the median around them, widened."""
-    half = 25
-    padded = np.pad(position, ((half, half), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
-    distance = np.linalg.norm(position - np.median(windows, axis=-1), axis=1)
+    median = median_filter(position, size=(51, 1), mode="nearest")
+    distance = np.linalg.norm(position - median, axis=1)
     limit = _JUMP_M_S * np.maximum(np.diff(time), 1.0 / RATE)
     jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < limit)
     bad = ~(distance < _SPIKE_M)

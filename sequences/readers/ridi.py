@@ -58,7 +58,7 @@ def read_ridi(path: Path) -> ImuSequence:
     columns = NamedColumns(file, _COLUMNS)
     stamps = columns.table.stamps_ns(columns.file_column("time"))
     time, accel = seconds(stamps, stamps[0]), columns.stack("acce")
-    first = columns.table.line_numbers[0]
+    first = columns.table.first_row
     pose = rotations(file, "ori", columns.stack("ori", "wxyz"), first_row=first)
     game_rv = rotations(file, "rv", columns.stack("rv", "wxyz"), first_row=first)
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv

@@ -48,7 +48,7 @@ def read_rnin(path: Path) -> ImuSequence:
     time = seconds(stamps, stamps[0])
     captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
     source = "gt" if captured else "vio"
-    first = columns.table.line_numbers[0]
+    first = columns.table.first_row
     quat_wxyz = columns.stack(f"{source}_q", "wxyz")
     attitude_WB = rotations(file, f"{source}_q", quat_wxyz, first_row=first)
     return ImuSequence(

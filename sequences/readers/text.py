@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from stario.sequences.sequence import FloatArray
 IntArray = NDArray[np.int64]
 
 _HEAD_BYTES = 8192
+_LARGE_BYTES = 2_000_000
 
 
 def read_lines(path: Path) -> list[str]:
@@ -84,36 +87,43 @@ def first_numbers(path: Path) -> list[float]:
     return numbers_in(first_line(path) or "")
 
 
-@dataclass(frozen=True)
 class Table:
     """Rows of numbers as they stand in a file.
 
     Attributes:
         path: the file.
         values: (N, K); `nan` and empty cells are NaN.
-        lines: the N lines.
-        line_numbers: where they stand in the file, counted from 1.
-        delimiter: between the cells, None for blanks.
+        first_row: where the first row stands in the file, counted from 1.
     """
 
-    path: Path
-    values: FloatArray
-    lines: list[str]
-    line_numbers: list[int]
-    delimiter: str | None = ","
+    def __init__(
+        self,
+        path: Path,
+        values: FloatArray,
+        first_row: int,
+        cells: Callable[[int], list[str]],
+        numbers: Callable[[int], NDArray[Any] | None] = lambda column: None,
+    ) -> None:
+        self.path, self.values, self.first_row = path, values, first_row
+        self._cells, self._numbers = cells, numbers
 
     def stamps_ns(self, column: int = 0, per_second: int = 10**9) -> IntArray:
         """A column of times as whole nanoseconds (N,), exact: float64 cannot hold those of today.
 
         Args:
-            column: which one.
+            column: which one, counted in the file.
             per_second: how many of the column's units make a second.
 
         Raises:
             ReadError: a cell is no time.
         """
-        cells = [line.split(self.delimiter, column + 1)[column] for line in self.lines]
         unit_ns = 10**9 // per_second
+        numbers = self._numbers(column)
+        if numbers is not None and numbers.dtype.kind == "i":
+            return np.asarray(numbers.astype(np.int64) * unit_ns, dtype=np.int64)
+        if numbers is not None and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
+            return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
+        cells = self._cells(column)
         try:
             stamps = [int(cell) * unit_ns for cell in cells]
         except ValueError:
@@ -132,7 +142,7 @@ class Table:
                 return int(whole) * unit_ns + round(float(f"0.{fraction or 0}") * unit_ns)
             return round(float(cell) * unit_ns)
         except (ValueError, OverflowError):
-            where = f"line {self.line_numbers[row]}, time"
+            where = f"line {row + self.first_row}, time"
             raise ReadError(self.path, where, repr(cell.strip()), "a time") from None
 
 
@@ -155,6 +165,49 @@ def read_table(
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
+    wanted = list(range(columns)) if used is None else used
+    return _read_quickly(path, skip, delimiter, wanted) or _read_carefully(
+        path, columns, skip, delimiter, wanted
+    )
+
+
+def _read_quickly(path: Path, skip: int, delimiter: str | None, wanted: list[int]) -> Table | None:
+    """A large file by pandas, five times as fast as by NumPy; None if anything is odd about it.
+
+    What is odd (no pandas, a blank or malformed cell, a row cut short) is left to the careful way,
+    which names it.
+    """
+    try:
+        if path.stat().st_size < _LARGE_BYTES:
+            return None
+        pandas = importlib.import_module("pandas")
+        frame = pandas.read_csv(
+            path,
+            sep=r"\s+" if delimiter is None else delimiter,
+            header=None,
+            skiprows=skip,
+            usecols=sorted(wanted),
+            comment="#",
+            na_filter=False,
+        )
+    except (ImportError, OSError, ValueError, UnicodeDecodeError):
+        return None
+    if not all(kind.kind in "if" for kind in frame.dtypes) or not len(frame):
+        return None
+    values = frame[wanted].to_numpy(dtype=np.float64)
+
+    def cells(column: int) -> list[str]:
+        return _read_carefully(path, column + 1, skip, delimiter, [column])._cells(column)
+
+    def numbers(column: int) -> NDArray[Any] | None:
+        return frame[column].to_numpy() if column in wanted else None
+
+    return Table(path, values, skip + 1, cells, numbers)
+
+
+def _read_carefully(
+    path: Path, columns: int, skip: int, delimiter: str | None, wanted: list[int]
+) -> Table:
     lines = read_lines(path)
     numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
     if not numbered:
@@ -163,12 +216,15 @@ def read_table(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            values = np.loadtxt(
-                rows, delimiter=delimiter, ndmin=2, usecols=used or range(columns), comments=None
-            )
+            values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
     except (ValueError, IndexError):
-        values = np.array([_row(path, k, line, columns, delimiter, used) for k, line in numbered])
-    return Table(path, values, rows, [k for k, _ in numbered], delimiter)
+        values = np.array([_row(path, k, line, columns, delimiter, wanted) for k, line in numbered])
+    return Table(
+        path,
+        values,
+        numbered[0][0],
+        lambda column: [line.split(delimiter, column + 1)[column] for line in rows],
+    )
 
 
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
@@ -182,7 +238,7 @@ def _is_row(line: str) -> bool:
 
 
 def _row(
-    path: Path, number: int, text: str, columns: int, delimiter: str | None, used: list[int] | None
+    path: Path, number: int, text: str, columns: int, delimiter: str | None, wanted: list[int]
 ) -> list[float]:
     """One row the slow way, for the error that names its line and column."""
     cells = text.split(delimiter)
@@ -195,7 +251,7 @@ def _row(
             "the file looks cut short" if number > 1 else "",
         )
     values = []
-    for k in used or range(columns):
+    for k in wanted:
         try:
             values.append(float(cells[k]) if cells[k].strip() else float("nan"))
         except ValueError:

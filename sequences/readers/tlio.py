@@ -130,7 +130,7 @@ def _width(place: slice) -> int:
 def _read_raw(file: Path) -> ImuSequence:
     table = read_table(file, columns=8)
     stamps = table.stamps_ns()
-    samples = checked(file, "samples", table.values[:, 2:8], table.line_numbers[0])
+    samples = checked(file, "samples", table.values[:, 2:8], table.first_row)
     calibration = JsonFields(file.with_name(_CALIBRATION))
     sequence = ImuSequence(
         name=file.resolve().parent.name,
