@@ -18,11 +18,14 @@ _OXIOD_FORMS = ("syn", "raw")
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file may be a list: text by its suffix whose first line is no row of numbers."""
-    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+    """Whether a file may be a list: text by its suffix whose first line is no row of numbers.
+
+    A single number may be a name: TLIO's are.
+    """
+    if path.suffix.lower() not in _SUFFIXES or first_line(path, comments=True) is None:
         return False
-    line = first_line(path)
-    return line is not None and not numbers_in(line) and not numbers_in(line, None)
+    line = first_line(path) or ""
+    return len(numbers_in(line)) < 2 and len(numbers_in(line, None)) < 2
 
 
 def list_entries(path: Path) -> Iterator[Path | ReadError]:
