@@ -33,6 +33,7 @@ class Augmentation:
         swung: share of windows in which the device is swung besides.
         swing_rate: largest angular rate of a swing [rad/s].
         lever: largest distance of the device from the point it is swung about [m].
+        sway: largest speed of the hands to and fro, along each axis [m/s].
         tilt: largest error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
@@ -45,6 +46,7 @@ class Augmentation:
     swung: float = 0.35
     swing_rate: float = 2.5
     lever: float = 0.35
+    sway: float = 1.5
     tilt: float = 0.05
     gyro_bias: float = 0.03
     accel_bias: float = 0.15
@@ -134,7 +136,7 @@ class WindowSampler:
         size = len(imu)
         mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
         imu, displacement = _mirrored(imu, displacement, mirror)
-        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
+        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, a.sway, self.generator)
         imu, displacement = swung(imu, displacement, swings)
         R_yaw = _about_z(self._symmetric(size) * torch.pi)
         R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)

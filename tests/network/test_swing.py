@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stario.network.swing import Swing, draw_swing, swung
+from stario.network.swing import Sines, Swing, draw_swing, swung
 
 GRAVITY = 9.80665
 
@@ -14,39 +14,46 @@ def at_rest(size: int) -> torch.Tensor:
     return imu
 
 
-def drawn(size: int, share: float = 1.0) -> Swing:
-    swing = draw_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
-    return Swing(*(value.double() for value in vars(swing).values()))
+def drawn(size: int, share: float = 1.0, speed: float = 1.5) -> Swing:
+    drawn = draw_swing(size, share, 2.5, 0.35, speed, torch.Generator().manual_seed(3))
+    exact = [Sines(*(v.double() for v in vars(s).values())) for s in (drawn.angle, drawn.sway)]
+    return Swing(drawn.axis.double(), drawn.lever.double(), *exact)
 
 
 def test_acceleration_integrates_to_the_displacement() -> None:
     swing = drawn(64)
     imu, displacement = swung(at_rest(64), torch.zeros(64, 3, dtype=torch.float64), swing)
-    # The velocity a swing begins with is omega x r at the window's first instant.
-    alpha = (swing.amplitude * swing.phase.sin()).sum(1)
-    lever = turned(swing.lever, swing.axis, alpha)
-    velocity = torch.linalg.cross(imu[:, 0, :3], lever)
+    # The velocity a window begins with is omega x r and that of the sway.
+    now = torch.zeros(1, dtype=torch.float64)
+    lever = turned(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
+    velocity = torch.linalg.cross(imu[:, 0, :3], lever) + swing.sway.at(now)[1][..., 0]
     accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
-    dt = 1.0 / 200.0
+    dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
     for k in range(200):
-        following = accel[:, min(k + 1, 199)]
-        velocity_next = velocity + 0.5 * dt * (accel[:, k] + following)
-        lever = lever + 0.5 * dt * (velocity + velocity_next)
+        velocity_next = velocity + 0.5 * dt * (accel[:, k] + accel[:, min(k + 1, 199)])
+        moved = moved + 0.5 * dt * (velocity + velocity_next)
         velocity = velocity_next
-    moved = lever - turned(swing.lever, swing.axis, alpha)
-    assert displacement.abs().max() > 0.1
+    assert displacement.abs().max() > 0.3
     assert (moved - displacement).abs().max() < 2e-3
 
 
 def test_rate_and_lever_belong_to_one_rotation() -> None:
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
-    swing = drawn(64)
+    swing = drawn(64, speed=0.0)
     imu, _ = swung(at_rest(64), torch.zeros(64, 3, dtype=torch.float64), swing)
-    alpha = (swing.amplitude * swing.phase.sin()).sum(1)
+    alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
     lever = turned(swing.lever, swing.axis, alpha)
     gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     velocity = torch.linalg.cross(gyro, lever)
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
+
+
+def test_no_swing_is_faster_than_its_bounds() -> None:
+    swing = drawn(512)
+    time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
+    rate, speed = swing.angle.at(time)[1].abs().max(), swing.sway.at(time)[1].abs().max()
+    assert 1.5 < rate <= 2.5
+    assert 0.8 < speed <= 1.5
 
 
 def test_what_is_not_swung_stays_as_it_is() -> None:
@@ -60,7 +67,7 @@ def test_what_is_not_swung_stays_as_it_is() -> None:
 @pytest.mark.parametrize("share", [0.25, 0.75])
 def test_the_share_of_swung_windows(share: float) -> None:
     swing = drawn(4000, share)
-    assert (swing.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
+    assert (swing.angle.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
 
 
 def turned(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
