@@ -7,7 +7,7 @@ slow to import.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -197,10 +197,22 @@ def innovations(
     return fig
 
 
-def imu_overview(sequence: ImuSequence) -> Figure:
+def imu_overview(
+    sequence: ImuSequence,
+    rotation: tuple[FloatArray, FloatArray] | None = None,
+    rest: Iterable[tuple[float, float]] = (),
+    gaps: Iterable[tuple[float, float]] = (),
+) -> Figure:
     """Angular rate, specific force and its norm, and the true speed where there is a truth.
 
     Long recordings are drawn as mean and envelope, so that no peak is lost.
+
+    Args:
+        sequence: the recording.
+        rotation: times [s] and the truth's angular rate there [rad/s], to be drawn over the
+            gyroscope's.
+        rest: first and last time of stretches to be shaded as rest [s].
+        gaps: first and last time of stretches to be shaded as gaps [s].
 
     Raises:
         InputError: no sample has finite values.
@@ -210,8 +222,9 @@ def imu_overview(sequence: ImuSequence) -> Figure:
         raise InputError("sequence", "no finite sample", "finite time, gyro and accel")
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
-    fig = _figure(9.0, 6.0 if sequence.truth is None else 8.0, f"IMU of {sequence.name}")
-    panels = _panels(fig, *([1] * (2 if sequence.truth is None else 3)))
+    count = 2 + (rotation is not None) + (sequence.truth is not None)
+    fig = _figure(9.0, 2.0 + 2.0 * count, f"IMU of {sequence.name}")
+    panels = _panels(fig, *([1] * count))
     _draw_samples(panels[1], time, np.linalg.norm(accel, axis=1), "norm", _GREY)
     for axes, values in ((panels[0], gyro), (panels[1], accel)):
         for k, axis in enumerate("xyz"):
@@ -219,12 +232,21 @@ def imu_overview(sequence: ImuSequence) -> Figure:
     panels[1].axhline(STANDARD_GRAVITY, color=_INK, lw=0.9, ls="--", label="gravity")
     panels[0].set_ylabel("angular rate [rad/s]")
     panels[1].set_ylabel("specific force [m/s$^2$]")
-    for axes in panels[:2]:
+    if rotation is not None:
+        panels[2].plot(*rotation, color=_GREY, lw=0.8, label="truth")
+        _draw_samples(panels[2], time, np.linalg.norm(gyro, axis=1), "gyroscope", _BLUE)
+        panels[2].set(ylabel="rotation [rad/s]", ylim=(0, _reach(np.linalg.norm(gyro, axis=1))))
+    for k, (start, stop) in enumerate(rest):
+        panels[1].axvspan(start, stop, color=_SKY, alpha=0.3, lw=0, label="" if k else "at rest")
+    for k, (start, stop) in enumerate(gaps):
+        for axes in panels[:2]:
+            axes.axvspan(start, stop, color=_RED, alpha=0.5, lw=1, label="" if k else "gap")
+    for axes in panels[: 2 + (rotation is not None)]:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
     if sequence.truth is not None:
         ticks, speed = _speed(sequence.truth)
-        panels[2].plot(ticks, speed, color="black", lw=1.0)
-        panels[2].set(ylabel="true speed [m/s]", ylim=(0, _reach(speed)))
+        panels[-1].plot(ticks, speed, color="black", lw=1.0)
+        panels[-1].set(ylabel="true speed [m/s]", ylim=(0, _reach(speed)))
     panels[-1].set_xlabel("time [s]")
     fig.align_ylabels()
     panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)

@@ -1,0 +1,306 @@
+"""What a recording is like, and what is wrong with it, before anything is computed from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.checks import check_units
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import MAX_TRUTH_GAP, STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.still import Rest, find_rest
+from stario.sequences.truth_fit import TruthFit, fit_truth
+
+_GAP_STEPS = 1.8
+"""A step of more usual ones than this has lost a sample."""
+
+_LATE_S = 0.02
+_TURNED_RAD = math.radians(5.0)
+_LEANING_RAD = math.radians(3.0)
+_ALIKE = 0.8
+"""Offset, misalignment, tilt and correlation from which a truth deserves a word."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How the samples are spread in time.
+
+    Attributes:
+        samples: as recorded.
+        duration_s: between the first and the last [s].
+        rate_hz: median rate [Hz].
+        jitter_s: median distance of a step from the median step [s].
+        gaps: start and length [s] of each step that has lost samples.
+        lost: samples that the gaps would have held.
+        repeated: samples at the time of the one before.
+        backward: samples earlier than the one before.
+        not_finite: samples with a time or a value that is no number.
+    """
+
+    samples: int
+    duration_s: float
+    rate_hz: float
+    jitter_s: float
+    gaps: tuple[tuple[float, float], ...]
+    lost: int
+    repeated: int
+    backward: int
+    not_finite: int
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the recording has a truth.
+
+    Attributes:
+        share: of the IMU's samples.
+        rate_hz: median rate of the truth [Hz].
+        gaps: in it, longer than what is interpolated across.
+        longest_gap_s: [s].
+        path_m: length of the way [m].
+    """
+
+    share: float
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+    path_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Findings about a recording.
+
+    Attributes:
+        name: the recording's.
+        timing: of its samples.
+        accel_norm: mean size of the accelerometer's samples [m/s^2].
+        gyro_norm: of the gyroscope's [rad/s].
+        rest: the sensors at rest, None if the device never rests.
+        coverage: of the truth, None without one.
+        fit: between truth and gyroscope, None where they cannot be compared.
+        problems: what is wrong, one line each, with what mends it.
+    """
+
+    name: str
+    timing: Timing
+    accel_norm: float
+    gyro_norm: float
+    rest: Rest | None
+    coverage: Coverage | None
+    fit: TruthFit | None
+    problems: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """The findings as plain values, units in the names."""
+        timing, rest, fit, coverage = self.timing, self.rest, self.fit, self.coverage
+        return {
+            "recording": self.name,
+            "samples": timing.samples,
+            "duration_s": timing.duration_s,
+            "rate_hz": timing.rate_hz,
+            "jitter_s": timing.jitter_s,
+            "gaps": [{"start_s": start, "length_s": length} for start, length in timing.gaps],
+            "samples_lost_in_gaps": timing.lost,
+            "times_repeated": timing.repeated,
+            "times_backward": timing.backward,
+            "samples_not_finite": timing.not_finite,
+            "accel_norm_mean_m_s2": self.accel_norm,
+            "gyro_norm_mean_rad_s": self.gyro_norm,
+            "rest": rest
+            and {
+                "seconds": rest.seconds,
+                "gyro_bias_rad_s": rest.gyro_bias,
+                "gyro_noise_rad_s_sqrt_hz": rest.gyro_noise,
+                "accel_norm_m_s2": rest.accel_norm,
+                "accel_noise_m_s2_sqrt_hz": rest.accel_noise,
+            },
+            "truth": coverage
+            and {
+                "coverage": coverage.share,
+                "rate_hz": coverage.rate_hz,
+                "gaps": coverage.gaps,
+                "longest_gap_s": coverage.longest_gap_s,
+                "path_m": coverage.path_m,
+            },
+            "truth_against_gyroscope": fit
+            and {
+                "time_offset_s": fit.time_offset,
+                "correlation": fit.correlation,
+                "misalignment_rad": fit.misalignment,
+                "misalignment_rotvec_rad": fit.R_TB.as_rotvec(),
+                "world_tilt_rad": fit.tilt,
+                "agreeing": fit.agreeing,
+                "pieces": fit.pieces,
+                "axes": fit.axes(),
+            },
+            "problems": list(self.problems),
+        }
+
+    def lines(self) -> list[str]:
+        """The findings for a person."""
+        return [
+            *self._timing_lines(),
+            f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
+            f"gyroscope: {self.gyro_norm:.3f} rad/s",
+            *self._rest_lines(),
+            *self._truth_lines(),
+            *(f"! {problem}" for problem in self.problems or ()),
+            *([] if self.problems else ["units, signs and axes: nothing wrong was found"]),
+        ]
+
+    def _timing_lines(self) -> list[str]:
+        t = self.timing
+        lines = [
+            f"{self.name}: {t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
+            f"jitter {1e3 * t.jitter_s:.2f} ms"
+        ]
+        if t.gaps:
+            start, length = max(t.gaps, key=lambda gap: gap[1])
+            lines.append(
+                f"gaps: {len(t.gaps)}, {t.lost} samples lost; "
+                f"longest {length:.3f} s at {start:.1f} s"
+            )
+        else:
+            lines.append("gaps: none")
+        lines.append(
+            f"times: {t.repeated} repeated, {t.backward} backward; "
+            f"{t.not_finite} samples not finite"
+        )
+        return lines
+
+    def _rest_lines(self) -> list[str]:
+        rest = self.rest
+        if rest is None:
+            return ["at rest: never for a second, so noise and bias cannot be told"]
+        bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
+        return [
+            f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",
+            f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise:.2e} rad/s/sqrt(Hz)",
+            f"  accelerometer: {rest.accel_norm:.4f} m/s^2 "
+            f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} to gravity), "
+            f"noise {rest.accel_noise:.2e} m/s^2/sqrt(Hz)",
+        ]
+
+    def _truth_lines(self) -> list[str]:
+        coverage, fit = self.coverage, self.fit
+        if coverage is None:
+            return ["truth: none"]
+        lines = [
+            f"truth: covers {100 * coverage.share:.1f} % of the samples, "
+            f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
+            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of way"
+        ]
+        if fit is not None:
+            lines.append(
+                f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
+                f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
+                f"correlation {fit.correlation:.3f}, "
+                f"world {math.degrees(fit.tilt):.2f} deg off level"
+            )
+        return lines
+
+
+def inspect_recording(sequence: ImuSequence) -> Inspection:
+    """Look a recording over; what is wrong with it is found, not raised.
+
+    Raises:
+        InputError: it holds no finite sample.
+    """
+    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    if not finite.any():
+        raise InputError(f"{sequence.name}: samples", "none that is finite", "numbers")
+    problems = []
+    try:
+        check_units(sequence)
+    except InputError as error:
+        problems.append(str(error))
+    fit: TruthFit | None = None
+    coverage = None if sequence.truth is None else _coverage(sequence, sequence.truth)
+    if coverage is not None and coverage.share > 0.0:
+        try:
+            fit = fit_truth(sequence)
+        except InputError as error:
+            problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+    if fit is not None:
+        problems += _fit_problems(sequence.name, fit, " ".join(problems))
+    return Inspection(
+        name=sequence.name,
+        timing=_timing(sequence, int((~finite).sum())),
+        accel_norm=float(np.linalg.norm(sequence.accel[finite], axis=1).mean()),
+        gyro_norm=float(np.linalg.norm(sequence.gyro[finite], axis=1).mean()),
+        rest=_rest(sequence),
+        coverage=coverage,
+        fit=fit,
+        problems=tuple(problems),
+    )
+
+
+def _rest(sequence: ImuSequence) -> Rest | None:
+    try:
+        return find_rest(sequence)
+    except InputError:  # a rate that `check_units` has named already
+        return None
+
+
+def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
+    time = sequence.time[np.isfinite(sequence.time)]
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
+    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
+    forward = steps[(steps > 0) & (steps <= _GAP_STEPS * usual)]
+    return Timing(
+        samples=len(sequence),
+        duration_s=sequence.duration,
+        rate_hz=sequence.rate,
+        jitter_s=float(np.median(np.abs(forward - usual))) if len(forward) else math.nan,
+        gaps=tuple((float(time[k]), float(steps[k])) for k in gaps),
+        lost=int(np.round(steps[gaps] / usual - 1.0).sum()) if len(gaps) else 0,
+        repeated=int((steps == 0).sum()),
+        backward=int((steps < 0).sum()),
+        not_finite=not_finite,
+    )
+
+
+def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
+    times = np.unique(sequence.time[np.isfinite(sequence.time)])
+    known = truth.time[truth.valid]
+    steps = np.diff(known)
+    return Coverage(
+        share=float(truth.at(times).valid.mean()) if len(known) > 1 else 0.0,
+        rate_hz=float(1.0 / np.median(steps)) if len(steps) else 0.0,
+        gaps=int((steps > MAX_TRUTH_GAP).sum()),
+        longest_gap_s=float(steps.max(initial=0.0)),
+        path_m=truth.path_length(),
+    )
+
+
+def _fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
+    """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
+    field = f"{name}: truth"
+    if fit.correlation < _ALIKE:
+        return [
+            f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f})"
+        ]
+    problems = []
+    if abs(fit.time_offset) > _LATE_S:
+        problems.append(
+            f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"
+        )
+    axes, degrees = fit.axes(), math.degrees(fit.misalignment)
+    if axes is not None and f"--axes={axes}" not in known:
+        problems.append(
+            f"{field}: its axes are not the IMU's ({degrees:.0f} degrees): pass `--axes={axes}`"
+        )
+    elif axes is None and fit.misalignment > _TURNED_RAD:
+        problems.append(
+            f"{field}: its axes are {degrees:.1f} degrees off the IMU's, which no option mends: "
+            "turn its attitude in the file"
+        )
+    if fit.tilt > _LEANING_RAD and not known:
+        problems.append(f"{field}: its world is {math.degrees(fit.tilt):.1f} degrees off level")
+    if fit.pieces > 1:
+        problems.append(f"{field}: its attitude jumps {fit.pieces - 1} times against the gyroscope")
+    return problems
