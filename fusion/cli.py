@@ -15,6 +15,9 @@ from stario.fusion.commands.benchmark import benchmark
 from stario.fusion.commands.compare import compare
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
+from stario.fusion.commands.export import export
+from stario.fusion.commands.inspect import inspect
+from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.train import train
@@ -27,7 +30,18 @@ app = typer.Typer(
     help="Inertial navigation: fused trajectories from IMU recordings.",
 )
 
-for command in (run, compare, evaluate, simulate, convert, train, benchmark):
+for command in (
+    run,
+    compare,
+    evaluate,
+    simulate,
+    convert,
+    inspect,
+    train,
+    models,
+    export,
+    benchmark,
+):
     app.command()(command)
 
 

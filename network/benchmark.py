@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.inference import inference_form
+from stario.network.timing import seconds_in_turn
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES
-
-_WARM_UP = 3
 
 
 @dataclass(frozen=True)
@@ -68,14 +67,9 @@ def _speed(
 ) -> NetworkSpeed:
     windows = torch.randn(batch, 6, WINDOW_SAMPLES, generator=generator)
     windows[:, 5] += STANDARD_GRAVITY
-    seconds = np.zeros((_WARM_UP + runs, len(forms)))
     with torch.inference_mode():
-        for row in seconds:
-            for column, form in enumerate(forms):
-                start = clock.perf_counter()
-                form(windows)
-                row[column] = clock.perf_counter() - start
-    per_window = 1e3 / batch * seconds[_WARM_UP:]
+        seconds = seconds_in_turn([partial(form, windows) for form in forms], runs)
+    per_window = 1e3 / batch * seconds
     medians, least = np.median(per_window, axis=0), per_window.min(axis=0)
     return NetworkSpeed(
         batch=batch,

@@ -64,6 +64,20 @@ class FastStarIO(nn.Module):
         with torch.no_grad():
             return self._recording(len(windows)).play(windows)
 
+    def weights(self) -> list[Tensor]:
+        """Every folded weight."""
+        found: list[Tensor] = []
+        held: list[object] = [*self.stages, *self.head]
+        while held:
+            item = held.pop()
+            if isinstance(item, Tensor):
+                found.append(item)
+            elif isinstance(item, list | tuple):
+                held += item
+            elif isinstance(item, Stage | Product | Star | Gate | Depthwise | Wings):
+                held += vars(item).values()
+        return found
+
     def _recording(self, batch: int) -> _Recording:
         known: dict[int, _Recording] = self._local.__dict__.setdefault("recordings", {})
         found = known.pop(batch, None)

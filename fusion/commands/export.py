@@ -1,0 +1,33 @@
+"""`stario export`: a network for other runtimes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stario.sequences.errors import InputError
+
+
+def export(
+    model: Annotated[
+        str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
+    ] = "default",
+    format: Annotated[str, typer.Option("--format", help="Format of the file: onnx.")] = "onnx",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="File to write; else the network's name here.")
+    ] = None,
+) -> None:
+    """Export a network with its calibration; `--model FILE.onnx` then runs it anywhere."""
+    from stario.network.export import export_onnx
+    from stario.network.model import load_model
+
+    if format != "onnx":
+        raise InputError("--format", repr(format), "onnx")
+    loaded = load_model(model)
+    path = out or Path(f"{loaded.name}.onnx")
+    if path.suffix != ".onnx":
+        raise InputError("--out", str(path), "a name that ends in .onnx")
+    export_onnx(loaded, path)
+    typer.echo(str(path))

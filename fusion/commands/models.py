@@ -1,0 +1,28 @@
+"""`stario models`: what each network costs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from stario.fusion.commands.common import JsonOption, print_json, progress_bar
+
+
+def models(
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Networks; all of the paper's table if none.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Parameters, FLOPs, time and memory of each network, beside the paper's figures."""
+    from stario.network.architectures import ARCHITECTURES
+    from stario.network.survey import survey, survey_table
+    from stario.sequences.stream_cache import cache_folder
+
+    with progress_bar("models") as progress:
+        rows = survey(names or list(ARCHITECTURES), cache_folder(), progress)
+    if as_json:
+        print_json([row.as_dict() for row in rows])
+        return
+    typer.echo(survey_table(rows))
