@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from stario.network.card import Calibration, Card
 from stario.network.model import DisplacementModel, DisplacementNetwork, save_model
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import atomic_write
-from stario.sequences.windows import WorldStream, windows_of
+from stario.sequences.windows import WorldStream, window_starts, windows_at
 
 log = logging.getLogger(__name__)
 
@@ -366,26 +366,32 @@ class _Run:
 
 
 class _ValidationSet:
-    """Windows kept from training, with the recording each comes from."""
+    """Windows kept from training, cut anew each time: all at once would fill the memory."""
 
     def __init__(self, streams: Sequence[WorldStream], device: torch.device) -> None:
-        cut = [windows_of(stream, VALIDATION_STRIDE) for stream in streams]
-        if not sum(len(windows) for windows, _ in cut):
+        self.streams, self.device = streams, device
+        counts = [len(window_starts(stream, VALIDATION_STRIDE)) for stream in streams]
+        if not sum(counts):
             raise InputError("validation", "no window", "stretches longer than a second")
-        self.windows = torch.from_numpy(np.concatenate([w for w, _ in cut])).to(device)
-        self.target = torch.from_numpy(np.concatenate([d for _, d in cut]))
-        self.names = np.concatenate(
-            [np.full(len(w), s.name) for s, (w, _) in zip(streams, cut, strict=True)]
-        )
+        self.names = np.repeat([stream.name for stream in streams], counts)
+
+    def _batches(self) -> Iterator[tuple[Tensor, Tensor]]:
+        for stream in self.streams:
+            starts = window_starts(stream, VALIDATION_STRIDE)
+            for first in range(0, len(starts), 256):
+                windows, target = windows_at(stream, starts[first : first + 256])
+                yield torch.from_numpy(windows), torch.from_numpy(target)
 
     @torch.inference_mode()
     def residuals(self, network: nn.Module) -> tuple[np.ndarray, np.ndarray]:
         """Errors (M, 3) [m] and log sigmas (M, 3)."""
         network.eval()
-        parts = [network(part) for part in torch.split(self.windows, 256)]
-        mean = torch.cat([m for m, _ in parts]).cpu()
-        log_sigma = torch.cat([s for _, s in parts]).cpu()
-        return (mean - self.target).double().numpy(), log_sigma.double().numpy()
+        errors, log_sigmas = [], []
+        for windows, target in self._batches():
+            mean, log_sigma = network(windows.to(self.device))
+            errors.append(mean.cpu() - target)
+            log_sigmas.append(log_sigma.cpu())
+        return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
 
     def errors(self, network: nn.Module) -> dict[str, float]:
         """Mean squared error by recording [m^2]."""

@@ -139,7 +139,18 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
 
 def windows_of(stream: WorldStream, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Windows (M, 6, 200) every `stride` samples with their displacements (M, 3) [m]."""
-    starts = np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
+    return windows_at(stream, window_starts(stream, stride))
+
+
+def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
+    """First samples (M,) of the windows every `stride` samples."""
+    return np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
+
+
+def windows_at(
+    stream: WorldStream, starts: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Windows (M, 6, 200) that begin at samples `starts` (M,), and displacements (M, 3) [m]."""
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
     windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
     return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
