@@ -53,6 +53,8 @@ def read_android(path: Path) -> ImuSequence:
     Raises:
         ReadError: a file is missing or malformed, or the two have no stretch in common.
     """
+    if not path.is_dir():
+        raise ReadError(path, "path", "a file", "a logger's folder")
     accel_file, gyro_file = _sensor_file(path, "acc"), _sensor_file(path, "gyr")
     for name, file in (("accelerometer", accel_file), ("gyroscope", gyro_file)):
         if file is None:

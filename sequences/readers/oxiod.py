@@ -184,7 +184,10 @@ def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
 
 def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
     """Rows at either end of an impossible step or far from the median around them, widened."""
-    median = median_filter(position, size=(51, 1), mode="nearest")
+    if len(time) < 2:
+        return np.zeros(len(time), dtype=np.bool_)
+    half = max(1, round(0.25 / float(np.median(np.diff(time)))))
+    median = median_filter(position, size=(2 * half + 1, 1), mode="nearest")
     distance = np.linalg.norm(position - median, axis=1)
     limit = _JUMP_M_S * np.maximum(np.diff(time), 1.0 / RATE)
     jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < limit)

@@ -381,10 +381,12 @@ def formats() -> SimpleNamespace:
     )
 
 
-@pytest.fixture(params=list(WRITERS))
+@pytest.fixture(scope="module", params=list(WRITERS))
 def written(
-    request: pytest.FixtureRequest, tmp_path: Path, walks: Callable[[float], ImuSequence]
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    walks: Callable[[float], ImuSequence],
 ) -> tuple[str, Written]:
-    """A recording in each format, with the name it must be recognised by."""
+    """A recording in each format, with the name it must be recognised by; not to be changed."""
     name, rate, write = WRITERS[request.param]
-    return name, write(tmp_path / "seq_1", walks(rate))
+    return name, write(tmp_path_factory.mktemp("set") / "seq_1", walks(rate))

@@ -1,0 +1,248 @@
+"""What a format leaves open: sources of attitude, orders of quaternions, frames, topics, clocks."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences.readers.bag import read_bag
+
+
+def angle(a: Rotation, b: Rotation) -> float:
+    return float((a.inv() * b).magnitude().max())
+
+
+def shape(attitude: Rotation) -> Rotation:
+    """An attitude but for what its first sample is."""
+    return attitude[0].inv() * attitude
+
+
+@pytest.mark.parametrize(
+    ("errors", "source"),
+    [
+        ({"grv_ori_error": 19.9, "ekf_ori_error": 1.0}, "game_rv"),
+        ({"grv_ori_error": 20.1, "ekf_ori_error": 5.0}, "ekf"),
+        ({"grv_ori_error": 25.0, "ekf_ori_error": 30.0, "gyro_integration_error": 40.0}, "game_rv"),
+        ({"grv_ori_error": 25.0, "ekf_ori_error": 30.0, "gyro_integration_error": 10.0}, "gyro"),
+    ],
+)
+def test_ronin_takes_the_attitude_that_its_authors_take(
+    tmp_path, walks, formats, errors, source
+) -> None:
+    walk = walks(200.0)
+    recording = formats.ronin(tmp_path / "a000_1", walk, **errors)
+    attitude = read_recording(recording.path).truth.attitude_WB
+    true = walk.truth.attitude_WB
+    if source == "ekf":  # the writer makes it drift about the vertical
+        drift = Rotation.from_rotvec(np.outer(walk.time, [0.0, 0.0, 0.01]))
+        true = drift * true
+    limit = 2e-3 if source == "gyro" else 1e-6
+    assert angle(attitude, true[100:]) < limit
+    if source == "gyro":
+        assert angle(shape(attitude), shape(true[100:])) > 1e-9
+
+
+def test_ronin_without_an_ekf_does_with_the_others(tmp_path, walks, formats) -> None:
+    h5py = pytest.importorskip("h5py")
+    recording = formats.ronin(tmp_path / "a", walks(200.0), grv_ori_error=30.0)
+    with h5py.File(recording.path / "data.hdf5", "a") as data:
+        del data["pose/ekf_ori"]
+    read = read_recording(recording.path / "data.hdf5")
+    assert angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
+
+
+def test_rnin_without_motion_capture_takes_the_odometry(tmp_path, walks, formats) -> None:
+    recording = formats.rnin(tmp_path, walks(200.0), captured=False)
+    truth, expected = read_recording(recording.path).truth, recording.expected.truth
+    assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
+    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+    csv = recording.path / "SenseINS.csv"
+    csv.write_text(csv.read_text().replace("times,", "time,", 1))
+    assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
+
+
+def test_tlio_trusts_the_name_of_the_quaternion(tmp_path, walks, formats) -> None:
+    recording = formats.tlio(tmp_path / "7", walks(200.0), order="wxyz")
+    read = read_recording(recording.path)
+    assert angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 1e-6
+    assert np.abs(read.accel - recording.expected.accel).max() < 1e-9
+
+
+def test_tlio_raw_is_posed_in_the_imus_axes(tmp_path, walks, formats) -> None:
+    """Where the pose is a device's, the calibration turns it; where it is the IMU's it does not."""
+    R_DI = Rotation.from_euler("zyx", [90.0, 10.0, -170.0], degrees=True)
+    recording = formats.tlio_raw(tmp_path / "7", walks(1000.0), R_DI)
+    truth, expected = read_recording(recording.path).truth, recording.expected.truth
+    assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
+    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+    (recording.path.parent / "imu0_resampled.npy").unlink()
+    alone = read_recording(recording.path.parent)
+    assert alone.truth is None
+    assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
+
+
+def test_raw_poses_of_a_world_with_z_up_stay(tmp_path, walks, formats) -> None:
+    """RIDI's raw folders have IMUNet's files, from a Tango."""
+    recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
+    truth, expected = read_recording(recording.path).truth, recording.expected.truth
+    assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
+    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+
+
+def test_a_processed_recording_is_preferred_to_the_raw_files_beside_it(
+    tmp_path, walks, formats
+) -> None:
+    walk = walks(200.0)
+    formats.imunet_raw(tmp_path / "seq", walk)
+    formats.ridi(tmp_path / "seq", walk)
+    assert len(read_recording(tmp_path / "seq")) == len(walk)
+    assert len(read_recording(tmp_path / "seq", format="imunet")) == len(walk)
+    assert find_recordings(tmp_path) == [tmp_path / "seq"]
+
+
+@pytest.mark.parametrize("version", ["ros1", "sqlite3"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "geometry_msgs/msg/TransformStamped",
+        "nav_msgs/msg/Odometry",
+    ],
+)
+def test_each_kind_of_pose_is_truth(tmp_path, formats, version, kind) -> None:
+    walk = formats.walk(100.0, 3.0)
+    path = formats.bag(tmp_path / "b", walk, version, pose_topics=(("/pose", kind),))
+    read = read_recording(path)
+    assert np.abs(read.truth.position_W - walk.truth.position_W).max() < 1e-9
+    assert angle(read.truth.attitude_WB, walk.truth.attitude_WB) < 1e-9
+    assert np.abs(read.truth.time - walk.time).max() < 2e-9
+
+
+def test_several_topics_are_named_with_the_option_that_chooses(tmp_path, formats) -> None:
+    walk = formats.walk(100.0, 3.0)
+    kind = "geometry_msgs/msg/PoseStamped"
+    path = formats.bag(
+        tmp_path / "b", walk, imu_topics=("/imu", "/imu_old"),
+        pose_topics=(("/mocap", kind), ("/vio", kind)),
+    )  # fmt: skip
+    with pytest.raises(ReadError, match=r"found /imu, /imu_old, .*imu_topic=/imu"):
+        read_recording(path)
+    with pytest.raises(ReadError, match=r"found /mocap, /vio, .*truth_topic=/mocap, or .*none"):
+        read_recording(path, imu_topic="/imu")
+    read = read_recording(path, imu_topic="/imu_old", truth_topic="/vio")
+    assert np.array_equal(read.gyro, walk.gyro)
+    assert read.truth is not None
+    assert read_bag(path, "/imu", "none").truth is None
+    with pytest.raises(ReadError, match="imu topic: found '/vio', expected one of /imu, /imu_old"):
+        read_recording(path, imu_topic="/vio")
+    (tmp_path / "a.csv").write_text("t,gx,gy,gz,ax,ay,az\n")
+    with pytest.raises(InputError, match="imu_topic: found an option of a csv recording"):
+        read_recording(tmp_path / "a.csv", imu_topic="/imu")
+
+
+def test_a_bag_without_an_imu_shows_what_it_has(tmp_path, formats) -> None:
+    path = formats.bag(tmp_path / "b", formats.walk(100.0, 1.0), imu_topics=())
+    with pytest.raises(ReadError, match=r"found /odom \(Odometry\), expected one topic with sens"):
+        read_recording(path)
+
+
+def phone_files(folder, accel: str, gyro: str, names=("accel.csv", "gyro.csv")) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, text in zip(names, (accel, gyro), strict=True):
+        (folder / name).write_text(text)
+
+
+def rows(time, values, joint=",", last=False) -> str:
+    return "\n".join(
+        joint.join(map(repr, [*v, t] if last else [t, *v]))
+        for t, v in zip(time.tolist(), values.tolist(), strict=True)
+    )
+
+
+def test_loggers_of_several_habits(tmp_path, formats) -> None:
+    """Seconds with units in a header; milliseconds without any; the time behind the values."""
+    walk = formats.walk(200.0, 5.0)
+    t, gyro, accel = walk.time, walk.gyro, walk.accel
+    header = '"Time (s)","Gyroscope x (deg/s)","Gyroscope y (deg/s)","Gyroscope z (deg/s)"\n'
+    g_header = "timestamp [s];ax [g];ay [g];az [g]\n"
+    blanks = "# a logger\n"
+    habits = {
+        "phyphox": (
+            g_header + rows(t, accel / 9.80665, ";"), header + rows(t, np.degrees(gyro)),
+        ),
+        "plain": (rows(1000 * t + 5e8, accel), rows(1000 * t + 5e8, gyro)),
+        "behind": (rows(t, accel, last=True), rows(t, gyro, last=True)),
+        "blanks": (blanks + rows(1e6 * t, accel, " "), blanks + rows(1e6 * t, gyro, " ")),
+    }  # fmt: skip
+    for name, (accel_text, gyro_text) in habits.items():
+        phone_files(tmp_path / name, accel_text, gyro_text)
+        read = read_recording(tmp_path / name)
+        assert np.abs(read.gyro - gyro).max() < 1e-9, name
+        assert np.abs(read.accel - accel).max() < 1e-6, name
+        assert np.abs(read.time - t).max() < 1e-7, name
+    assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(habits)]
+
+
+def test_a_loggers_gravity_is_added_where_it_was_removed(tmp_path, formats) -> None:
+    walk = formats.walk(100.0, 5.0)
+    gravity = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
+    phone_files(tmp_path / "s", rows(walk.time, walk.accel - gravity), rows(walk.time, walk.gyro))
+    assert np.abs(read_recording(tmp_path / "s").accel).mean() < 3.0
+    (tmp_path / "s/Gravity.csv").write_text(rows(walk.time, gravity))
+    assert np.abs(read_recording(tmp_path / "s").accel - walk.accel).max() < 1e-9
+
+
+def test_clocks_of_other_phase_are_interpolated_but_not_across_a_gap(tmp_path, formats) -> None:
+    walk = formats.walk(200.0, 10.0)
+    t = walk.time
+    accel_time = np.delete(t[:-1] + 0.0017, np.arange(800, 1000))
+    force = np.stack([np.interp(accel_time, t, walk.accel[:, k]) for k in range(3)], axis=1)
+    phone_files(tmp_path / "s", rows(accel_time, force), rows(t, walk.gyro))
+    read = read_recording(tmp_path / "s")
+    assert len(read) == len(t) - 2 - 201
+    assert np.diff(read.time).max() == pytest.approx(1.01, abs=1e-6)
+    kept = np.searchsorted(t, read.time + t[1] - 1e-6)
+    assert np.array_equal(read.gyro, walk.gyro[kept])
+    assert np.abs(read.accel - walk.accel[kept]).max() < 0.3
+    phone_files(tmp_path / "late", rows(t + 100.0, walk.accel), rows(t, walk.gyro))
+    with pytest.raises(ReadError, match=r"gyroscope from 0.000 to 10.000 s, accelerometer from 1"):
+        read_recording(tmp_path / "late")
+
+
+def test_large_files_are_read_alike_with_and_without_pandas(
+    tmp_path, walks, formats, monkeypatch
+) -> None:
+    pytest.importorskip("pandas")
+    monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
+    for write in (formats.ridi, formats.rnin, formats.imunet_raw, formats.android):
+        path = write(tmp_path / "seq", walks(200.0)).path
+        quick = read_recording(path)
+        with monkeypatch.context() as without:
+            without.setitem(__import__("sys").modules, "pandas", None)
+            careful = read_recording(path)
+        assert np.array_equal(quick.time, careful.time)
+        assert np.array_equal(quick.gyro, careful.gyro)
+        assert np.array_equal(quick.accel, careful.accel)
+        shutil.rmtree(tmp_path / "seq")
+
+
+def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, formats, monkeypatch) -> None:
+    recording = formats.ronin(tmp_path / "a", walks(200.0))
+    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    with pytest.raises(InputError, match=r'h5py: found not installed.*"stario\[readers\]"'):
+        read_recording(recording.path)
+
+
+def test_calibration_is_as_the_authors_filter_applies_it(tmp_path, walks, formats) -> None:
+    recording = formats.tlio_raw(tmp_path / "7", walks(1000.0))
+    calibration = recording.path.with_name("calibration.json")
+    fields = json.loads(calibration.read_text())
+    fields["Accelerometer"]["Bias"]["Offset"] = [0.0, 0.0, 0.0]
+    calibration.write_text(json.dumps(fields))
+    off = read_recording(recording.path).accel - recording.expected.accel
+    assert np.abs(off - [0.1, 0.05, -0.2]).max() < 1e-9  # R^-1 x - b: the bias, not R^-1 b
