@@ -331,9 +331,6 @@ def test_find_walks_through_folders_in_order(
 
 
 RECORDED = [
-    ("oxiod/handheld/data1/syn/imu7.csv", 0.95, 0.1),
-    ("oxiod/multi users/user2/syn/imu4.csv", 0.95, 0.1),
-    ("oxiod/trolley/data2/syn/imu1.csv", 0.88, 0.1),  # little turning beside the capture's noise
     ("tumvi/dataset-room3_512_16", 0.95, 1.0),  # an accelerometer's bias turns up as tilt here
     ("euroc/V1_02_medium", 0.95, 1.0),
 ]

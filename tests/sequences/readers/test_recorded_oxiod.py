@@ -1,0 +1,70 @@
+"""The recorded part of OxIOD: mount and lag are found, glitches masked, the world is level."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+DATA = Path(
+    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")
+)
+OXIOD = DATA / "oxiod"
+needs_data = pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
+
+SOME = (
+    "handheld/data1/syn/imu2.csv",  # flips at 149 s
+    "multi users/user2/syn/imu6.csv",  # flips at 252 s
+    "trolley/data2/syn/imu1.csv",  # turns about the vertical alone
+)
+ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
+
+
+def seen_and_measured(
+    sequence: ImuSequence, truth: Trajectory, seconds: float
+) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors [rad] of the attitude and of the gyroscope over an interval, in B."""
+    stride = round(seconds * 100.0)
+    steps = 0.5 * np.diff(sequence.time)[:, None] * (sequence.gyro[1:] + sequence.gyro[:-1])
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    at = np.stack([np.interp(truth.time, sequence.time, angle[:, k]) for k in range(3)], axis=1)
+    inside = (truth.time > sequence.time[0]) & (truth.time < sequence.time[-1]) & truth.valid
+    good = inside[:-stride] & inside[stride:]
+    attitude = truth.attitude_WB
+    seen = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    return seen[good], (at[stride:] - at[:-stride])[good]
+
+
+def holds(path: Path) -> None:
+    sequence = read_recording(path)
+    truth = sequence.truth
+    assert truth is not None
+    seen, measured = seen_and_measured(sequence, truth, 0.1)
+    assert np.corrcoef(seen.ravel(), measured.ravel())[0, 1] > 0.95
+    # No flip and no glitch is left: over 0.1 s both see the same rotation to a few degrees.
+    apart = np.degrees(np.linalg.norm(seen - measured, axis=1))
+    assert np.percentile(apart, 99.9) < 15.0
+    assert truth.valid.mean() > 0.97
+    steps = np.linalg.norm(np.diff(truth.position_W, axis=0), axis=1)
+    assert steps[truth.valid[:-1] & truth.valid[1:]].max() < 0.05  # 5 m/s
+    inside = sequence.time < truth.time[-1]
+    pose = truth.at(sequence.time[inside])
+    force = pose.attitude_WB.apply(sequence.accel[inside])[pose.valid].mean(axis=0)
+    assert np.degrees(np.arctan2(np.hypot(*force[:2]), force[2])) < 0.1
+    assert np.linalg.norm(force) == pytest.approx(9.8, abs=0.15)
+
+
+@needs_data
+@pytest.mark.parametrize("name", SOME)
+def test_some_recordings_agree_with_themselves(name: str) -> None:
+    holds(OXIOD / name)
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ALL, ids=str)
+def test_every_recording_agrees_with_itself(path: Path) -> None:
+    holds(path)
