@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from stario.fusion.benchmark import filter_speed
-from stario.fusion.compare import demonstration
+from stario.fusion.compare import DEMONSTRATION_SEED, demonstration
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.navigator import Navigator
 from stario.network.benchmark import network_speed
 from stario.network.model import DisplacementModel
+from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.stream_cache import recorded
+from stario.sequences.walks import generate_walk
 
 _RUNS = 5
 
@@ -43,7 +49,25 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         "run_s_per_min": medians["run"],
         "run_network_s_per_min": medians["run_network"],
         "update_rate_hz": default.config.filter.update_rate,
+        **windows_speed(),
         "network": [asdict(speed) for speed in network_speed(model.training_form)],
+    }
+
+
+def windows_speed(seconds: float = 600.0) -> dict[str, float]:
+    """Seconds per hour of data to read windows for training from a CSV, and from the cache."""
+    sequence = simulate_imu(generate_walk(DEMONSTRATION_SEED, seconds), 200.0, PHONE_IMU)
+    hours = sequence.duration / 3600.0
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "walk.csv"
+        write_csv(path, sequence)
+        runs = [
+            _timed(lambda: list(recorded([path], read_recording, {}, Path(name) / "cache")))[0]
+            for _ in range(1 + _RUNS)
+        ]
+    return {
+        "windows_built_s_per_hour": runs[0] / hours,
+        "windows_cached_s_per_hour": float(np.median(runs[1:])) / hours,
     }
 
 
@@ -59,6 +83,10 @@ def speed_table(report: dict[str, Any]) -> str:
         f"whole run at {report['update_rate_hz']} updates/s: {report['run_s_per_min']:.3f} s/min, "
         f"of which network {report['run_network_s_per_min']:.3f} s/min",
     ]
+    lines.append(
+        f"training windows: {report['windows_built_s_per_hour']:.2f} s per hour of data from CSV, "
+        f"{report['windows_cached_s_per_hour']:.3f} s from the cache, one process"
+    )
     lines += [
         f"network, batch {n['batch']}: {n['inference_form']:.3f} ms/window "
         f"(as trained: {n['training_form']:.3f}), {n['threads']} threads"

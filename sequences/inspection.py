@@ -269,7 +269,7 @@ def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
     known = truth.time[truth.valid]
     steps = np.diff(known)
     return Coverage(
-        share=float(truth.at(times).valid.mean()) if len(known) > 1 else 0.0,
+        share=float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
         rate_hz=float(1.0 / np.median(steps)) if len(steps) else 0.0,
         gaps=int((steps > MAX_TRUTH_GAP).sum()),
         longest_gap_s=float(steps.max(initial=0.0)),

@@ -89,16 +89,9 @@ class Trajectory:
         Raises:
             InputError: fewer than two valid samples to interpolate between.
         """
-        time = _checked_time("time", time)
+        covered = self.covers(time, max_gap)
         known = np.flatnonzero(self.valid)
-        if len(known) < 2:
-            raise InputError("trajectory", f"{len(known)} valid samples", "at least 2")
         t = self.time[known]
-        right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
-        tolerance = 1e-9 * max(1.0, abs(t[-1]))
-        inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
-        bracketed = t[right] - t[right - 1] <= max_gap
-        exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
         clipped = np.clip(time, t[0], t[-1])
         velocity = None if self.velocity_W is None else _lerp(clipped, t, self.velocity_W[known])
         covariance = None
@@ -111,8 +104,25 @@ class Trajectory:
             attitude_WB=Slerp(t, self.attitude_WB[known])(clipped),
             velocity_W=velocity,
             position_covariance_W=covariance,
-            valid=inside & (bracketed | exact),
+            valid=covered,
         )
+
+    def covers(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> BoolArray:
+        """Whether the pose is known at each time (M,): what `at` returns as `valid`, but sooner.
+
+        Raises:
+            InputError: as for `at`.
+        """
+        time = _checked_time("time", time)
+        t = self.time[self.valid]
+        if len(t) < 2:
+            raise InputError("trajectory", f"{len(t)} valid samples", "at least 2")
+        right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
+        tolerance = 1e-9 * max(1.0, abs(t[-1]))
+        inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
+        bracketed = t[right] - t[right - 1] <= max_gap
+        exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
+        return np.asarray(inside & (bracketed | exact))
 
     def slice(self, start: float, stop: float) -> Trajectory:
         """The samples with start <= time <= stop [s]."""

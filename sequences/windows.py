@@ -80,7 +80,8 @@ def world_streams(
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
     grid, imu_W, usable = imu_in_world(sequence, sequence.truth)
-    position_W = sequence.truth.at(grid).position_W
+    known = sequence.truth.valid
+    position_W = _interpolate(grid, sequence.truth.time[known], sequence.truth.position_W[known])
     return [
         WorldStream(
             name=sequence.name,
@@ -108,7 +109,7 @@ def imu_in_world(
     attitude_WB = truth.at(time).attitude_WB
     grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
     imu_W = np.concatenate([attitude_WB.apply(gyro), attitude_WB.apply(accel)], axis=1)
-    usable = truth.at(grid).valid & ~_spans_gap(time, grid)
+    usable = truth.covers(grid) & ~_spans_gap(time, grid)
     return grid, resample(time, imu_W, grid).astype(np.float32), usable
 
 
