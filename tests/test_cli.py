@@ -19,7 +19,18 @@ from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
 
-COMMANDS = ("run", "compare", "evaluate", "simulate", "convert", "train", "benchmark")
+COMMANDS = (
+    "run",
+    "compare",
+    "evaluate",
+    "simulate",
+    "convert",
+    "inspect",
+    "train",
+    "models",
+    "export",
+    "benchmark",
+)
 
 
 class Done:
@@ -227,6 +238,22 @@ def test_what_the_numbers_mean_can_be_told_to_every_command(
     words = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
     done = stario(command, "odd.csv", *target, *words)
     assert done.code == 0, done.err
+
+
+# --- inspect -----------------------------------------------------------------------------------
+
+
+def test_inspect_names_what_mends_a_recording(stario, recording: Path, tmp_path: Path) -> None:
+    walk = read_own_csv(recording)
+    write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
+    done = stario("inspect", "g.csv", "--out", "out")
+    assert done.code == 0
+    assert "--accel-unit g" in done.out
+    assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
+    mended = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
+    assert mended["problems"] == []
+    assert mended == json.loads((tmp_path / "runs/g/inspection.json").read_text())
+    assert mended["rate_hz"] == pytest.approx(100.0)
 
 
 # --- wrong input -------------------------------------------------------------------------------
