@@ -21,9 +21,6 @@ from stario.sequences.windows import WINDOW_SECONDS
 UPDATE_RATES = (1, 2, 5, 10, 20)
 """Network updates per second that may be asked for."""
 
-KEYFRAME_RATES = (1, 2, 5, 10)
-"""Keyframes of the graph per second that may be asked for."""
-
 LEAST_OUTPUT_RATE = 10
 """States per second where the network is asked less often [Hz]."""
 
@@ -107,20 +104,15 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """The factor graph, batch and fixed-lag.
+    """The factor graph.
 
     Attributes:
-        keyframe_rate: keyframes per second, at most; windows count that begin and end at one.
-        lag: how far back the fixed-lag graph moves its keyframes [s].
+        lag: how far back the graph of a stream moves its keyframes [s].
     """
 
-    keyframe_rate: int = 1
-    lag: float = 10.0
+    lag: float = 5.0
 
     def __post_init__(self) -> None:
-        if self.keyframe_rate not in KEYFRAME_RATES:
-            found = repr(self.keyframe_rate)
-            raise ConfigError("keyframe_rate", found, f"one of {KEYFRAME_RATES}")
         if not 2.0 <= self.lag <= 60.0:
             raise ConfigError("lag", repr(self.lag), "2 to 60 s")
 

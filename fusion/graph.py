@@ -129,7 +129,10 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Forget the keyframes before one, keeping what they say of the others."""
+        """Forget the keyframes before one, keeping what they say of it.
+
+        No measurement may reach across it.
+        """
         old = [k for k in self._time if k < before]
         if not old:
             return
@@ -144,32 +147,20 @@ class KeyframeGraph:
         _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         self._factors = [item for item in self._factors if item[0] >= before]
         self._terms = [term for term in self._terms if term.first >= before]
-        self._add_prior(self._marginal(rest))
+        self._add_prior(self._marginal(before, rest))
         for key in keys:
             self._values.erase(key)
         for k in old:
             del self._time[k]
         self._tree = None
 
-    def _marginal(self, rest: Any) -> Prior:
-        """What elimination left of the keyframes it did not eliminate."""
-        keys = rest.keyVector()
-        touched = tuple(k for k in self._time if X(k) in keys or V(k) in keys or B(k) in keys)
-        columns = {}
-        for n, k in enumerate(touched):
-            for key, first, width in ((X(k), 0, 6), (V(k), 6, 3), (B(k), 9, 6)):
-                if key in keys:
-                    columns[key] = np.arange(width) + CORE * n + first
-        A, b = rest.jacobian(_ordering(list(columns)))
-        table = np.zeros((len(b), CORE * len(touched) + 1))
-        table[:, np.concatenate(list(columns.values()))] = A
-        table[:, -1] = b
-        table = np.asarray(np.linalg.qr(table, mode="r"))[: table.shape[1] - 1]
-        about = tuple(self.pose(k) for k in touched)
-        for n, state in enumerate(about):
-            part = slice(CORE * n, CORE * (n + 1))
-            table[:, part] = table[:, part] @ np.linalg.inv(state.invariant_from_local())
-        return Prior(touched, about, table[:, :-1], table[:, -1])
+    def _marginal(self, k: int, rest: Any) -> Prior:
+        """What elimination left of the one keyframe that it reached."""
+        A, b = rest.jacobian(_ordering([X(k), V(k), B(k)]))
+        table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[:CORE]
+        about = self.pose(k)
+        root = table[:, :-1] @ np.linalg.inv(about.invariant_from_local())
+        return Prior(k, about, root, table[:, -1])
 
     def _add_prior(self, prior: Prior) -> None:
         self._terms.append(_Whitened(prior, prior.covariance, math.inf))
@@ -276,7 +267,7 @@ def _prior(state: NavState) -> Prior:
     to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
     covariance = to_invariant @ state.covariance @ to_invariant.T
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    return Prior((0,), (about,), root, np.zeros(CORE))
+    return Prior(0, about, root, np.zeros(CORE))
 
 
 def _world_from_local(R_WB: FloatArray) -> FloatArray:

@@ -42,8 +42,9 @@ class Taken(NamedTuple):
 class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
-    Keyframes stand at the grid's times, `keyframe_rate` a second, at both ends of a gap and at the
-    times of fixes that come in time.
+    Keyframes stand where windows meet, one a second, at both ends of a gap and at the times of
+    fixes that come in time. More of them bring nothing: the IMU binds them as well over a second
+    as over a tenth, and windows that overlap see the same motion again.
 
     Args:
         config: noise, filter and graph settings.
@@ -62,13 +63,10 @@ class GraphBuilder:
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
         output_rate = config.filter.output_rate
-        self._stride = output_rate // config.graph.keyframe_rate
-        self._window = round(output_rate * WINDOW_SECONDS)
-        # Overlapping windows see the same motion again, as in the filter's settings.
-        rate = min(config.filter.update_rate, config.graph.keyframe_rate)
-        self._scale = rate * WINDOW_SECONDS * config.filter.covariance_scale
+        self._window = round(output_rate * WINDOW_SECONDS)  # epochs
         self._pending: list[Epoch] = []
-        self._keyframe_at = {count: 0}  # as far back as a window reaches
+        # Keyframes where one window ends and the next begins.
+        self._joints: list[int] = [0] if count % self._window == 0 else []
 
     @property
     def newest(self) -> Segment:
@@ -98,20 +96,18 @@ class GraphBuilder:
         before = self.graph.last
         if epoch.gap:
             self.close()
-            self._keyframe_at.clear()
         self.count = 0 if epoch.gap else self.count + 1
         self._append(epoch)
         inside = [fix for fix in fixes if fix.time < epoch.stop - _SAME_TIME]
         for fix in inside:
             self.fix(fix)
-        due = self.count % self._stride == 0
+        due = self.count % self._window == 0
         if due or len(inside) < len(fixes):
             self.close(guess)
         if due:
-            self._keyframe_at[self.count] = self.graph.last
-            self._keyframe_at.pop(self.count - self._window - self._stride, None)
-            if measurement is not None:
-                self._measure(epoch, *measurement)
+            if measurement is not None and self._joints:
+                self._measure(self._joints[-1], epoch, *measurement)
+            self._joints.append(self.graph.last)
             if held is not None:
                 self._hold_still(held)
         for fix in fixes[len(inside) :]:
@@ -149,12 +145,12 @@ class GraphBuilder:
         graph.add(self._fix_term(fix, held[-1]))
         return True
 
-    def forget(self, before: int) -> None:
-        """Marginalise the keyframes before one."""
-        self.graph.marginalise(before)
-        for k in [k for k in self.segments if k < before]:
-            del self.segments[k]
-        self._keyframe_at = {n: k for n, k in self._keyframe_at.items() if k >= before}
+    def forget(self, time: float) -> None:
+        """Marginalise the keyframes before a time [s], up to where windows meet."""
+        joint = max((k for k in self._joints if self.graph.time(k) <= time), default=0)
+        self.graph.marginalise(joint)
+        self._joints = [k for k in self._joints if k >= joint]
+        self.segments = {k: pieces for k, pieces in self.segments.items() if k >= joint}
 
     def reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
@@ -183,10 +179,9 @@ class GraphBuilder:
         for epoch in after:
             self._append(epoch)
 
-    def _measure(self, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
-        i = self._keyframe_at.get(self.count - self._window)
-        covariance = covariance_N * self._scale
-        if i is None or not _usable(d_N, covariance):
+    def _measure(self, i: int, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
+        covariance = covariance_N * self._config.filter.covariance_scale
+        if not _usable(d_N, covariance):
             return
         assert epoch.R_NB_window is not None  # a window always comes with its first attitude
         self.graph.add(Displacement(i, self.graph.last, d_N, epoch.R_NB_window, covariance))
@@ -194,7 +189,7 @@ class GraphBuilder:
     def _hold_still(self, held: Held) -> None:
         zero, k = np.zeros(3), self.graph.last
         # One keyframe stands for the epochs since the one before.
-        covariance = held.covariance / self._stride
+        covariance = held.covariance / self._window
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
         self.graph.add(GyroBias(k, held.b_g, covariance[3:, 3:]))
 

@@ -105,8 +105,7 @@ class GraphRecipe:
         try:
             graph.solve()
             newest = graph.state(graph.last)
-            oldest = newest.time - self._config.graph.lag
-            builder.forget(next(k for k in graph.keyframes if graph.time(k) >= oldest))
+            builder.forget(newest.time - self._config.graph.lag)
         except IndeterminateError as error:
             self._fallbacks += 1
             self._why = str(error)

@@ -97,7 +97,7 @@ class KeyframeState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of some keyframes together: root error = offset, with white noise of 1.
+    """What is known of a keyframe: root error = offset, with white noise of 1.
 
     The error is right-invariant, so that a turn about the vertical and a shift are the same
     directions wherever the keyframes have moved since: what was marginalised cannot come to know
@@ -105,16 +105,21 @@ class Prior:
     and a stream's yaw then is reported twice as certain as it is.
 
     Attributes:
-        keyframes: n of them.
-        about: the states the error is counted from.
-        root: (m, 15 n).
-        offset: (m,).
+        k: keyframe.
+        about: the state the error is counted from.
+        root: (15, 15).
+        offset: (15,).
     """
 
-    keyframes: tuple[int, ...]
-    about: tuple[KeyframeState, ...]
+    k: int
+    about: KeyframeState
     root: FloatArray
     offset: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The one."""
+        return (self.k,)
 
     @property
     def covariance(self) -> FloatArray:
@@ -123,13 +128,10 @@ class Prior:
 
     def linearise(self, values: Any) -> Linearised:
         """In the rows of the root."""
-        residual, blocks = self.offset, []
-        for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
-            state = KeyframeState.of(values, k)
-            root = self.root[:, CORE * n : CORE * (n + 1)]
-            residual = residual - root @ state.error_from(about)
-            H = root @ state.invariant_from_local()
-            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
+        state = KeyframeState.of(values, self.k)
+        residual = self.offset - self.root @ state.error_from(self.about)
+        H = self.root @ state.invariant_from_local()
+        blocks = [(X(self.k), H[:, :6]), (V(self.k), H[:, 6:9]), (B(self.k), H[:, 9:])]
         return Linearised(residual, blocks)
 
 
