@@ -10,14 +10,14 @@ if TYPE_CHECKING:
     from stario.network.card import Card as Card
     from stario.network.model import DisplacementModel as DisplacementModel
     from stario.network.model import load_model as load_model
-    from stario.network.train import TrainingConfig as TrainingConfig
+    from stario.network.recipe import TrainingConfig as TrainingConfig
 
 _MODULES = {
     "Augmentation": "augment",
     "Calibration": "card",
     "Card": "card",
     "DisplacementModel": "model",
-    "TrainingConfig": "train",
+    "TrainingConfig": "recipe",
     "load_model": "model",
 }
 

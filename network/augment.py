@@ -63,6 +63,12 @@ class Augmentation:
                 raise ConfigError(item.name, repr(value), "a finite number >= 0")
 
 
+def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
+    """Samples that a stream must have for windows in a row at the fastest replay."""
+    # Windows that are not replayed keep speed 1.
+    return math.ceil(successive * WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
+
+
 class WindowSampler:
     """Draws augmented training batches from streams, each stream weighted.
 
@@ -73,6 +79,7 @@ class WindowSampler:
         weights: relative frequency of each stream per second of it.
         augmentation: how far windows are varied.
         seed: of all randomness.
+        successive: windows in a row, one second apart, that are drawn and varied as one.
 
     Raises:
         InputError: a stream is too short.
@@ -84,10 +91,11 @@ class WindowSampler:
         weights: Sequence[float],
         augmentation: Augmentation,
         seed: int,
+        successive: int = 1,
     ) -> None:
         self.augmentation = augmentation
-        # Windows that are not replayed keep speed 1.
-        reach = math.ceil(WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
+        self._successive = successive
+        reach = reach_of(augmentation, successive)
         for stream in streams:
             if len(stream) < reach:
                 found = f"a stretch of {len(stream)} samples"
@@ -101,7 +109,10 @@ class WindowSampler:
         self.generator = torch.Generator().manual_seed(seed)
 
     def batch(self, size: int) -> tuple[Tensor, Tensor]:
-        """Windows (size, 6, 200) and displacements (size, 3) [m], augmented."""
+        """Windows (size, 6, 200) and displacements (size, 3) [m], augmented.
+
+        More than one in a row come as (size, K, 6, 200) and (size, K, 3).
+        """
         uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
         stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._first) - 1)
         # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
@@ -109,12 +120,16 @@ class WindowSampler:
         speed = self._speeds(size)
         # Samples count through all streams, as the draws of a seed always have.
         start = self._first[stream].double() + offset
-        steps = torch.arange(WINDOW_SAMPLES + 1, dtype=torch.float64)
+        steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
         at = start[:, None] + steps * speed[:, None].double()
         imu_W, position_W = self._pieces(stream.tolist(), offset.long().tolist())
         imu = _lerp(imu_W, start, at[:, :-1])
-        ends = _lerp(position_W, start, at[:, [0, -1]])
-        return self._vary(_replayed(imu, speed), ends[:, 1] - ends[:, 0])
+        ends = _lerp(position_W, start, at[:, ::WINDOW_SAMPLES])
+        imu, displacement = self._vary(_replayed(imu, speed), ends.diff(dim=1))
+        if self._successive == 1:
+            return imu.transpose(1, 2).contiguous(), displacement.squeeze(1)
+        windows = imu.view(size, self._successive, WINDOW_SAMPLES, 6)
+        return windows.transpose(2, 3).contiguous(), displacement
 
     def _pieces(self, streams: list[int], offsets: list[int]) -> tuple[Tensor, Tensor]:
         """Stretches (B, reach, 6) and (B, reach, 3): all that is read from a memory-mapped file."""
@@ -131,7 +146,7 @@ class WindowSampler:
         return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
 
     def _vary(self, imu: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-        """Mirror, turn, tilt, bias and noise; imu is (B, 200, 6)."""
+        """Mirror, turn, tilt, bias and noise of imu (B, 200 K, 6), displacements (B, K, 3)."""
         a = self.augmentation
         size = len(imu)
         mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
@@ -140,15 +155,14 @@ class WindowSampler:
         imu, displacement = swung(imu, displacement, swings)
         R_yaw = _about_z(self._symmetric(size) * torch.pi)
         R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
-        turned = imu.view(size, WINDOW_SAMPLES, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)
-        imu = turned.reshape(size, WINDOW_SAMPLES, 6)
+        turned = imu.view(size, -1, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)
+        imu = turned.reshape(size, -1, 6)
         limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
         deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
         imu = imu + (self._symmetric(size, 6) * limits).unsqueeze(1)
         white = torch.randn(imu.shape, generator=self.generator)
         imu = imu + white * (self._uniform(size)[:, None, None] ** 2 * deviations)
-        displacement = (R_yaw @ displacement.unsqueeze(2)).squeeze(2)
-        return imu.transpose(1, 2).contiguous(), displacement
+        return imu, displacement @ R_yaw.mT
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)
@@ -169,7 +183,7 @@ def _mirrored(imu: Tensor, displacement: Tensor, sign: Tensor) -> tuple[Tensor, 
     """Image in the vertical x-z plane where sign is -1: rates are axial vectors, the rest polar."""
     one = torch.ones_like(sign)
     factors = torch.stack([sign, one, sign, one, sign, one], dim=1)
-    return imu * factors.unsqueeze(1), displacement * factors[:, 3:]
+    return imu * factors.unsqueeze(1), displacement * factors[:, None, 3:]
 
 
 def _about_z(yaw: Tensor) -> Tensor:

@@ -103,21 +103,22 @@ def draw_swing(
 
 
 def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
-    """Windows (B, 200, 6) in W and displacements (B, 3) [m] with the swing added."""
-    time = torch.arange(WINDOW_SAMPLES + 1) / WINDOW_RATE
+    """Seconds (B, 200 K, 6) in W and displacements (B, K, 3) [m] with the swing added."""
+    length = imu.shape[1]
+    time = torch.arange(length + 1) / WINDOW_RATE
     angle, rate, growth = (values[..., None] for values in swing.angle.at(time))
     sway, _, shove = (values.mT for values in swing.sway.at(time))
 
-    axis = swing.axis[:, None, :].expand(-1, WINDOW_SAMPLES + 1, -1)
+    axis = swing.axis[:, None, :].expand(-1, length + 1, -1)
     lever = _turned(swing.lever[:, None, :].expand_as(axis), axis, angle)
     tangent = torch.linalg.cross(axis, lever)
     acceleration = growth * tangent + rate**2 * torch.linalg.cross(axis, tangent) + shove
     point = lever + sway
 
-    inside = slice(0, WINDOW_SAMPLES)
+    inside = slice(0, length)
     gyro = _turned(imu[..., :3], axis[:, inside], angle[:, inside]) + (rate * axis)[:, inside]
     accel = imu[..., 3:] + acceleration[:, inside]
-    return torch.cat([gyro, accel], dim=2), displacement + point[:, -1] - point[:, 0]
+    return torch.cat([gyro, accel], dim=2), displacement + point[:, ::WINDOW_SAMPLES].diff(dim=1)
 
 
 def _turned(vectors: Tensor, axis: Tensor, angle: Tensor) -> Tensor:

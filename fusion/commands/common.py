@@ -181,11 +181,12 @@ def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
 
 
 @contextmanager
-def progress_bar(title: str, total: int = 100) -> Iterator[Progress]:
+def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[Progress]:
     """A bar on stderr, driven by the share of the work done; none where nobody watches."""
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=title, disable=None, leave=False, file=sys.stderr) as bar:
+    hidden = None if shown else True
+    with tqdm(total=total, desc=title, disable=hidden, leave=False, file=sys.stderr) as bar:
 
         def advance(share: float) -> None:
             bar.update(max(0, round(share * total) - bar.n))

@@ -24,7 +24,7 @@ from stario.fusion.commands.common import (
 from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from stario.network.train import TrainingConfig
+    from stario.network.recipe import TrainingConfig
     from stario.sequences.batch import Skipped
     from stario.sequences.windows import WorldStream
 
@@ -33,9 +33,16 @@ if TYPE_CHECKING:
 def train(
     reading: Reading,
     paths: PathsArgument = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="Network to train, as `stario models` names it.")
+    ] = None,
     out: Annotated[
-        Path, typer.Option("--out", help="Folder of the run, resumed if it holds a checkpoint.")
-    ] = Path("runs/train"),
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder of the run, resumed if it holds a checkpoint; else runs/NETWORK.",
+        ),
+    ] = None,
     validation: Annotated[
         list[Path] | None,
         typer.Option(help="Recordings that choose and calibrate; else the last fifth of each."),
@@ -70,13 +77,18 @@ def train(
     ] = None,
     jobs: JobsOption = 1,
 ) -> None:
-    """Train a network on recordings with truth and on simulated walks; resumes by itself."""
+    """Train a network on recordings with truth and on simulated walks; resumes by itself.
+
+    The same recipe for every network. In several processes, on GPUs or CPUs:
+    torchrun --nproc-per-node 2 --no-python stario train ...
+    """
     from stario.network.data import gather
     from stario.network.model import load_model
+    from stario.network.parallel import leads
     from stario.network.train import train as train_network
     from stario.sequences.stream_cache import cache_folder
 
-    recipe = _recipe(config, epochs=epochs, seed=seed)
+    recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
     if last_stage and start_from is None:
         raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     folder = cache or cache_folder()
@@ -90,15 +102,16 @@ def train(
         _generated(generated, recipe.seed, folder),
     )
     held_out = held_out or _generated(10, recipe.seed + 1, folder)
-    for words in material.words:
-        typer.echo(words, err=True)
-    with progress_bar("train", total=recipe.steps) as progress:
+    if leads():
+        for words in material.words:
+            typer.echo(words, err=True)
+    with progress_bar("train", total=recipe.steps, shown=leads()) as progress:
         path = train_network(
             recipe,
             material.streams,
             material.weights,
             held_out,
-            out,
+            out or Path("runs") / recipe.architecture,
             on_step=lambda step, error: progress(step / recipe.steps),
             on_epoch=lambda report: typer.echo(
                 f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
@@ -109,12 +122,13 @@ def train(
             start_from=load_model(start_from) if start_from else None,
             keep_calibration=last_stage,
         )
-    typer.echo(str(path))
-    leave_with_skipped(skipped)
+    if leads():
+        typer.echo(str(path))
+        leave_with_skipped(skipped)
 
 
-def _recipe(path: Path | None, **over: int | None) -> TrainingConfig:
-    from stario.network.train import training_config
+def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
+    from stario.network.recipe import training_config
 
     values: dict[str, Any] = {}
     if path is not None:

@@ -253,3 +253,39 @@ def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
     windows, _ = sampler.batch(64)
     assert torch.isfinite(windows).all()
     assert int(statm.read_text().split()[1]) - before < 25_000  # pages of 4 kB
+
+
+def test_windows_in_a_row_follow_each_other_and_are_varied_as_one() -> None:
+    ranges = only(gyro_bias=0.05, accel_bias=0.2, tilt=0.1)
+    sampler = WindowSampler([resting("lift", 2400, climb=1.0)], [1.0], ranges, 0, successive=5)
+    windows, displacement = sampler.batch(16)
+    assert windows.shape == (16, 5, 6, 200)
+    # One tilt and one bias for all of a row, another for the next row.
+    torch.testing.assert_close(windows, windows[:, :1].expand_as(windows))
+    assert float((windows[0] - windows[1]).abs().max()) > 1e-3
+    torch.testing.assert_close(displacement[..., 2], torch.ones(16, 5), atol=1e-4, rtol=0.0)
+
+
+def test_windows_in_a_row_are_those_of_the_path_turned() -> None:
+    windows, displacements = windows_at_every_start(STREAM)
+    rows, moved = WindowSampler([STREAM], [1.0], NOTHING, 3, successive=4).batch(6)
+    for row, moves in zip(rows.double().numpy(), moved.double().numpy(), strict=True):
+        distance = np.square(windows[:, 5] - row[0, 5])
+        start = int(np.argmin(distance.sum(axis=1)))
+        for k in range(4):
+            there = start + k * WINDOW_SAMPLES
+            # Neither a yaw nor a mirror image touches the vertical and the length of a way.
+            np.testing.assert_allclose(row[k, 5], windows[there, 5], atol=1e-5)
+            np.testing.assert_allclose(moves[k, 2], displacements[there, 2], atol=1e-5)
+            lengths = [np.linalg.norm(d[:2]) for d in (moves[k], displacements[there])]
+            assert lengths[0] == pytest.approx(lengths[1], abs=1e-5)
+
+
+def test_a_swing_goes_on_from_one_window_to_the_next() -> None:
+    swinging = only(swung=1.0, swing_rate=2.5, lever=0.35)
+    windows, displacement = WindowSampler(
+        [resting("rest", 2400)], [1.0], swinging, 0, successive=3
+    ).batch(8)
+    seam = (windows[:, 1:, :, 0] - windows[:, :-1, :, -1]).abs().max()
+    assert float(displacement.norm(dim=-1).max()) > 0.05
+    assert float(seam) < 0.2  # a sample's change, not a jump to another swing

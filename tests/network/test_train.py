@@ -10,17 +10,18 @@ import pytest
 import safetensors.torch
 import torch
 
+from stario.network.architectures import build_network
 from stario.network.augment import Augmentation
 from stario.network.card import card_path
+from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model
-from stario.network.train import (
-    EpochReport,
+from stario.network.recipe import (
     TrainingConfig,
     learning_rate,
     loss_with_sigma,
-    train,
     training_config,
 )
+from stario.network.train import EpochReport, train
 from stario.sequences.errors import ConfigError, InputError, ReadError, StarioError, WeightsError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream, windows_of
@@ -204,10 +205,49 @@ def test_sigma_takes_nothing_from_the_mean() -> None:
         torch.testing.assert_close(squared.grad, torch.ones(1, 3))
 
 
+def test_a_checkpoint_from_before_windows_in_a_row_goes_on(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    path = finished[0].parent / "checkpoint.safetensors"
+    with safetensors.safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    config = json.loads(metadata["config"])
+    del config["successive"]
+    content = safetensors.torch.load_file(path)
+    safetensors.torch.save_file(
+        content,
+        tmp_path / path.name,
+        metadata={**metadata, "config": json.dumps(config)},
+    )
+    assert run(tmp_path, trained_on=["swings"]).read_bytes() == finished[0].read_bytes()
+
+
+def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -> None:
+    values = {"architecture": "RNIN", "epochs": 1, "epoch_windows": 40, "batch": 20}
+    config = training_config({**values, "device": "cpu", "likelihood_from": 0.0})
+    assert config.successive == 10
+    # A step changes the weights that only a state which is not zero reaches.
+    path = run(tmp_path / "row", config)
+    assert load_model(path).along_track(2) is not None
+    first = DisplacementNetwork(build_network_of(config)).state_dict()
+    last = safetensors.torch.load_file(path)
+    change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
+    assert float(change.abs().max()) > 0.0
+    # Streams shorter than ten seconds cannot give any.
+    with pytest.raises(InputError, match="none long enough"):
+        train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
+
+
+def build_network_of(config: TrainingConfig) -> torch.nn.Module:
+    torch.manual_seed(config.seed)
+    return build_network(config.architecture)
+
+
 @pytest.mark.parametrize(
     ("values", "field"),
     [
         ({"epoch": 3}, "epoch"),
+        ({"batch": 10, "successive": 3}, "batch"),
         ({"augmentation": {"tild": 0.1}}, "augmentation.tild"),
         ({"augmentation": 3}, "augmentation"),
         ({"epochs": 0}, "epochs"),

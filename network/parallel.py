@@ -1,0 +1,110 @@
+"""Training in several processes, as torch's launcher starts them.
+
+`torchrun --nproc-per-node 2 --no-python stario train ...` starts the command twice and tells each
+process its number in the environment. Every process draws the same windows and takes its share of
+them; gradients are averaged, so that a step is that of one process with the whole batch, but for
+the batch norms, which see a share.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from stario.sequences.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The processes of a run, seen from one of them.
+
+    Attributes:
+        rank: number of this one; number 0 writes and reports.
+        count: of all.
+        device: that this one computes on.
+    """
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the process that writes and reports."""
+        return self.rank == 0
+
+    def share(self, batch: Tensor) -> Tensor:
+        """This process's rows of a batch that all have drawn."""
+        return batch[self.rank :: self.count]
+
+    def wrapped(self, network: nn.Module) -> nn.Module:
+        """The network with gradients averaged over the processes."""
+        if self.count == 1:
+            return network
+        ids = [self.device] if self.device.type == "cuda" else None
+        # Before sigma is learned, a head of its own gets no gradient.
+        return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=True)
+
+    def mean(self, value: float) -> float:
+        """A number averaged over the processes."""
+        if self.count == 1:
+            return value
+        total = torch.tensor(value, dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(total)
+        return float(total) / self.count
+
+    def agreed(self, value: float) -> float:
+        """A number of the leading process, told to all."""
+        if self.count == 1:
+            return value
+        told = torch.tensor(value, dtype=torch.float64, device=self.device)
+        torch.distributed.broadcast(told, 0)
+        return float(told)
+
+
+def leads() -> bool:
+    """Whether this process is the only one or the first one of the launcher's."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+@contextmanager
+def workers(device: str, batch: int) -> Iterator[Workers]:
+    """The processes that the launcher started, connected; one process without it.
+
+    Args:
+        device: "auto", "cpu" or "cuda", of which each process takes its own.
+        batch: rows that are shared out evenly.
+
+    Raises:
+        ConfigError: no GPU is there though asked for, or the batch cannot be shared out.
+    """
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    chosen = _device(device)
+    if count == 1:
+        yield Workers(0, 1, chosen)
+        return
+    if batch % count:
+        raise ConfigError("batch", f"{batch} for {count} processes", "a multiple of their number")
+    backend = "nccl" if chosen.type == "cuda" else "gloo"
+    torch.distributed.init_process_group(backend)
+    try:
+        yield Workers(torch.distributed.get_rank(), count, chosen)
+        torch.distributed.barrier()
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        if not torch.cuda.is_available():
+            raise ConfigError("device", "cuda, but torch sees no GPU", "cpu or auto")
+        return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    return torch.device(name)
