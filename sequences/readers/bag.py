@@ -92,7 +92,12 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
             topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
             chosen = [_imu_topic(path, topics, imu_topic)]
             chosen += _truth_topic(path, topics, truth_topic)
-            return {topics[topic]: _topic(path, reader, topic, topics[topic]) for topic in chosen}
+            connections = [c for c in reader.connections if c.topic in chosen]
+            received: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in chosen}
+            for connection, time, raw in reader.messages(connections):
+                received[connection.topic].append((time, bytes(raw)))
+        little = version == "1"
+        return {topics[t]: _decoded(path, t, topics[t], received[t], little) for t in chosen}
     except ReadError:
         raise
     except Exception as error:  # whatever the library stumbles over, the file is broken
@@ -129,17 +134,16 @@ def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:
     return wanted
 
 
-def _topic(path: Path, reader: Any, topic: str, kind: str) -> _Messages:
-    connections = [c for c in reader.connections if c.topic == topic]
-    received = [(time, bytes(raw)) for _, time, raw in reader.messages(connections)]
+def _decoded(
+    path: Path, topic: str, kind: str, received: list[tuple[int, bytes]], little: bool
+) -> _Messages:
+    """Stamps and doubles of a topic's messages; CDR says its byte order in its second byte."""
     raws = [raw for _, raw in received]
     size = 8 * _DOUBLES[kind]
-    shortest = min(map(len, raws))
+    shortest = min(map(len, raws), default=0)
     if shortest < _STAMP.stop + size:
         raise ReadError(path, topic, f"a message of {shortest} bytes", f"a whole {kind}")
-    # ROS 1 is little-endian; CDR says so in its second byte.
-    big = not magic(path).startswith(b"#ROSBAG") and raws[0][1] & 1 == 0
-    order = ">" if big else "<"
+    order = "<" if little or raws[0][1] & 1 else ">"
     parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{order}u4").reshape(-1, 2)
     stamps = parts.astype(np.int64) @ np.array([10**9, 1])
     if not stamps.any():

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -33,7 +35,7 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.text import first_line, read_lines
+from stario.sequences.readers.text import first_line, read_lines, read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, TIME_UNITS
 
@@ -51,22 +53,64 @@ def read_own_csv(path: Path) -> ImuSequence:
     """
     lines = read_lines(path)
     start, columns = read_header(path, lines)
+    rows = _rows_quickly(path, start, columns) or _rows_carefully(path, lines, start, columns)
+    is_imu, table = rows.is_imu, rows.table
+    return ImuSequence(
+        name=path.stem,
+        time=rows.time[is_imu],
+        gyro=_triple(path, table, columns, "g", GYRO_UNITS)[is_imu],
+        accel=_triple(path, table, columns, "a", ACCEL_UNITS)[is_imu],
+        truth=_truth(path, rows) if "px" in table else None,
+    )
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Columns by their canonical name, time [s], which rows are IMU samples, where rows stand."""
+
+    table: dict[str, FloatArray]
+    time: FloatArray
+    is_imu: BoolArray
+    line_numbers: Sequence[int]
+
+
+def _rows_quickly(path: Path, start: int, columns: dict[str, Column]) -> _Rows | None:
+    """The rows of a large file in which every row is whole, else None."""
+    names = ["t", *(name for name in (*IMU, *TRUTH) if name in columns)]
+    quick = read_quickly(path, start, ",", [columns[name].index for name in names])
+    if quick is None:
+        return None
+    stamps = quick.numbers(columns["t"].index)
+    per_second = unit_factor(path, columns["t"], TIME_UNITS)
+    if stamps is not None and stamps.dtype.kind == "i":
+        time = np.asarray((stamps - stamps[0]) / per_second, dtype=np.float64)
+    elif stamps is not None and per_second == 1 and stamps[0] == 0.0:
+        time = np.asarray(stamps, dtype=np.float64)
+    else:  # the difference of long decimals is taken before it is rounded
+        return None
+    count = len(time)
+    return _Rows(
+        table=dict(zip(names, quick.values.T, strict=True)),
+        time=time,
+        is_imu=np.ones(count, dtype=np.bool_),
+        line_numbers=range(quick.first_row, quick.first_row + count),
+    )
+
+
+def _rows_carefully(path: Path, lines: list[str], start: int, columns: dict[str, Column]) -> _Rows:
     numbered = [(k, line) for k, line in enumerate(lines[start:], start + 1) if _is_row(line)]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
     used = [name for name in (*IMU, *TRUTH) if name in columns]
     values = _numbers(path, numbered, [columns[name] for name in used])
-    table = {name: values[:, k] for k, name in enumerate(used)}
     is_imu = _imu_rows(numbered, columns, values[:, : len(IMU)])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
-    time = _seconds(path, numbered, columns["t"], int(np.argmax(is_imu)))
-    return ImuSequence(
-        name=path.stem,
-        time=time[is_imu],
-        gyro=_triple(path, table, columns, "g", GYRO_UNITS)[is_imu],
-        accel=_triple(path, table, columns, "a", ACCEL_UNITS)[is_imu],
-        truth=_truth(path, numbered, time, table) if "px" in table else None,
+    return _Rows(
+        table={name: values[:, k] for k, name in enumerate(used)},
+        time=_seconds(path, numbered, columns["t"], int(np.argmax(is_imu))),
+        is_imu=is_imu,
+        line_numbers=[number for number, _ in numbered],
     )
 
 
@@ -203,11 +247,10 @@ def _seconds(
     return np.array([float((stamp - start) / per_second) for stamp in stamps])
 
 
-def _truth(
-    path: Path, numbered: list[tuple[int, str]], time: FloatArray, table: dict[str, FloatArray]
-) -> Trajectory | None:
+def _truth(path: Path, rows: _Rows) -> Trajectory | None:
     """The track of the rows that hold truth; None if none does."""
-    poses = np.stack([table[name] for name in TRUTH], axis=1)
+    time = rows.time
+    poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
     newest = np.maximum.accumulate(time[kept])
     kept = kept[np.append(True, newest[1:] > newest[:-1])] if len(kept) else kept
@@ -218,7 +261,7 @@ def _truth(
     bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
     if bad.any():
         k = int(np.argmax(bad))
-        where = f"line {numbered[kept[k]][0]}, qx qy qz qw"
+        where = f"line {rows.line_numbers[kept[k]]}, qx qy qz qw"
         raise ReadError(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "leave the row's truth blank"
         )

@@ -94,6 +94,8 @@ class Table:
         path: the file.
         values: (N, K); `nan` and empty cells are NaN.
         first_row: where the first row stands in the file, counted from 1.
+        numbers: a column of the file, as whole numbers where all of it is written so; None where
+            that is not known.
     """
 
     def __init__(
@@ -105,7 +107,7 @@ class Table:
         numbers: Callable[[int], NDArray[Any] | None] = lambda column: None,
     ) -> None:
         self.path, self.values, self.first_row = path, values, first_row
-        self._cells, self._numbers = cells, numbers
+        self._cells, self.numbers = cells, numbers
 
     def stamps_ns(self, column: int = 0, per_second: int = 10**9) -> IntArray:
         """A column of times as whole nanoseconds (N,), exact: float64 cannot hold those of today.
@@ -118,7 +120,7 @@ class Table:
             ReadError: a cell is no time.
         """
         unit_ns = 10**9 // per_second
-        numbers = self._numbers(column)
+        numbers = self.numbers(column)
         if numbers is not None and numbers.dtype.kind == "i":
             return np.asarray(numbers.astype(np.int64) * unit_ns, dtype=np.int64)
         if numbers is not None and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
@@ -166,16 +168,16 @@ def read_table(
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if used is None else used
-    return _read_quickly(path, skip, delimiter, wanted) or _read_carefully(
+    return read_quickly(path, skip, delimiter, wanted) or _read_carefully(
         path, columns, skip, delimiter, wanted
     )
 
 
-def _read_quickly(path: Path, skip: int, delimiter: str | None, wanted: list[int]) -> Table | None:
+def read_quickly(path: Path, skip: int, delimiter: str | None, wanted: list[int]) -> Table | None:
     """A large file by pandas, five times as fast as by NumPy; None if anything is odd about it.
 
     What is odd (no pandas, a blank or malformed cell, a row cut short) is left to the careful way,
-    which names it.
+    which names it. Arguments are those of `read_table`, `wanted` its `used`.
     """
     try:
         if path.stat().st_size < _LARGE_BYTES:

@@ -1,14 +1,15 @@
 """What a format leaves open: sources of attitude, orders of quaternions, frames, topics, clocks."""
 
+import dataclasses
 import json
-import shutil
+import sys
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.bag import read_bag
 
 
@@ -214,26 +215,56 @@ def test_clocks_of_other_phase_are_interpolated_but_not_across_a_gap(tmp_path, f
         read_recording(tmp_path / "late")
 
 
+def alike(a, b) -> bool:
+    arrays = [(x.time, x.gyro, x.accel) for x in (a, b)]
+    if (a.truth is None) != (b.truth is None):
+        return False
+    if a.truth is not None:
+        arrays = [(*x, y.truth.position_W) for x, y in zip(arrays, (a, b), strict=True)]
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
+
+
 def test_large_files_are_read_alike_with_and_without_pandas(
     tmp_path, walks, formats, monkeypatch
 ) -> None:
     pytest.importorskip("pandas")
+    walk = walks(200.0)
+    paths = [
+        write(tmp_path / f"seq{k}", walk).path
+        for k, write in enumerate((formats.ridi, formats.rnin, formats.imunet_raw, formats.android))
+    ]
+    write_csv(tmp_path / "own.csv", walk)
+    late = dataclasses.replace(walk, time=walk.time + 1.5e9, truth=None)
+    write_csv(tmp_path / "late.csv", late)
+    sparse = walk.truth.at(walk.time[::2] + 0.001)
+    write_csv(tmp_path / "sparse.csv", dataclasses.replace(walk, truth=sparse))
+    for path in [*paths, *(tmp_path / f"{name}.csv" for name in ("own", "late", "sparse"))]:
+        careful = read_recording(path)
+        with monkeypatch.context() as small:
+            small.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
+            assert alike(read_recording(path), careful), path
+            small.setitem(sys.modules, "pandas", None)
+            assert alike(read_recording(path), careful), path
+
+
+def test_what_is_odd_in_a_large_file_is_named_all_the_same(
+    tmp_path, walks, formats, monkeypatch
+) -> None:
     monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
-    for write in (formats.ridi, formats.rnin, formats.imunet_raw, formats.android):
-        path = write(tmp_path / "seq", walks(200.0)).path
-        quick = read_recording(path)
-        with monkeypatch.context() as without:
-            without.setitem(__import__("sys").modules, "pandas", None)
-            careful = read_recording(path)
-        assert np.array_equal(quick.time, careful.time)
-        assert np.array_equal(quick.gyro, careful.gyro)
-        assert np.array_equal(quick.accel, careful.accel)
-        shutil.rmtree(tmp_path / "seq")
+    path = formats.ridi(tmp_path / "seq", walks(200.0)).path
+    csv = path / "processed/data.csv"
+    lines = csv.read_text().splitlines()
+    csv.write_text("\n".join([*lines[:99], lines[99].rsplit(",", 3)[0]]))
+    with pytest.raises(ReadError, match="line 100: found 24 values, expected 27"):
+        read_recording(path)
+    csv.write_text("\n".join([*lines[:99], lines[99].replace(".", "x", 1)]))
+    with pytest.raises(ReadError, match="line 100, column "):
+        read_recording(path)
 
 
 def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, formats, monkeypatch) -> None:
     recording = formats.ronin(tmp_path / "a", walks(200.0))
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r'h5py: found not installed.*"stario\[readers\]"'):
         read_recording(recording.path)
 
