@@ -255,7 +255,7 @@ def test_what_is_odd_in_a_large_file_is_named_all_the_same(
     csv = path / "processed/data.csv"
     lines = csv.read_text().splitlines()
     csv.write_text("\n".join([*lines[:99], lines[99].rsplit(",", 3)[0]]))
-    with pytest.raises(ReadError, match="line 100: found 24 values, expected 27"):
+    with pytest.raises(ReadError, match="line 100: found 25 values, expected 28"):
         read_recording(path)
     csv.write_text("\n".join([*lines[:99], lines[99].replace(".", "x", 1)]))
     with pytest.raises(ReadError, match="line 100, column "):
