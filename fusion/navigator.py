@@ -8,7 +8,7 @@ see many windows at once. As the intake does not depend on the filter both give 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
@@ -16,6 +16,8 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stario.fusion.along_track import AlongTrack
+from stario.fusion.along_track import Predictor as Predictor
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
@@ -47,16 +49,11 @@ LEAST_SIGMA = 5e-3
 SUSPECT_SCALE = 4.0
 """On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
 
+_BATCH = 512
+"""Windows of a recording that the network is given at once."""
+
 Progress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
-
-
-class Predictor(Protocol):
-    """What a navigator needs of a model; `DisplacementModel` is one."""
-
-    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +104,7 @@ class Navigator:
         self._intake = Intake(self.config)
         self._recipe: FilterRecipe | GraphRecipe | None = None
         self._fixes = FixQueue()
+        self._network = self._along_track()
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
         """Take in one sample of a stream.
@@ -196,6 +194,7 @@ class Navigator:
                 "prior": None if self.prior is None else vars(self.prior),
                 "intake": self._intake.checkpoint(),
                 "fixes": self._fixes.checkpoint(),
+                "network": self._network.checkpoint(),
                 "recipe": None if recipe is None else recipe.dump(),
             }
         )
@@ -218,11 +217,14 @@ class Navigator:
         intake, fixes, recipe = Intake(self.config), FixQueue(), None
         intake.rewind(tree["intake"])
         fixes.rewind(tree["fixes"])
+        network = self._along_track()
+        network.rewind(tree["network"])
         if tree["recipe"] is not None:
             assert intake.start is not None  # there is no recipe without one
             recipe = self._new_recipe(intake.start, prior)
             recipe.load(tree["recipe"])
         self.prior, self._intake, self._fixes, self._recipe = prior, intake, fixes, recipe
+        self._network = network
 
     def run(
         self,
@@ -307,14 +309,21 @@ class Navigator:
 
     def _measure(self, epochs: Sequence[Epoch], progress: Progress) -> list[Measurement | None]:
         measurements: list[Measurement | None] = [None] * len(epochs)
-        with_window = [k for k, epoch in enumerate(epochs) if epoch.window is not None]
-        for begin in range(0, len(with_window), 512):
-            part = with_window[begin : begin + 512]
-            mean, covariance = self.model.predict(np.stack([_window(epochs[k]) for k in part]))
-            for k, d_N, cov_N in zip(part, mean, covariance, strict=True):
+        network = self._along_track()
+        for part in _parts(epochs, unbroken=network.remembers):
+            if network.remembers and epochs[part[0]].gap:
+                network.restart()
+            known = [k for k in part if epochs[k].window is not None]
+            if not known:
+                continue
+            mean, covariance = network.predict(np.stack([_window(epochs[k]) for k in known]))
+            for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
                 measurements[k] = _measurement(epochs[k], d_N, cov_N)
-            progress(0.1 + 0.5 * (begin + len(part)) / len(with_window))
+            progress(0.1 + 0.5 * (part[-1] + 1) / len(epochs))
         return measurements
+
+    def _along_track(self) -> AlongTrack:
+        return AlongTrack(self.model, self.config.filter.window_updates)
 
     def _advance(self, epoch: Epoch) -> NavState:
         if self._recipe is None:
@@ -322,8 +331,10 @@ class Navigator:
             self._recipe = self._new_recipe(start, self.prior)
             self._fixes.start(start.time)
         measurement = None
+        if epoch.gap:
+            self._network.restart()
         if epoch.window is not None:
-            mean, covariance = self.model.predict(epoch.window[None])
+            mean, covariance = self._network.predict(epoch.window[None])
             measurement = _measurement(epoch, mean[0], covariance[0])
         return self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
 
@@ -351,6 +362,17 @@ class Navigator:
                 "give specific force in m/s^2 with gravity left in, and rates in rad/s",
             )
         return start
+
+
+def _parts(epochs: Sequence[Epoch], unbroken: bool) -> Iterator[range]:
+    """Runs of epochs whose windows the network sees at once; `unbroken` ones end at a gap."""
+    begin = windows = 0
+    for k, epoch in enumerate(epochs):
+        if windows == _BATCH or (unbroken and epoch.gap and k > begin):
+            yield range(begin, k)
+            begin, windows = k, 0
+        windows += epoch.window is not None
+    yield range(begin, len(epochs))
 
 
 def _with_refused(health: Health, queue: FixQueue) -> Health:

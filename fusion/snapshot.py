@@ -11,6 +11,7 @@ Infinity. The object holds
     model     checksum of the weights, likewise; empty for models without a card
     prior     what was known of the first pose, or null
     intake    samples, windows and counts (`Intake.checkpoint`)
+    network   what the network remembers of earlier windows, or null
     fixes     those that wait, and counts of those refused
     recipe    the estimator's state (its `dump`), or null before the first second is over
 

@@ -11,6 +11,7 @@ from time import perf_counter
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.along_track import AlongTrack
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.navigator import Observed, Predictor
 from stario.fusion.preintegration import preintegrate
@@ -82,7 +83,7 @@ def network_track_true_attitude(
     began = perf_counter()
     time, windows = _true_windows(sequence, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
-    displacement, _ = model.predict(windows)
+    displacement = _along(model, time, windows, config.filter.window_updates)
     done = perf_counter()
     middle = time + 0.5 * WINDOW_SECONDS
     ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
@@ -93,6 +94,23 @@ def network_track_true_attitude(
         seconds_network=done - prepared,
         seconds_filter=prepared - began + perf_counter() - done,
     )
+
+
+def _along(
+    model: Predictor,
+    time: FloatArray,
+    windows: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
+    updates: int,
+) -> FloatArray:
+    """Displacements (M, 3) of windows that start at `time` (M,), a memory ending at each gap."""
+    network = AlongTrack(model, updates)
+    if not network.remembers:
+        return network.predict(windows)[0]
+    displacements = []
+    for part in np.split(windows, np.flatnonzero(np.diff(time) * updates > 1.5) + 1):
+        displacements.append(network.predict(part)[0])
+        network.restart()
+    return np.concatenate(displacements)
 
 
 def _true_windows(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -135,6 +136,14 @@ class TrackModel:
             )
             self._count += 1
         return mean, covariance
+
+    def checkpoint(self) -> dict[str, Any]:
+        """What is remembered, as plain values and arrays."""
+        return {"count": self._count, "states": list(self._states)}
+
+    def rewind(self, memory: dict[str, Any]) -> None:
+        """Take up what `checkpoint` gave."""
+        self._count, self._states = int(memory["count"]), list(memory["states"])
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:

@@ -1,0 +1,66 @@
+"""The network along one track: its windows in order of time, its memory gone after each gap."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from numpy.typing import ArrayLike
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray
+
+
+class Predictor(Protocol):
+    """What a navigator needs of a model; `DisplacementModel` is one.
+
+    A model whose network remembers earlier windows has `along_track(updates)` besides, which gives
+    a predictor for the windows of one unbroken stretch.
+    """
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2]."""
+        ...
+
+
+class AlongTrack:
+    """A model's word on the windows of one track.
+
+    Args:
+        model: may remember.
+        updates: windows that begin within the length of one.
+    """
+
+    def __init__(self, model: Predictor, updates: int) -> None:
+        self._model, self._updates = model, updates
+        self.restart()
+
+    @property
+    def remembers(self) -> bool:
+        """Whether earlier windows matter, so that a gap does."""
+        return self._stretch is not self._model
+
+    def restart(self) -> None:
+        """Forget what was before a gap."""
+        begin = getattr(self._model, "along_track", None)
+        self._stretch: Any = self._model if begin is None else begin(self._updates)
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The stretch's next windows; as the model's `predict`."""
+        answer: tuple[FloatArray, FloatArray] = self._stretch.predict(windows)
+        return answer
+
+    def checkpoint(self) -> Any:
+        """What the network remembers, as a tree of arrays and numbers; None without memory."""
+        return self._stretch.checkpoint() if self.remembers else None
+
+    def rewind(self, memory: Any) -> None:
+        """Take up what a `checkpoint` of the same model gave.
+
+        Raises:
+            InputError: one of the two has no memory.
+        """
+        self.restart()
+        if (memory is not None) != self.remembers:
+            raise InputError("snapshot: network", "another kind of memory", "the same network's")
+        if self.remembers:
+            self._stretch.rewind(memory)
