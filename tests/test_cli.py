@@ -203,6 +203,22 @@ def test_settings_come_from_a_file_and_are_kept(stario, recording: Path, tmp_pat
     assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_run_takes_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
+    done = stario("run", "all", "--out", "out")
+    assert done.code == 0
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"a", "b"}
+    (tmp_path / "list.txt").write_text("all/b.csv\nall/c.csv\n")
+    done = stario("run", "list.txt", "--out", "alone")
+    assert done.code == 1
+    assert "skipped" in done.err
+    assert "all/c.csv" in done.err
+    assert (tmp_path / "alone/ekf.tum").exists()
+
+
 # --- convert -----------------------------------------------------------------------------------
 
 

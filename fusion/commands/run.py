@@ -1,9 +1,10 @@
-"""`stario run`: one recording into a fused track."""
+"""`stario run`: recordings into fused tracks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,15 +15,24 @@ from stario.fusion.commands.common import (
     OutOption,
     Reading,
     grouped,
+    leave_with_skipped,
     print_json,
     progress_bar,
+    recordings_at,
     track_table,
 )
+from stario.sequences.batch import Skipped
+from stario.sequences.errors import InputError, StarioError
+
+if TYPE_CHECKING:
+    from stario.fusion.fixes import Fix
+    from stario.fusion.navigator import Navigator
+    from stario.sequences.sequence import ImuSequence
 
 
 @grouped
 def run(
-    path: Annotated[Path, typer.Argument(help="A recording: a file, or a recording's folder.")],
+    path: Annotated[Path, typer.Argument(help="A recording, or a folder or list of some.")],
     reading: Reading,
     estimating: Estimating,
     fixes: FixesOption = None,
@@ -30,25 +40,44 @@ def run(
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fuse one recording into a track with attitude, velocity, biases and covariance."""
-    from stario.fusion.compare import measure
+    """Fuse each recording into a track with attitude, velocity, biases and covariance."""
     from stario.fusion.fixes import read_fixes
+    from stario.fusion.many import distinct_name
     from stario.fusion.navigator import Navigator
+
+    navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
+    known = [] if fixes is None else read_fixes(fixes)
+    # A format that is named is that of the path itself, whatever it looks like.
+    files, skipped = recordings_at([path]) if reading.format == "auto" else ([path], [])
+    if fixes is not None and len(files) > 1:
+        raise InputError("--fixes", f"{len(files)} recordings", "one recording")
+    names: set[str] = set()
+    for file in files:
+        try:
+            sequence = reading.read(file)
+            name = distinct_name(sequence.name, names)
+            names.add(name)
+            folder = out if out and len(files) == 1 else (out or Path("runs")) / name
+            _run(navigator, sequence, known, folder, as_json)
+        except StarioError as error:
+            skipped.append(Skipped(str(file), str(error)))
+    leave_with_skipped(skipped)
+
+
+def _run(
+    navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, as_json: bool
+) -> None:
+    from stario.fusion.compare import measure
     from stario.fusion.results import write_run
     from stario.sequences.metrics import align
 
-    settings, network = estimating.settings(), estimating.network()
-    sequence = reading.read(path)
-    navigator = Navigator(network, settings, backend=backend)  # type: ignore[arg-type]
-    known = [] if fixes is None else read_fixes(fixes)
     with progress_bar(f"run {sequence.name}") as progress:
-        track = navigator.run(sequence, progress, known)
-    truth = sequence.truth
+        track = navigator.run(sequence, progress, fixes)
+    truth, backend = sequence.truth, navigator.backend
     metrics = measure(track, truth)
-    folder = out or Path("runs") / sequence.name
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, "first")
     written = write_run(
-        folder, sequence.name, track, truth, aligned, metrics, settings, navigator.backend
+        folder, sequence.name, track, truth, aligned, metrics, navigator.config, backend
     )
     if as_json:
         print_json({"recording": sequence.name, backend: metrics, "folder": str(folder)})
