@@ -36,6 +36,7 @@ from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, unit_named
 _log = logging.getLogger(__name__)
 
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
+_SENSORS = ("acc", "gyr", "grav")
 _OTHER = ("lin", "user", "meta", "bias")
 """Parts of names of files that hold something else than the raw sensor."""
 
@@ -85,13 +86,17 @@ def is_android(path: Path) -> bool:
 
 
 def _sensor_file(folder: Path, sensor: str) -> Path | None:
-    """The sensor's file: one of the total force before others, uncalibrated ones last."""
-    names = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in _SUFFIXES]
-    named = [
-        file
-        for file in names
-        if sensor in file.name.lower() and not any(part in file.name.lower() for part in _OTHER)
-    ]
+    """The sensor's file: one of the total force before others, uncalibrated ones last.
+
+    A file named after both sensors holds both, and is no logger's.
+    """
+    named = []
+    for file in sorted(folder.iterdir()):
+        name = file.name.lower()
+        sensors = [part for part in _SENSORS if part in name]
+        other = any(part in name for part in _OTHER) or file.suffix.lower() not in _SUFFIXES
+        if sensors == [sensor] and not other:
+            named.append(file)
     return min(
         named,
         key=lambda file: ("total" not in file.name.lower(), "uncal" in file.name.lower()),

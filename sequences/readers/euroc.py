@@ -3,11 +3,13 @@
 IMU rows: time [ns], gyroscope xyz [rad/s], accelerometer xyz [m/s^2]. Truth rows, in
 `state_groundtruth_estimate0` (EuRoC) or `mocap0` (TUM-VI, Schubert et al., 2018): time [ns],
 position xyz [m], quaternion w x y z, IMU to world; EuRoC adds velocity xyz. Time is returned as
-seconds since the first IMU row. Truth may start later, end earlier and have gaps.
+seconds since the first IMU row. Truth may start later, end earlier and have gaps; a pose whose
+quaternion is none, as captures write while they see nothing, is left out with a warning.
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import read_lines, read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
+
+_log = logging.getLogger(__name__)
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
 """Poses of the IMU; EuRoC's `leica0` is a position alone and `vicon0` the markers' pose."""
@@ -81,6 +85,8 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     table, time = table[keep], time[keep]
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    if not valid.all():
+        _log.warning("%s: %d of %d poses are none, left out", path, (~valid).sum(), len(valid))
     quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])
     return Trajectory(
         time=time,

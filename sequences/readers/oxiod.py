@@ -146,6 +146,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
     norm = np.linalg.norm(quat_xyzw, axis=1)
     valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    valid &= (position != 0.0).any(axis=1)  # written while nothing was seen
     quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
     attitude_WV = Rotation.from_quat(quat_xyzw)
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)

@@ -81,6 +81,19 @@ def test_the_capture_is_brought_onto_the_phones_clock(
     assert read_recording(raw / "imu1.csv").name == "pocket-data1-raw-imu1"
 
 
+def test_poses_written_while_nothing_was_seen_are_masked(tmp_path, walk, formats) -> None:
+    stamps = formats.stamps_ns(walk.time)
+    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, stamps))
+    rows = capture_rows(formats, walk, 1, stamps[0], 1, 0.0)
+    for k in range(1000, 1300):
+        rows[k] = ",".join(rows[k].split(",")[:2] + ["0.0"] * 6 + ["1.0"])
+    formats.save(tmp_path / "raw/vi1.csv", "", rows)
+    truth = read_recording(tmp_path / "raw/imu1.csv").truth
+    assert not truth.valid[1000:1300].any()
+    assert truth.valid[:990].mean() > 0.95
+    assert truth.valid[1310:].mean() > 0.95
+
+
 def test_neighbours_that_were_swapped_are_put_in_order(tmp_path, walk, formats) -> None:
     rows = apple_rows(formats, walk, formats.stamps_ns(walk.time))
     for k in range(100, 5000, 500):

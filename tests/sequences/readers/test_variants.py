@@ -189,6 +189,12 @@ def test_loggers_of_several_habits(tmp_path, formats) -> None:
     assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(habits)]
 
 
+def test_files_that_hold_both_sensors_are_no_loggers(tmp_path, walks) -> None:
+    write_csv(tmp_path / "accel_gyro_1.csv", walks(200.0))
+    write_csv(tmp_path / "accel_gyro_2.csv", walks(200.0))
+    assert len(find_recordings(tmp_path)) == 2
+
+
 def test_a_loggers_gravity_is_added_where_it_was_removed(tmp_path, formats) -> None:
     walk = formats.walk(100.0, 5.0)
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
