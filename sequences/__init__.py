@@ -6,7 +6,7 @@ from stario.sequences.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from stario.sequences.checks import check_units as check_units
-    from stario.sequences.checks import with_units as with_units
+    from stario.sequences.conventions import with_conventions as with_conventions
     from stario.sequences.errors import ConfigError as ConfigError
     from stario.sequences.errors import InputError as InputError
     from stario.sequences.errors import ReadError as ReadError
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from stario.sequences.errors import WeightsError as WeightsError
     from stario.sequences.files import read_tum as read_tum
     from stario.sequences.files import write_tum as write_tum
+    from stario.sequences.inspection import inspect_recording as inspect_recording
     from stario.sequences.metrics import align as align
     from stario.sequences.metrics import evaluate_track as evaluate_track
     from stario.sequences.metrics import position_nees as position_nees
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from stario.sequences.simulate import ImuErrors as ImuErrors
     from stario.sequences.simulate import simulate_imu as simulate_imu
     from stario.sequences.walks import WalkStyle as WalkStyle
+    from stario.sequences.units import with_units as with_units
     from stario.sequences.walks import generate_walk as generate_walk
 
 _MODULES = {
@@ -51,11 +53,13 @@ _MODULES = {
     "evaluate_track": "metrics",
     "find_recordings": "readers",
     "generate_walk": "walks",
+    "inspect_recording": "inspection",
     "position_nees": "metrics",
     "read_recording": "readers",
     "read_tum": "files",
     "simulate_imu": "simulate",
-    "with_units": "checks",
+    "with_conventions": "conventions",
+    "with_units": "units",
     "write_tum": "files",
 }
 
@@ -79,10 +83,12 @@ __all__ = [
     "evaluate_track",
     "find_recordings",
     "generate_walk",
+    "inspect_recording",
     "position_nees",
     "read_recording",
     "read_tum",
     "simulate_imu",
+    "with_conventions",
     "with_units",
     "write_tum",
 ]

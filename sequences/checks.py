@@ -19,10 +19,8 @@ from stario.sequences.alignment import cumulative_rotations
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth_fit import fit_truth
-from stario.sequences.units import GYRO_UNITS, TIME_UNITS, with_units
+from stario.sequences.units import GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples
-
-__all__ = ["check_units", "with_units"]
 
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and something around it [s]."""

@@ -223,7 +223,8 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         try:
             fit = fit_truth(sequence)
         except InputError as error:
-            problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+            if not problems:  # wrong units explain it
+                problems.append(f"{sequence.name}: truth against gyroscope: {error}")
     if fit is not None:
         problems += _fit_problems(sequence.name, fit, " ".join(problems))
     return Inspection(

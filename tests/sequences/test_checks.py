@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.checks import check_units, with_units
+from stario.sequences.checks import check_units
 from stario.sequences.conventions import with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.units import with_units
 from stario.sequences.walks import CARRY_WAYS, WalkStyle, generate_walk
 
 DATA = Path(
