@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from stario.sequences.simulate import PHONE_IMU as PHONE_IMU
     from stario.sequences.simulate import ImuErrors as ImuErrors
     from stario.sequences.simulate import simulate_imu as simulate_imu
-    from stario.sequences.walks import WalkStyle as WalkStyle
     from stario.sequences.units import with_units as with_units
+    from stario.sequences.walks import WalkStyle as WalkStyle
     from stario.sequences.walks import generate_walk as generate_walk
 
 _MODULES = {
