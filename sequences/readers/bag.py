@@ -111,7 +111,7 @@ def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
         return _named(path, "imu topic", wanted, fitting)
     if len(fitting) != 1:
         seen = ", ".join(fitting or [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8])
-        fix = f"name one: imu_topic={fitting[0]}" if fitting else ""
+        fix = f"name one: --imu-topic {fitting[0]}" if fitting else ""
         raise ReadError(path, "topics", seen or "none", "one topic with sensor_msgs/Imu", fix)
     return fitting[0]
 
@@ -123,7 +123,7 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
     if wanted:
         return [_named(path, "truth topic", wanted, fitting)]
     if len(fitting) > 1:
-        fix = f"name one: truth_topic={fitting[0]}, or truth_topic={NO_TRUTH}"
+        fix = f"name one: --truth-topic {fitting[0]}, or --truth-topic {NO_TRUTH}"
         raise ReadError(path, "topics", ", ".join(fitting), "one topic with poses", fix)
     return fitting
 

@@ -131,9 +131,9 @@ def test_several_topics_are_named_with_the_option_that_chooses(tmp_path, formats
         tmp_path / "b", walk, imu_topics=("/imu", "/imu_old"),
         pose_topics=(("/mocap", kind), ("/vio", kind)),
     )  # fmt: skip
-    with pytest.raises(ReadError, match=r"found /imu, /imu_old, .*imu_topic=/imu"):
+    with pytest.raises(ReadError, match=r"found /imu, /imu_old, .*--imu-topic /imu"):
         read_recording(path)
-    with pytest.raises(ReadError, match=r"found /mocap, /vio, .*truth_topic=/mocap, or .*none"):
+    with pytest.raises(ReadError, match=r"found /mocap, /vio, .*--truth-topic /mocap, or .*none"):
         read_recording(path, imu_topic="/imu")
     read = read_recording(path, imu_topic="/imu_old", truth_topic="/vio")
     assert np.array_equal(read.gyro, walk.gyro)
