@@ -95,7 +95,7 @@ def cached(
 
 def recording_files(path: Path) -> list[Path]:
     """The files that a recording's content comes from, and perhaps others beside them."""
-    while path != path.parent and any(known.recognises(path.parent) for known in FORMATS.values()):
+    while path != path.parent and _is_recording(path.parent, path.parent.stat().st_mtime_ns):
         path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
     if path.is_dir():
         return sorted(p for p in path.rglob("*") if p.is_file())
@@ -104,6 +104,12 @@ def recording_files(path: Path) -> list[Path]:
     number = "".join(filter(str.isdigit, path.stem))
     siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
     return sorted(p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number)
+
+
+@cache
+def _is_recording(folder: Path, changed_ns: int) -> bool:
+    """Asked once for all the files of a folder, which may be thousands."""
+    return any(known.recognises(folder) for known in FORMATS.values())
 
 
 def _stored(
