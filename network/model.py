@@ -198,6 +198,28 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     return DisplacementModel(TorchEngine(network), card)
 
 
+def weights_named(name: str, runs: Path) -> str | Path:
+    """What `load_model` takes for a network's name, a file or "default".
+
+    Args:
+        name: "default"; an architecture, whose training run is the folder of that name in `runs`
+            (StarIO without one means the default weights); or a file.
+        runs: folder of training runs.
+
+    Raises:
+        WeightsError: the architecture has no weights there.
+    """
+    if name not in ARCHITECTURES:
+        return name
+    path = runs / name / "model.safetensors"
+    if path.is_file():
+        return path
+    if name == "StarIO":
+        return "default"
+    fix = f"train it: stario train --model '{name}' --out '{runs / name}'"
+    raise WeightsError(path, "file", "nothing there", f"weights of {name}", fix)
+
+
 def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:
     batch = np.ascontiguousarray(windows, dtype=np.float32)
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):

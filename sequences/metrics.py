@@ -7,7 +7,7 @@ across a gap of the truth. `CONVENTIONS` says in words what each number means.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 from scipy.stats import chi2
@@ -343,6 +343,16 @@ def _select(trajectory: Trajectory, keep: np.ndarray[tuple[int], np.dtype[np.boo
 def _span(trajectory: Trajectory) -> str:
     time = trajectory.time[trajectory.valid]
     return f"{time[0]:.3f} to {time[-1]:.3f} s" if len(time) else "no valid pose"
+
+
+def check_convention(name: str) -> Convention:
+    """A word as a convention of averaging.
+
+    Raises:
+        InputError: there is no such convention.
+    """
+    _check_choice("convention", name, get_args(Convention))
+    return cast(Convention, name)
 
 
 def _check_choice(field: str, found: str, choices: tuple[str, ...]) -> None:

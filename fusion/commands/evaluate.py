@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,10 @@ from stario.fusion.commands.common import (
     recordings_at,
 )
 
+if TYPE_CHECKING:
+    from stario.fusion.config import NavigatorConfig
+    from stario.sequences.batch import Skipped
+
 
 @grouped
 def evaluate(
@@ -31,6 +35,20 @@ def evaluate(
         Path, typer.Option(help="Folder of the development recordings, used without PATH.")
     ] = Path("../shared/data"),
     split: Annotated[str, typer.Option(help="Which of them: test, validation, training.")] = "test",
+    models: Annotated[
+        str | None,
+        typer.Option(
+            "--models",
+            help="Networks side by side: names of `stario models`, default, or weights files, "
+            "with commas between; several weights of one network are averaged.",
+        ),
+    ] = None,
+    runs: Annotated[
+        Path, typer.Option(help="Folder of training runs, where named networks are found.")
+    ] = Path("runs"),
+    convention: Annotated[
+        str, typer.Option(help="How --models averages position errors: rms, ronin, mean.")
+    ] = "rms",
     jobs: JobsOption = 1,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -42,8 +60,15 @@ def evaluate(
     from stario.sequences.batch import Skipped
     from stario.sequences.splits import split_paths
 
-    settings, network = estimating.settings(), estimating.network_for(jobs)
     files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
+    if models is not None:
+        named = [name.strip() for name in models.split(",")]
+        skipped += _networks(
+            named, runs, files, estimating.settings(), reading, convention, jobs, out, as_json
+        )
+        leave_with_skipped(skipped)
+        return
+    settings, network = estimating.settings(), estimating.network_for(jobs)
     recordings = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
         for outcome in compare_recordings(
@@ -62,3 +87,43 @@ def evaluate(
     elif recordings:
         typer.echo(summary_table(recordings))
     leave_with_skipped(skipped)
+
+
+def _networks(
+    names: list[str],
+    runs: Path,
+    files: list[Path],
+    settings: NavigatorConfig,
+    reading: Reading,
+    convention: str,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """The table of networks; returns the recordings that could not be used."""
+    from stario.fusion.results import make_folder
+    from stario.fusion.table import compare_networks, table_dict, table_text, write_table
+    from stario.network.model import load_model, weights_named
+    from stario.sequences.metrics import check_convention
+
+    networks = {name: load_model(weights_named(name, runs)) for name in names}
+    if out is not None:
+        make_folder(out)
+    with progress_bar("evaluate", 100 * len(files)) as progress:
+        table, skipped = compare_networks(
+            files,
+            list(networks.items()),
+            settings,
+            reading.read,
+            check_convention(convention),
+            jobs,
+            progress=progress,
+        )
+    if table.entries:
+        if out is not None:
+            write_table(out, table)
+        if as_json:
+            print_json(table_dict(table))
+        else:
+            typer.echo(table_text(table))
+    return skipped
