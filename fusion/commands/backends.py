@@ -1,0 +1,66 @@
+"""`stario backends`: filter against graph."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stario.fusion.commands.common import (
+    Estimating,
+    JsonOption,
+    PathsArgument,
+    Reading,
+    grouped,
+    leave_with_skipped,
+    print_json,
+    progress_bar,
+    recordings_at,
+)
+
+if TYPE_CHECKING:
+    from stario.fusion.backends import Score
+    from stario.sequences.batch import Skipped
+
+
+@grouped
+def backends(
+    reading: Reading,
+    estimating: Estimating,
+    paths: PathsArgument = None,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each in s.")] = 120.0,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of the development recordings, instead of walks.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="Which of them.")] = "validation",
+    as_json: JsonOption = False,
+) -> None:
+    """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
+
+    Without PATH or --data: on simulated walks, measured under white noise of a known size.
+    """
+    from stario.fusion.backends import score_recording, score_table, score_walk, summary
+    from stario.sequences.splits import split_paths
+
+    scores: list[Score] = []
+    skipped: list[Skipped] = []
+    if paths or data is not None:
+        files, skipped = recordings_at(paths or split_paths(data or Path(), split))
+        settings, network = estimating.settings(), estimating.network()
+        with progress_bar("backends", len(files)) as progress:
+            for k, file in enumerate(files, 1):
+                scores.append(score_recording(network, reading.read(file), settings))
+                progress(k / len(files))
+    else:
+        with progress_bar("backends", walks) as progress:
+            for seed in range(walks):
+                scores.append(score_walk(seed, seconds))
+                progress((seed + 1) / walks)
+    if scores and as_json:
+        print_json({"summary": summary(scores), "scores": [asdict(score) for score in scores]})
+    elif scores:
+        typer.echo(score_table(scores))
+    leave_with_skipped(skipped)

@@ -1,0 +1,212 @@
+"""The fixed-lag graph of a stream: against the filter and the batch, fixes, faults, memory."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavState
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.graph import IndeterminateError, KeyframeGraph
+from stario.fusion.recipe import PriorPose
+from stario.sequences.noise import ImuNoise
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+
+NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
+CONFIG = NavigatorConfig(
+    NOISE,
+    FilterConfig(
+        covariance_scale=1.0, gyro_bias_sigma=3e-3, accel_bias_sigma=0.05, accel_motion_noise=0.0
+    ),
+)
+
+
+def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
+    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
+    return [s for row in rows if (s := navigator.push(*row)) is not None]
+
+
+def lagged(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
+    return Navigator(model, config, backend="graph", **more)
+
+
+def true_start(walk: ImuSequence) -> PriorPose:
+    truth = walk.truth
+    return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
+
+
+def errors(states: list[NavState], walk: ImuSequence) -> np.ndarray:
+    time = np.array([s.time for s in states])
+    position = np.array([s.p_W for s in states])
+    return np.linalg.norm(position - walk.truth.at(time).position_W, axis=1)
+
+
+def assert_sound(state: NavState) -> None:
+    for value in (state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a, state.covariance):
+        assert np.isfinite(value).all()
+    assert np.linalg.eigvalsh(state.covariance).min() > -1e-9
+    np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-9)
+
+
+def test_a_stream_knows_what_the_filter_knows(make_walk: Make, make_oracle: Make) -> None:
+    """Same times; errors and sigmas alike, yaw's above all, which only fixes can tell."""
+    walk = make_walk(5, 40.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    ours, theirs = (
+        stream(Navigator(oracle, CONFIG, true_start(walk), backend), walk)
+        for backend in ("graph", "ekf")
+    )
+    assert [s.time for s in ours] == [s.time for s in theirs]
+    assert errors(ours, walk).mean() < 1.3 * errors(theirs, walk).mean() + 0.02
+    sigma, expected = (np.sqrt(np.diag(states[-1].covariance)) for states in (ours, theirs))
+    np.testing.assert_allclose(sigma[:9], expected[:9], rtol=0.1)
+    assert 0.95 < sigma[2] / expected[2] < 1.05
+
+
+def test_at_first_a_stream_is_the_batch(walk: ImuSequence, make_oracle: Make) -> None:
+    """Until something has left the lag both optimise the same graph."""
+    short = walk.slice(0.0, 4.0)
+    oracle = make_oracle(short, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    track, states = lagged(oracle).run(short), stream(lagged(oracle), short)
+    at = int(np.argmin(np.abs(track.time - 3.0)))
+    newest = next(s for s in states if abs(s.time - 3.0) < 1e-6)
+    # The batch sees a second more.
+    assert np.linalg.norm(newest.p_W - track.trajectory.position_W[at]) < 0.1
+
+
+def test_a_longer_lag_than_the_walk_changes_little(walk: ImuSequence, make_oracle: Make) -> None:
+    """What is marginalised still counts."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    ends = [
+        stream(lagged(oracle, replace(CONFIG, graph=replace(CONFIG.graph, lag=lag))), walk)[-1]
+        for lag in (3.0, 60.0)
+    ]
+    assert np.linalg.norm(ends[0].p_W - ends[1].p_W) < 0.15
+    np.testing.assert_allclose(*(np.sqrt(np.diag(s.covariance)) for s in ends), rtol=0.05)
+
+
+def test_fixes_pull_the_newest_state_late_ones_too(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    navigator = lagged(oracle, prior=true_start(walk))
+    seen = walk.truth.at(np.array([10.33, 14.0])).position_W
+    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
+    before = after = None
+    for row in rows:
+        if navigator.push(*row) is None:
+            continue
+        if abs(row[0] - 10.9) < 0.01 and before is None:  # more than half a second late
+            before = navigator.state
+            navigator.update_position(10.33, seen[0], 1e-4 * np.eye(3))
+            after = navigator.state
+        if abs(row[0] - 13.5) < 0.01:  # half a second early
+            navigator.update_position(14.0, seen[1], 1e-4 * np.eye(3))
+    assert before.time == after.time
+    assert errors([after], walk)[0] < 0.1
+    assert np.trace(after.covariance[6:9, 6:9]) < 0.2 * np.trace(before.covariance[6:9, 6:9])
+    assert navigator.health.fixes == {"applied": 2}
+    assert_sound(navigator.state)
+
+
+def test_two_positions_turn_a_stream_that_started_without_a_pose(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    walk = make_walk(2, 30.0)
+    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
+    navigator = lagged(make_oracle(walk, walk.truth, CONFIG))
+    for time in (5.0, 25.0):
+        seen = R.apply(walk.truth.at(np.array([time])).position_W[0]) + shift
+        navigator.update_position(time, seen, 0.01 * np.eye(3))
+    states = stream(navigator, walk)
+    last = states[-1]
+    truth = R.apply(walk.truth.at(np.array([last.time])).position_W[0]) + shift
+    assert np.linalg.norm(last.p_W - truth) < 1.0
+    assert last.world == 2
+    assert_sound(last)
+
+
+def test_rest_stops_the_drift(make_oracle: Make, still_model: Any, make_walk: Make) -> None:
+    """A device on a table, whose network knows nothing."""
+    rng = np.random.default_rng(0)
+    n = 3000
+    time = np.arange(n) / 100.0
+    gyro = 2e-3 + 2e-3 * rng.normal(size=(n, 3))
+    accel = np.array([0.0, 0.0, 9.80665]) + 0.02 * rng.normal(size=(n, 3))
+    navigator = lagged(still_model)
+    for row in zip(time, gyro, accel, strict=True):
+        navigator.push(*row)
+    assert navigator.health.rests["applied"] > 100
+    assert np.linalg.norm(navigator.state.p_W) < 0.1
+    np.testing.assert_allclose(navigator.state.b_g, 2e-3, atol=2e-4)
+
+
+def test_states_stay_sound_under_bursts_of_nan(walk: ImuSequence, make_oracle: Make) -> None:
+    rng = np.random.default_rng(0)
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    for start in rng.integers(0, len(walk), 20):
+        (gyro if rng.random() < 0.5 else accel)[start : start + rng.integers(1, 60)] = np.nan
+    bad = replace(walk, gyro=gyro, accel=accel)
+    navigator = lagged(make_oracle(bad, walk.truth, CONFIG))
+    for state in stream(navigator, bad):
+        assert_sound(state)
+    assert len(navigator.health.gaps) > 3
+
+
+def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
+    walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve, calls = KeyframeGraph.solve, []
+
+    def fails_once(self: KeyframeGraph) -> Any:
+        calls.append(self)
+        if len(calls) == 8:
+            raise IndeterminateError("velocity at 8.0 s")
+        return solve(self)
+
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    filtered = stream(Navigator(oracle, CONFIG), walk)
+    monkeypatch.setattr(KeyframeGraph, "solve", fails_once)
+    navigator = lagged(oracle)
+    states = stream(navigator, walk)
+    at = next(k for k, s in enumerate(states) if abs(s.time - 8.0) < 1e-6)
+    np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-12)
+    assert len(calls) > 15
+    assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
+    assert (
+        "fell back to the filter 1 times, last for velocity at 8.0 s" in navigator.health.notes[0]
+    )
+
+
+def grown(walk: ImuSequence, model: Any, warm: float, seconds: float) -> int:
+    navigator = lagged(model)
+    rows = list(zip(walk.gyro.tolist(), walk.accel.tolist(), strict=True))
+
+    def push(start: float, stop: float) -> None:
+        for k in range(round(start * walk.rate), round(stop * walk.rate)):
+            navigator.push(k / walk.rate, *rows[k % len(rows)])
+
+    tracemalloc.start()
+    try:
+        push(0.0, warm)
+        before = tracemalloc.get_traced_memory()[0]
+        push(warm, warm + seconds)
+        assert len(navigator._recipe._builder.graph.keyframes) < 12
+        return tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
+    assert grown(make_walk(1, 30.0, 50.0), still_model, 20.0, 40.0) < 60_000
+
+
+@pytest.mark.slow
+def test_the_memory_of_an_hour_does_not_grow(make_walk: Make, still_model: Any) -> None:
+    assert grown(make_walk(1, 30.0, 50.0), still_model, 120.0, 3600.0) < 60_000
