@@ -33,7 +33,6 @@ class Augmentation:
         swung: share of windows in which the device is swung besides.
         swing_rate: largest angular rate of a swing [rad/s].
         lever: largest distance of the device from the point it is swung about [m].
-        sway: largest speed of the hands to and fro, along each axis [m/s].
         tilt: largest error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
@@ -46,7 +45,6 @@ class Augmentation:
     swung: float = 0.35
     swing_rate: float = 2.5
     lever: float = 0.35
-    sway: float = 1.5
     tilt: float = 0.05
     gyro_bias: float = 0.03
     accel_bias: float = 0.15

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.sequence import Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulate import PHONE_IMU, simulate_imu
 from stario.sequences.stream_cache import cached
 from stario.sequences.walks import generate_walk
@@ -56,13 +56,21 @@ def gather(
         strict=True,
     )
     for kind, members, share in kinds:
-        seconds = sum(len(s) for s in members) / 200.0
         if not members:
             continue
+        seconds = sum(len(s) for s in members) / 200.0
+        lively = [_liveliness(s) if kind == "recorded" else 1.0 for s in members]
+        whole = sum(v * len(s) for v, s in zip(lively, members, strict=True)) / 200.0
         streams += members
-        weights += [share / seconds] * len(members)
+        weights += [share * v / whole for v in lively]
         words.append(f"{kind}: {seconds / 60:.0f} min")
     return Material(streams, weights, words)
+
+
+def _liveliness(stream: WorldStream) -> float:
+    """Root mean square of the linear acceleration [m/s^2]: errors are large where it is."""
+    linear = stream.imu_W[::10, 3:] - np.array([0.0, 0.0, STANDARD_GRAVITY], np.float32)
+    return float(np.sqrt(np.square(linear).sum(axis=1).mean()))
 
 
 def split_off(

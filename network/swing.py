@@ -1,10 +1,10 @@
-"""Hands that turn and sway a device, added to windows that were recorded without it.
+"""A device swung about a point beside it, added to windows that were recorded otherwise.
 
-The device's point moves with the walk plus r_W(t) = exp(alpha(t) [n]x) r_0 + s_W(t): a lever arm
-turned about a fixed axis n, and a sway of the hands. Rotating the device about its own point leaves
-its specific force in the world untouched and adds its rate. All of it is exact: rate, acceleration
-and displacement follow from the same angle alpha(t) and sway s_W(t), sums of sines. It teaches that
-turning says nothing of the way that was walked, and that hands come back.
+Hands turn a device while its owner walks on. The device's point moves with the walk plus
+r_W(t) = exp(alpha(t) [n]x) r_0, a lever arm turned about a fixed axis n; rotating the device about
+its own point leaves its specific force in the world untouched and adds its rate. All of it is
+exact: rate, acceleration and displacement follow from the same angle alpha(t), a sum of sines.
+It teaches that turning says nothing of the way that was walked.
 """
 
 from __future__ import annotations
@@ -18,23 +18,20 @@ from torch import Tensor
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 
 _SINES = 2
-"""Sines in the angle of a swing, and in each axis of its sway."""
+"""Sines in the angle of a swing."""
 
 _FREQUENCIES = (0.1, 1.0)
-"""Of the angle's sines [Hz]: sweeps and shakes of hands."""
-
-_SWAYS = (0.25, 1.2)
-"""Of the sway's sines [Hz]: slower ones no window could tell from walking."""
+"""Of those sines [Hz]: sweeps and shakes of hands."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sines:
-    """Sums of K sines, one for each of some leading axes (...).
+    """Sums of K sines, one for each of B windows.
 
     Attributes:
-        amplitude: (..., K).
-        frequency: (..., K) [rad/s].
-        phase: (..., K) [rad].
+        amplitude: (B, K) [rad].
+        frequency: (B, K) [rad/s].
+        phase: (B, K) [rad].
     """
 
     amplitude: Tensor
@@ -42,7 +39,7 @@ class Sines:
     phase: Tensor
 
     def at(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Value and first and second derivative (..., T) at times (T,) [s]."""
+        """Value and first and second derivative (B, T) at times (T,) [s]."""
         argument = self.frequency[..., None] * time + self.phase[..., None]
         a, w = self.amplitude[..., None], self.frequency[..., None]
         sine = a * argument.sin()
@@ -57,17 +54,15 @@ class Swing:
         axis: (B, 3) unit vectors in W.
         lever: (B, 3) from the point that walks to the device at angle zero [m].
         angle: about the axis (B, K) [rad].
-        sway: of each axis of W (B, 3, K) [m].
     """
 
     axis: Tensor
     lever: Tensor
     angle: Sines
-    sway: Sines
 
 
 def draw_swing(
-    size: int, share: float, rate: float, lever: float, speed: float, generator: torch.Generator
+    size: int, share: float, rate: float, lever: float, generator: torch.Generator
 ) -> Swing:
     """Random swings about axes near the vertical, as arms and hips make them.
 
@@ -76,30 +71,21 @@ def draw_swing(
         share: of windows that are swung at all.
         rate: largest angular rate [rad/s].
         lever: longest lever arm [m].
-        speed: largest speed of the sway along each axis [m/s].
         generator: of the draws.
     """
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 
-    def sines(most: Tensor, band: tuple[float, float]) -> Sines:
-        """Whose first derivatives add up to `most` (...) or less."""
-        low, high = (2.0 * math.pi * f for f in band)
-        frequency = low + (high - low) * uniform(*most.shape, _SINES)
-        amplitude = most[..., None] / _SINES * uniform(*most.shape, _SINES) / frequency
-        return Sines(amplitude, frequency, 2.0 * math.pi * uniform(*most.shape, _SINES))
-
     axis = torch.randn(size, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
     axis = torch.nn.functional.normalize(axis + torch.tensor([0.0, 0.0, 1.0]), dim=1)
     arm = torch.nn.functional.normalize(torch.randn(size, 3, generator=generator), dim=1)
     swings = (uniform(size) < share).float()
-    return Swing(
-        axis,
-        arm * (swings * lever * uniform(size))[:, None],
-        sines(swings * rate, _FREQUENCIES),
-        sines((swings * speed * uniform(size))[:, None].expand(-1, 3), _SWAYS),
-    )
+    low, high = (2.0 * math.pi * f for f in _FREQUENCIES)
+    frequency = low + (high - low) * uniform(size, _SINES)
+    amplitude = swings[:, None] * rate / _SINES * uniform(size, _SINES) / frequency
+    angle = Sines(amplitude, frequency, 2.0 * math.pi * uniform(size, _SINES))
+    return Swing(axis, arm * (swings * lever * uniform(size))[:, None], angle)
 
 
 def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
@@ -107,18 +93,16 @@ def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tens
     length = imu.shape[1]
     time = torch.arange(length + 1) / WINDOW_RATE
     angle, rate, growth = (values[..., None] for values in swing.angle.at(time))
-    sway, _, shove = (values.mT for values in swing.sway.at(time))
 
     axis = swing.axis[:, None, :].expand(-1, length + 1, -1)
     lever = _turned(swing.lever[:, None, :].expand_as(axis), axis, angle)
     tangent = torch.linalg.cross(axis, lever)
-    acceleration = growth * tangent + rate**2 * torch.linalg.cross(axis, tangent) + shove
-    point = lever + sway
+    acceleration = growth * tangent + rate**2 * torch.linalg.cross(axis, tangent)
 
     inside = slice(0, length)
     gyro = _turned(imu[..., :3], axis[:, inside], angle[:, inside]) + (rate * axis)[:, inside]
     accel = imu[..., 3:] + acceleration[:, inside]
-    return torch.cat([gyro, accel], dim=2), displacement + point[:, ::WINDOW_SAMPLES].diff(dim=1)
+    return torch.cat([gyro, accel], dim=2), displacement + lever[:, ::WINDOW_SAMPLES].diff(dim=1)
 
 
 def _turned(vectors: Tensor, axis: Tensor, angle: Tensor) -> Tensor:

@@ -3,8 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from stario.network.data import gather, generated_streams, simulated_streams, split_off
+from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream
 
 
@@ -52,3 +54,16 @@ def test_simulated_streams_are_made_once_for_what_they_depend_on(tmp_path: Path)
     walks.write_bytes(b"22")
     simulated_streams("captured", build, tmp_path / "cache", walks, 0)
     assert len(calls) == 3
+
+
+def test_lively_recordings_are_drawn_more_often() -> None:
+    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
+    material = gather([calm, lively], [], [])
+    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
+    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
+
+
+def moving(name: str, acceleration: float) -> WorldStream:
+    imu_W = np.zeros((2000, 6), np.float32)
+    imu_W[:, 3], imu_W[:, 5] = acceleration, STANDARD_GRAVITY
+    return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32))

@@ -14,32 +14,32 @@ def at_rest(size: int) -> torch.Tensor:
     return imu
 
 
-def drawn(size: int, share: float = 1.0, speed: float = 1.5) -> Swing:
-    drawn = draw_swing(size, share, 2.5, 0.35, speed, torch.Generator().manual_seed(3))
-    exact = [Sines(*(v.double() for v in vars(s).values())) for s in (drawn.angle, drawn.sway)]
-    return Swing(drawn.axis.double(), drawn.lever.double(), *exact)
+def drawn(size: int, share: float = 1.0) -> Swing:
+    drawn = draw_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
+    angle = Sines(*(value.double() for value in vars(drawn.angle).values()))
+    return Swing(drawn.axis.double(), drawn.lever.double(), angle)
 
 
 def test_acceleration_integrates_to_the_displacement() -> None:
     swing = drawn(64)
     imu, displacement = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
-    # The velocity a window begins with is omega x r and that of the sway.
+    # The velocity a window begins with is omega x r.
     now = torch.zeros(1, dtype=torch.float64)
     lever = turned(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
-    velocity = torch.linalg.cross(imu[:, 0, :3], lever) + swing.sway.at(now)[1][..., 0]
+    velocity = torch.linalg.cross(imu[:, 0, :3], lever)
     accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
     for k in range(200):
         velocity_next = velocity + 0.5 * dt * (accel[:, k] + accel[:, min(k + 1, 199)])
         moved = moved + 0.5 * dt * (velocity + velocity_next)
         velocity = velocity_next
-    assert displacement.abs().max() > 0.3
+    assert displacement.abs().max() > 0.1
     assert (moved - displacement[:, 0]).abs().max() < 2e-3
 
 
 def test_rate_and_lever_belong_to_one_rotation() -> None:
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
-    swing = drawn(64, speed=0.0)
+    swing = drawn(64)
     imu, _ = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
     lever = turned(swing.lever, swing.axis, alpha)
@@ -48,12 +48,10 @@ def test_rate_and_lever_belong_to_one_rotation() -> None:
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
 
 
-def test_no_swing_is_faster_than_its_bounds() -> None:
+def test_no_swing_is_faster_than_its_bound() -> None:
     swing = drawn(512)
     time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
-    rate, speed = swing.angle.at(time)[1].abs().max(), swing.sway.at(time)[1].abs().max()
-    assert 1.5 < rate <= 2.5
-    assert 0.8 < speed <= 1.5
+    assert 1.5 < swing.angle.at(time)[1].abs().max() <= 2.5
 
 
 def test_what_is_not_swung_stays_as_it_is() -> None:
