@@ -149,7 +149,7 @@ class WindowSampler:
         size = len(imu)
         mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
         imu, displacement = _mirrored(imu, displacement, mirror)
-        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, a.sway, self.generator)
+        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
         imu, displacement = swung(imu, displacement, swings)
         R_yaw = _about_z(self._symmetric(size) * torch.pi)
         R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
