@@ -133,7 +133,7 @@ class Inspection:
                 "misalignment_rotvec_rad": fit.R_TB.as_rotvec(),
                 "world_tilt_rad": fit.tilt,
                 "agreeing": fit.agreeing,
-                "pieces": fit.pieces,
+                "jumps": fit.jumps,
                 "axes": fit.axes(),
             },
             "problems": list(self.problems),
@@ -302,6 +302,8 @@ def _fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
         )
     if fit.tilt > _LEANING_RAD and not known:
         problems.append(f"{field}: its world is {math.degrees(fit.tilt):.1f} degrees off level")
-    if fit.pieces > 1:
-        problems.append(f"{field}: its attitude jumps {fit.pieces - 1} times against the gyroscope")
+    if fit.jumps:
+        problems.append(
+            f"{field}: its attitude jumps by what the gyroscope has not seen, {fit.jumps} times"
+        )
     return problems

@@ -7,6 +7,7 @@ their clocks and the constant rotation between their axes (`stario.sequences.ali
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.signal import correlate
@@ -16,7 +17,7 @@ from stario.sequences.alignment import align_tracked_body
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
-from stario.sequences.windows import clean_samples
+from stario.sequences.windows import MAX_IMU_GAP, clean_samples
 
 LONGEST_S = 600.0
 """What is looked at of a longer recording [s], from its middle: the cost does not grow with it."""
@@ -43,7 +44,7 @@ class TruthFit:
         R_TB: takes the IMU's axes to those whose attitude the truth gives.
         tilt: of the truth's world against the vertical [rad].
         agreeing: share of the truth's samples that the gyroscope agrees with.
-        pieces: unbroken stretches of the truth's attitude; more than 1 where it jumps.
+        jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
     """
@@ -53,7 +54,7 @@ class TruthFit:
     R_TB: Rotation
     tilt: float
     agreeing: float
-    pieces: int
+    jumps: int
     times: FloatArray
     speed: FloatArray
 
@@ -84,15 +85,20 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     truth = replace(truth, time=truth.time + coarse)
     grid = _grid(max(time[0], truth.time[0]), min(time[-1], truth.time[-1]))
     pose = truth.at(grid)
-    aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, pose.valid)
+    gaps = np.flatnonzero(np.diff(time) > MAX_IMU_GAP)
+    valid = pose.valid & ~np.isin(np.searchsorted(time, grid) - 1, gaps)
+    aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, valid)
     mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2]
     return TruthFit(
         time_offset=coarse + aligned.lag,
         correlation=aligned.correlation,
         R_TB=mount,
         tilt=float(aligned.leveling_WW.magnitude()),
-        agreeing=float(aligned.valid.sum() / max(pose.valid.sum(), 1)),
-        pieces=len(aligned.mounts),
+        agreeing=float(aligned.valid.sum() / max(valid.sum(), 1)),
+        jumps=sum(
+            not ((time[gaps] > before - 1.0) & (time[gaps] < after)).any()
+            for (_, before, _), (after, _, _) in pairwise(aligned.mounts)
+        ),
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
     )

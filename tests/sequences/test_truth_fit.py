@@ -31,7 +31,7 @@ def test_a_truth_that_fits_needs_nothing(walk: ImuSequence) -> None:
     assert fit.tilt < np.radians(1.0)
     assert fit.correlation > 0.99
     assert fit.agreeing > 0.99
-    assert fit.pieces == 1
+    assert fit.jumps == 0
     assert fit.axes() is None
 
 
@@ -67,14 +67,23 @@ def test_a_world_off_level_is_told(walk: ImuSequence) -> None:
     assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
 
 
-def test_a_truth_that_flips_is_in_pieces(walk: ImuSequence) -> None:
+def test_a_truth_that_flips_jumps(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     quat_xyzw = truth.quat_xyzw
     late = truth.time > 20.0
     flip = Rotation.from_rotvec([0.0, 0.0, np.pi])
     quat_xyzw[late] = (truth.attitude_WB[late] * flip).as_quat()
     flipped = replace(walk, truth=replace(truth, attitude_WB=Rotation.from_quat(quat_xyzw)))
-    assert fit_truth(flipped).pieces == 2
+    assert fit_truth(flipped).jumps == 1
+
+
+def test_a_gap_of_the_imu_is_no_jump_of_the_truth(walk: ImuSequence) -> None:
+    kept = (walk.time < 15.0) | (walk.time > 18.0)
+    gappy = replace(walk, time=walk.time[kept], gyro=walk.gyro[kept], accel=walk.accel[kept])
+    fit = fit_truth(gappy)
+    assert fit.jumps == 0
+    assert fit.misalignment < np.radians(1.0)
+    assert abs(fit.time_offset) < 0.003
 
 
 def test_another_recordings_truth_does_not_agree(walk: ImuSequence) -> None:
