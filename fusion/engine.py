@@ -33,7 +33,7 @@ class UpdateResult(NamedTuple):
         accepted: False where the state was left alone.
         scale: factor by which the measurement covariance was inflated (1: not gated).
         reason: why the measurement was refused; empty where it was accepted.
-        residual: (m,) measured minus predicted, None where the measurement was refused.
+        residual: (m,) measured minus predicted, None where the measurement made no sense.
         sigma: (m,) standard deviations of the residual under the covariance given, likewise.
     """
 
@@ -100,7 +100,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         scale = 1.0
         if gate is not None and nis > gate:
             if gate_mode == "reject":
-                return UpdateResult(nis, m, False, reason="gated")
+                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma)
             scale = nis / gate
             covariance = covariance * scale
             whitener = _whitener(HPH + covariance)

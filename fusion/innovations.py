@@ -31,10 +31,10 @@ class InnovationLog:
     def add(self, time: float, result: UpdateResult) -> None:
         """Note what became of a network measurement at a time [s]."""
         self.offered += 1
-        if not result.accepted or result.residual is None or result.sigma is None:
+        if result.residual is None or result.sigma is None:
             count(self.refused, result.reason)
             return
-        gated = result.scale > 1.0
+        gated = is_gated(result)
         self.gated += gated
         self._nis_sum += result.nis
         self._nis_count += 1
@@ -106,6 +106,11 @@ class InnovationLog:
         self.refused = dict(checkpoint["refused"])
         self.fixes, self.rests = dict(checkpoint["fixes"]), dict(checkpoint["rests"])
         self._nis_sum, self._nis_count = checkpoint["nis"]
+
+
+def is_gated(result: UpdateResult) -> bool:
+    """Whether a measurement was taken for an outlier, left out or inflated."""
+    return result.reason == "gated" or result.scale > 1.0
 
 
 def count(counts: dict[str, int], reason: str) -> None:
