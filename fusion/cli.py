@@ -11,11 +11,14 @@ import sys
 
 import typer
 
+from stario.fusion.commands.backends import backends
 from stario.fusion.commands.benchmark import benchmark
 from stario.fusion.commands.compare import compare
+from stario.fusion.commands.consistency import consistency
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
+from stario.fusion.commands.faults import faults
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
@@ -41,6 +44,9 @@ for command in (
     models,
     export,
     benchmark,
+    backends,
+    faults,
+    consistency,
 ):
     app.command()(command)
 
