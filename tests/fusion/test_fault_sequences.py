@@ -1,0 +1,173 @@
+"""Any sequence of faults leaves finite states, sound covariances and time that increases."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stario.fusion import Navigator, NavigatorConfig, NavState
+from stario.fusion.config import FilterConfig
+from stario.sequences.errors import InputError
+
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
+RATE = 50.0
+GRAVITY = np.array([0.0, 0.0, 9.8])
+
+FAULTS = (
+    "fine",
+    "not finite",
+    "gap",
+    "long gap",
+    "duplicate",
+    "back in time",
+    "wild time",
+    "wild times in a row",
+    "spike",
+    "saturated",
+    "free fall",
+    "network not finite",
+    "network far off",
+    "network too sure",
+    "covariance without meaning",
+    "position",
+    "position far off",
+    "late heading",
+    "old velocity",
+    "fix without meaning",
+    "restored",
+)
+
+WALK = st.lists(
+    st.tuples(st.sampled_from(FAULTS), st.integers(1, 60), st.floats(-1.0, 1.0)),
+    min_size=3,
+    max_size=12,
+)
+
+
+class Moody:
+    """A network that says what the fault of the moment makes it say."""
+
+    def __init__(self) -> None:
+        self.mood, self.size = "", 0.0
+
+    def predict(self, windows):
+        n = len(windows)
+        mean = np.tile([0.5, 0.0, 0.0], (n, 1))
+        covariance = np.tile(0.01 * np.eye(3), (n, 1, 1))
+        if self.mood == "network not finite":
+            mean[:] = np.nan if self.size > 0.0 else np.inf
+        elif self.mood == "network far off":
+            mean += 1e3 * self.size
+        elif self.mood == "network too sure":
+            covariance *= 1e-12
+        elif self.mood == "covariance without meaning":
+            covariance *= np.nan if self.size > 0.5 else -1.0
+        return mean, covariance
+
+
+class Stream:
+    """Drives a navigator through faults and holds every state against what must hold."""
+
+    def __init__(self, backend: str) -> None:
+        self.model = Moody()
+        self.backend: Any = backend
+        self.navigator = Navigator(self.model, CONFIG, backend=self.backend)
+        self.rng = np.random.default_rng(0)
+        self.now = 0.0
+        self.newest = -np.inf
+
+    def push(self, time: float, gyro: Any, accel: Any) -> None:
+        state = self.navigator.push(time, gyro, accel)
+        if state is not None:
+            assert state.time > self.newest
+            self.newest = state.time
+            assert_sound(state)
+
+    def samples(self, count: int, fault: str, size: float) -> None:
+        for _ in range(count):
+            self.now += 1.0 / RATE
+            gyro = self.rng.normal(0.0, 0.3, 3)
+            accel = self.rng.normal(GRAVITY, 1.0)
+            time = self.now
+            if fault == "not finite":
+                (gyro if size > 0.0 else accel)[0] = np.nan if size > 0.5 else np.inf
+            elif fault == "duplicate":
+                self.push(time, gyro, accel)
+            elif fault == "back in time":
+                time -= 3.0 * abs(size)
+            elif fault == "spike":
+                gyro[1] += 400.0 * size
+                accel[2] += 900.0 * size
+            elif fault == "saturated":
+                accel = np.clip(3.0 * accel, -20.0, 20.0)
+            elif fault == "free fall":
+                accel[:] = 0.0
+            self.push(time, gyro, accel)
+
+    def take(self, fault: str, count: int, size: float) -> None:
+        self.model.mood, self.model.size = fault, size
+        n, at = self.navigator, self.now - 0.3
+        eye = np.eye(3)
+        if fault == "gap":
+            self.now += 5.0 * abs(size)
+        elif fault == "long gap":
+            self.now += 10.0 + 1e5 * abs(size)
+        elif fault.startswith("wild time"):
+            for k in range(1 if fault == "wild time" else 4):
+                self.push(self.now + 1e6 * abs(size) + 20.0 + k, np.zeros(3), np.zeros(3))
+        elif fault == "position":
+            n.update_position(self.now + size, [10.0 * size, 5.0, 0.0], 0.1 * eye)
+        elif fault == "position far off":
+            n.update_position(at, 1e5 * size * np.ones(3), 1e-6 * eye)
+        elif fault == "late heading":
+            n.update_heading(at, 4.0 * size, 0.1)
+        elif fault == "old velocity":
+            n.update_velocity(at - 3.0 * abs(size), [1.0, size, 0.0], 0.01 * eye)
+        elif fault == "fix without meaning":
+            n.update_position(at, [np.nan, size, 0.0], eye)
+            n.update_velocity(at, np.zeros(3), -eye)
+            n.update_heading(np.inf, size, 0.0)
+        elif fault == "restored" and self.backend == "ekf":
+            data = n.snapshot()
+            self.navigator = Navigator(self.model, CONFIG, backend=self.backend)
+            self.navigator.restore(data)
+        self.samples(count, fault, size)
+        if self.navigator.state is not None:
+            assert_sound(self.navigator.state)
+
+
+def assert_sound(state: NavState) -> None:
+    for name in ("time", "R_WB", "v_W", "p_W", "b_g", "b_a", "covariance"):
+        assert np.isfinite(getattr(state, name)).all(), name
+    np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-6)
+    sigma = np.sqrt(np.maximum(np.diag(state.covariance), 1e-300))
+    assert np.linalg.eigvalsh(state.covariance / np.outer(sigma, sigma)).min() > -1e-6
+
+
+@pytest.mark.parametrize("backend", ["ekf", pytest.param("graph", marks=pytest.mark.slow)])
+def test_no_sequence_of_faults_breaks_a_stream(backend: str) -> None:
+    @settings(
+        max_examples=25 if backend == "ekf" else 8,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(WALK)
+    def run(walk: list[tuple[str, int, float]]) -> None:
+        stream = Stream(backend)
+        try:
+            stream.samples(80, "fine", 0.0)
+            for fault, count, size in walk:
+                stream.take(fault, count, size)
+        except InputError as error:
+            # The only one a stream of samples may raise: no gravity in its first second.
+            assert "first second" in str(error)  # noqa: PT017
+        health = stream.navigator.health
+        assert health.lines()
+        assert sum(health.samples.values()) > 0
+
+    run()
