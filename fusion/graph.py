@@ -26,7 +26,9 @@ from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
 
-_MOST_ROUNDS = 5
+_MOST_STEPS = 3
+"""Of Levenberg-Marquardt per round: no more pay before the measurements are linearised anew."""
+
 _MOVED = 1e-3
 """A round that moves no keyframe further [m] is the last."""
 
@@ -96,8 +98,11 @@ class KeyframeGraph:
         self._terms.append(_Whitened(term, whitener, _quantile(self._gate, len(whitener))))
         self._tree = None
 
-    def solve(self) -> Solution:
+    def solve(self, most_rounds: int = 5) -> Solution:
         """Move the keyframes to where everything known fits best.
+
+        Args:
+            most_rounds: linearisations of the measurements after which it is good enough.
 
         Raises:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
@@ -105,7 +110,7 @@ class KeyframeGraph:
         """
         start, self._tree = self._values, None
         try:
-            rounds = self._optimise()
+            rounds = self._optimise(most_rounds)
             self._tree = self._linear().eliminateMultifrontal(self._ordering(), gtsam.EliminateQR)
             self._check_determined()
         except RuntimeError as error:  # gtsam's way to report it
@@ -174,11 +179,11 @@ class KeyframeGraph:
         self._values.insert(B(k), gtsam.imuBias.ConstantBias(state.b_a, state.b_g))
         self._tree = None
 
-    def _optimise(self) -> int:
+    def _optimise(self, most_rounds: int) -> int:
         fixed = gtsam.NonlinearFactorGraph()
         for _first, factor in self._factors:
             fixed.add(factor)
-        for _round in range(_MOST_ROUNDS):
+        for _round in range(most_rounds):
             graph = gtsam.NonlinearFactorGraph(fixed)
             for term in self._terms:
                 graph.add(gtsam.LinearContainerFactor(term.factor(self._values), self._values))
@@ -292,6 +297,7 @@ def _ordering(keys: list[int]) -> Any:
 def _parameters() -> Any:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setMaxIterations(_MOST_STEPS)
     return parameters
 
 

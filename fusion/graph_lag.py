@@ -19,6 +19,9 @@ from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.recipe import FilterRecipe, PriorPose
 from stario.fusion.state import Health, Innovations, NavState
 
+_ROUNDS = 3
+"""Of each optimisation: the next keyframe's goes on from there."""
+
 
 class GraphRecipe:
     """A `FilterRecipe` whose states are those of a fixed-lag graph.
@@ -103,7 +106,7 @@ class GraphRecipe:
         builder = self._builder
         graph = builder.graph
         try:
-            graph.solve()
+            graph.solve(_ROUNDS)
             newest = graph.state(graph.last)
             builder.forget(newest.time - self._config.graph.lag)
         except IndeterminateError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -164,11 +165,11 @@ def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
 ) -> None:
     solve, calls = KeyframeGraph.solve, []
 
-    def fails_once(self: KeyframeGraph) -> Any:
+    def fails_once(self: KeyframeGraph, most_rounds: int = 5) -> Any:
         calls.append(self)
         if len(calls) == 8:
             raise IndeterminateError("velocity at 8.0 s")
-        return solve(self)
+        return solve(self, most_rounds)
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
     filtered = stream(Navigator(oracle, CONFIG), walk)
@@ -195,8 +196,10 @@ def grown(walk: ImuSequence, model: Any, warm: float, seconds: float) -> int:
     tracemalloc.start()
     try:
         push(0.0, warm)
+        gc.collect()  # what it still holds in free lists is no growth
         before = tracemalloc.get_traced_memory()[0]
         push(warm, warm + seconds)
+        gc.collect()
         assert len(navigator._recipe._builder.graph.keyframes) < 12
         return tracemalloc.get_traced_memory()[0] - before
     finally:
@@ -204,7 +207,7 @@ def grown(walk: ImuSequence, model: Any, warm: float, seconds: float) -> int:
 
 
 def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
-    assert grown(make_walk(1, 30.0, 50.0), still_model, 20.0, 40.0) < 60_000
+    assert grown(make_walk(1, 30.0, 50.0), still_model, 20.0, 30.0) < 40_000
 
 
 @pytest.mark.slow
