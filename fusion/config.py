@@ -58,7 +58,7 @@ class FilterConfig:
 
     update_rate: int = 2
     measurement: str = "displacement"
-    covariance_scale: float = 0.6
+    covariance_scale: float = 0.5
     gate: float = 0.997
     gate_seconds: float = 0.0
     tilt_sigma: float = 0.05
