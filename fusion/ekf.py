@@ -97,6 +97,19 @@ class StateCloningEkf(ErrorStateEngine):
         self._check_slot(slot)
         return np.array(self._X[1 + slot, :, :3]), np.array(self._X[1 + slot, :, 4])
 
+    def clone_covariance(self, slot: int) -> FloatArray:
+        """Covariance (6, 6) of a clone's rotation about the world's axes [rad] and position [m].
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        self._check_slot(slot)
+        first = CORE + CLONE * slot
+        to_world = np.eye(CLONE)
+        to_world[3:, :3] = -skew(self._X[1 + slot, :, 4])
+        P = self.P[first : first + CLONE, first : first + CLONE]
+        return np.asarray(to_world @ P @ to_world.T)
+
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
         return self._clone_time[slot]

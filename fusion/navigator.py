@@ -27,8 +27,8 @@ from stario.fusion.graph_lag import GraphRecipe
 from stario.fusion.intake import Epoch, Intake, Start, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.snapshot import check_same, pack, unpack
-from stario.fusion.state import Health, NavState, Track, track_from_states
-from stario.fusion.world import in_last_world
+from stario.fusion.state import Health, NavState, SmoothedPose, Track, track_from_states
+from stario.fusion.world import in_last_world, smoothed_track
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -163,6 +163,15 @@ class Navigator:
         return None if self._recipe is None else self._recipe.state()
 
     @property
+    def smoothed(self) -> SmoothedPose | None:
+        """The stream's newest pose one window (1 s) late, corrected by all measured since.
+
+        It comes with each network update; None before the first, and where there are no clones
+        (`measurement` "velocity") or the back end is not the EKF.
+        """
+        return self._recipe.smoothed if isinstance(self._recipe, FilterRecipe) else None
+
+    @property
     def health(self) -> Health:
         """The stream's report so far."""
         counts = self._intake.counts
@@ -283,11 +292,14 @@ class Navigator:
         queue = FixQueue(fixes)
         queue.start(start.time)
         states, taken = [recipe.state()], []
+        poses: list[SmoothedPose] = []
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
         ):
             due = queue.due(epoch.stop)
             states.append(recipe.step(epoch, measurement, due))
+            if recipe.smoothed is not None and (not poses or recipe.smoothed is not poses[-1]):
+                poses.append(recipe.smoothed)
             taken.append(Taken(epoch, measurement, due, recipe.held))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
@@ -296,16 +308,17 @@ class Navigator:
         prior, states = states[0], in_last_world(states, recipe.world_changes)
         notes = []
         if self.backend == "graph":
-            smoothed = smooth(states, prior, taken, self.config)
-            states, notes = smoothed.states, [smoothed.note]
+            whole = smooth(states, prior, taken, self.config)
+            states, notes, poses = whole.states, [whole.note], []
         health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
-        return track_from_states(
+        track = track_from_states(
             states,
             recipe.innovations(),
             _with_refused(health, queue),
             seconds_network=observed.seconds_network,
             seconds_filter=observed.seconds_intake + perf_counter() - began,
         )
+        return replace(track, smoothed=smoothed_track(poses, recipe.world_changes))
 
     def _measure(self, epochs: Sequence[Epoch], progress: Progress) -> list[Measurement | None]:
         measurements: list[Measurement | None] = [None] * len(epochs)

@@ -27,7 +27,7 @@ from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import exp_so3
 from stario.fusion.rest import RestDetector
 from stario.fusion.segments import segment_of
-from stario.fusion.state import Health, Innovations, NavState
+from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
 from stario.fusion.world import KNOWN_YAW, UNKNOWN_YAW, WorldChange, WorldFrame
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -96,6 +96,8 @@ class FilterRecipe:
 
     Attributes:
         ekf: the filter.
+        smoothed: the newest pose that left the window, corrected by all of it; None at first, and
+            where mean velocities are measured.
         held: what the last step measured at rest, None where it moved or was refused.
     """
 
@@ -119,6 +121,7 @@ class FilterRecipe:
         self._log = InnovationLog(keep_rows=not streaming)
         self._rest = RestDetector(per_window, f.rest_noise)
         self.held: Held | None = None
+        self.smoothed: SmoothedPose | None = None
         self._gated_since: float | None = None
         self._world = WorldFrame(
             placed=prior is not None,
@@ -198,6 +201,7 @@ class FilterRecipe:
             "ekf": self.ekf.checkpoint(),
             "slots": list(self._slots),
             "gated_since": self._gated_since,
+            "smoothed": self.smoothed and vars(self.smoothed),
             "velocity_steps": list(self._velocity_steps),
             "log": self._log.checkpoint(),
             "rest": self._rest.checkpoint(),
@@ -209,6 +213,8 @@ class FilterRecipe:
         self.ekf.rewind(checkpoint["ekf"])
         self._slots = deque(checkpoint["slots"])
         self._gated_since = checkpoint["gated_since"]
+        smoothed = checkpoint["smoothed"]
+        self.smoothed = None if smoothed is None else SmoothedPose(**smoothed)
         self._velocity_steps = deque(
             checkpoint["velocity_steps"], maxlen=self._velocity_steps.maxlen
         )
@@ -360,8 +366,18 @@ class FilterRecipe:
 
     def _clone(self, time: float) -> None:
         if len(self._slots) == self.ekf.slots:
+            self.smoothed = self._oldest()
             self.ekf.release(self._slots.popleft())
         self._slots.append(self.ekf.clone(time))
+
+    def _oldest(self) -> SmoothedPose:
+        """The oldest clone, which a whole window of measurements has corrected since."""
+        slot = self._slots[0]
+        R_WB, p_W = self.ekf.clone_pose(slot)
+        time = self.ekf.clone_time(slot)
+        assert time is not None  # the slot is taken
+        world = len(self._world.changes)
+        return SmoothedPose(time, R_WB, p_W, self.ekf.clone_covariance(slot), world)
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""

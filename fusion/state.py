@@ -46,6 +46,25 @@ class NavState:
 
 
 @dataclass(frozen=True, eq=False)
+class SmoothedPose:
+    """A pose as it is known one window later, with what was measured since.
+
+    Attributes:
+        time: of the pose [s].
+        R_WB: (3, 3) attitude, body to world.
+        p_W: (3,) position [m].
+        covariance: (6, 6) of rotation about the world's axes [rad] and position [m].
+        world: as in `NavState`.
+    """
+
+    time: float
+    R_WB: FloatArray
+    p_W: FloatArray
+    covariance: FloatArray
+    world: int = 0
+
+
+@dataclass(frozen=True, eq=False)
 class Innovations:
     """Measured minus predicted displacement of every update.
 
@@ -133,6 +152,8 @@ class Track:
         covariance: (N, 15, 15) as in `NavState`, None where the track has none.
         innovations: of the network's measurements, None where there is no filter.
         health: counts and statistics of the run, None where there is no filter.
+        smoothed: poses at the times of the filter's clones, each as it was known one window later;
+            None where there are none.
         seconds_network: computing time of the network [s].
         seconds_filter: computing time of everything else [s].
     """
@@ -143,6 +164,7 @@ class Track:
     covariance: FloatArray | None = None
     innovations: Innovations | None = None
     health: Health | None = None
+    smoothed: Trajectory | None = None
     seconds_network: float = 0.0
     seconds_filter: float = 0.0
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stario.fusion.ekf import StateCloningEkf
@@ -23,7 +24,8 @@ from stario.fusion.engine import UpdateResult
 from stario.fusion.fixes import Fix
 from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import FloatArray, skew
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, SmoothedPose
+from stario.sequences.sequence import Trajectory
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 """Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
@@ -163,6 +165,30 @@ def in_last_world(states: list[NavState], changes: list[WorldChange]) -> list[Na
     for change in changes:
         states = [state if state.time >= change.time else _moved(state, change) for state in states]
     return states
+
+
+def smoothed_track(poses: list[SmoothedPose], changes: list[WorldChange]) -> Trajectory | None:
+    """Smoothed poses as a track, in the world it ends in; None where there is none."""
+    if not poses:
+        return None
+    rows = []
+    for pose in poses:
+        R_WB, p_W, covariance = pose.R_WB, pose.p_W, pose.covariance[3:, 3:]
+        for change in changes[pose.world :]:
+            R_WB, p_W = change.R @ R_WB, change.R @ p_W + change.shift
+            covariance = change.R @ covariance @ change.R.T
+            across = skew(p_W - change.pivot) @ [0.0, 0.0, -change.yaw_sigma]
+            covariance = covariance + np.outer(across, across)
+            if change.position_covariance is not None:
+                covariance = covariance + change.position_covariance
+        rows.append((pose.time, p_W, R_WB, covariance))
+    time, position, attitude, covariances = zip(*rows, strict=True)
+    return Trajectory(
+        time=np.array(time),
+        position_W=np.array(position),
+        attitude_WB=Rotation.from_matrix(np.array(attitude)),
+        position_covariance_W=np.array(covariances),
+    )
 
 
 def _moved(state: NavState, change: WorldChange) -> NavState:

@@ -1,0 +1,101 @@
+"""The EKF's poses one window late: better than the filter's, and as sure as they say."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavigatorConfig, Track
+from stario.fusion.config import FilterConfig
+from stario.fusion.fixes import position_fix
+from stario.sequences.metrics import align, pose_errors
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulate import ImuErrors
+
+NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
+ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
+CONFIG = NavigatorConfig(
+    NOISE,
+    FilterConfig(
+        update_rate=1,
+        covariance_scale=1.0,
+        gyro_bias_sigma=3e-3,
+        accel_bias_sigma=0.05,
+        accel_motion_noise=0.0,
+    ),
+)
+
+Make = Callable[..., Any]
+
+
+def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
+    return pose_errors(align(track, walk.truth, "first"), walk.truth).position_W
+
+
+@pytest.fixture(scope="module")
+def tracks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Track]]:
+    made = []
+    for seed in range(5):
+        walk = make_walk(seed, 25.0, 100.0, ERRORS)
+        oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1, seed=seed)
+        made.append((walk, Navigator(oracle, CONFIG).run(walk)))
+    return made
+
+
+def test_it_is_one_window_late_and_surer_than_the_filter_was(
+    tracks: list[tuple[ImuSequence, Track]],
+) -> None:
+    for _, track in tracks:
+        np.testing.assert_allclose(np.diff(track.smoothed.time), 1.0, atol=1e-9)
+        assert track.smoothed.time[-1] == pytest.approx(track.time[-1] - 1.0)
+        at = np.searchsorted(track.time, track.smoothed.time - 1e-6)
+        then = np.trace(track.covariance[at, 6:9, 6:9], axis1=1, axis2=2)
+        late = np.trace(track.smoothed.position_covariance_W, axis1=1, axis2=2)
+        assert (late[2:] <= then[2:] + 1e-9).all()
+
+
+def test_it_is_no_worse_than_the_filter_and_honest(
+    tracks: list[tuple[ImuSequence, Track]],
+) -> None:
+    filtered, smoothed, nees = [], [], []
+    for walk, track in tracks:
+        at = np.searchsorted(track.time, track.smoothed.time - 1e-6)[1:]
+        error = errors_at(track.smoothed, walk)[1:]
+        filtered.append(np.square(errors_at(track.trajectory, walk)[at]).sum(axis=1).mean())
+        smoothed.append(np.square(error).sum(axis=1).mean())
+        P = track.smoothed.position_covariance_W[1:]
+        nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]))
+    assert np.mean(smoothed) < np.mean(filtered)
+    assert 1.0 < np.median(np.concatenate(nees)) < 6.0  # of chi-square with 3: 2.4
+
+
+def test_a_stream_gives_the_same_poses(make_walk: Make, make_oracle: Make) -> None:
+    walk = make_walk(1, 15.0, 100.0, ERRORS)
+    model = make_oracle(walk, walk.truth, CONFIG)
+    position = walk.truth.at(np.array([3.0, 11.0])).position_W
+    fixes = [
+        position_fix(t, p, 1e-3 * np.eye(3)) for t, p in zip((3.0, 11.0), position, strict=True)
+    ]
+    track, navigator = Navigator(model, CONFIG).run(walk, fixes=fixes), Navigator(model, CONFIG)
+    for fix in fixes:
+        navigator.update_position(fix.time, fix.value, fix.covariance)
+    poses: list[Any] = []
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        navigator.push(*row)
+        pose = navigator.smoothed
+        if pose is not None and (not poses or pose.time > poses[-1].time):
+            poses.append(pose)
+    assert [pose.time for pose in poses] == pytest.approx(list(track.smoothed.time))
+    last = [pose.world == poses[-1].world for pose in poses]
+    ours = np.array([pose.p_W for pose in poses])[last]
+    np.testing.assert_allclose(ours, track.smoothed.position_W[last], atol=1e-9)
+    truth = walk.truth.at(track.smoothed.time)
+    assert np.linalg.norm(truth.position_W - track.smoothed.position_W, axis=1).max() < 1.0
+
+
+def test_without_clones_there_is_none(still_model: Any, walk: ImuSequence) -> None:
+    config = NavigatorConfig(filter=FilterConfig(measurement="velocity"))
+    assert Navigator(still_model, config).run(walk).smoothed is None
+    assert Navigator(still_model, config).smoothed is None
