@@ -43,13 +43,18 @@ class Workers:
         """This process's rows of a batch that all have drawn."""
         return batch[self.rank :: self.count]
 
-    def wrapped(self, network: nn.Module) -> nn.Module:
-        """The network with gradients averaged over the processes."""
+    def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
+        """The network with gradients averaged over the processes.
+
+        Args:
+            network: on this process's device.
+            idle: whether some parameters get no gradient in some steps, as a head of its own for
+                sigma before sigma is learned.
+        """
         if self.count == 1:
             return network
         ids = [self.device] if self.device.type == "cuda" else None
-        # Before sigma is learned, a head of its own gets no gradient.
-        return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=True)
+        return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=idle)
 
     def mean(self, value: float) -> float:
         """A number averaged over the processes."""

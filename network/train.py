@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from stario.network.architectures import build_network
+from stario.network.architectures import architecture, build_network
 from stario.network.augment import WindowSampler, reach_of
 from stario.network.calibrate import calibrate
 from stario.network.card import Calibration, Card
@@ -115,7 +115,9 @@ class _Run:
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.rate, weight_decay=config.weight_decay
         )
-        self._shared = workers.wrapped(self.network)
+        self._shared = workers.wrapped(
+            self.network, idle=architecture(config.architecture).heads > 1
+        )
         if not workers.leads:
             torch.manual_seed(config.seed + workers.rank)  # dropout of its own
         self.step = 0
