@@ -21,7 +21,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.stats import chi2
 
-from stario.fusion.graph_terms import KeyframeState, Prior, Term
+from stario.fusion.graph_terms import KeyframeState, Prior, Term, dumped, loaded
 from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
@@ -68,12 +68,13 @@ class KeyframeGraph:
         self._gate = gate
         self._values = gtsam.Values()
         self._factors: list[tuple[int, Any]] = []  # with the first keyframe each touches
+        self._segments: dict[int, Segment] = {}  # by the keyframe each begins at
         self._terms: list[_Whitened] = []
         self._time: dict[int, float] = {}
         self._tree: Any = None
         self.last = -1
         self._insert(first)
-        self._add_prior(_prior(first))
+        self._add_prior(_prior(0, first))
 
     @property
     def keyframes(self) -> list[int]:
@@ -88,14 +89,19 @@ class KeyframeGraph:
         """Bind a new keyframe to the last one by a segment; returns its number."""
         i, j = self.last, self.last + 1
         self._insert(guess)
-        imu = gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), segment.pim)
-        self._factors.append((i, imu))
+        self._bind(i, segment)
         return j
+
+    def add_apart(self, state: NavState) -> int:
+        """A new keyframe that nothing binds to the last one; its covariance is its prior."""
+        self._insert(state)
+        self._add_prior(_prior(self.last, state))
+        return self.last
 
     def add(self, term: Term) -> None:
         """Take in a measurement; its covariance is positive definite."""
-        whitener = np.linalg.inv(np.linalg.cholesky(term.covariance))
-        self._terms.append(_Whitened(term, whitener, _quantile(self._gate, len(whitener))))
+        limit = _quantile(self._gate, len(term.covariance))
+        self._terms.append(_Whitened.of(term, limit))
         self._tree = None
 
     def solve(self, most_rounds: int = 5) -> Solution:
@@ -157,7 +163,36 @@ class KeyframeGraph:
             self._values.erase(key)
         for k in old:
             del self._time[k]
+            self._segments.pop(k, None)
         self._tree = None
+
+    def dump(self) -> dict[str, Any]:
+        """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
+        return {
+            "keyframes": [[k, time, list(self.pose(k))] for k, time in self._time.items()],
+            "segments": [[i, segment.dump()] for i, segment in self._segments.items()],
+            "terms": [[*dumped(term.term), term.limit] for term in self._terms],
+        }
+
+    def load(self, dump: dict[str, Any]) -> None:
+        """Become what was dumped; `solve` comes before `state`."""
+        self._values, self._time, self._tree = gtsam.Values(), {}, None
+        for k, time, state in dump["keyframes"]:
+            self._time[k] = time
+            KeyframeState(*state).insert_into(self._values, k)
+        self.last = max(self._time)
+        self._factors, self._segments = [], {}
+        for i, segment in dump["segments"]:
+            self._bind(i, Segment.loaded(segment))
+        self._terms = []
+        for name, fields, limit in dump["terms"]:
+            self._terms.append(_Whitened.of(loaded(name, fields), limit))
+
+    def _bind(self, i: int, segment: Segment) -> None:
+        j = i + 1
+        imu = gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), segment.pim)
+        self._factors.append((i, imu))
+        self._segments[i] = segment
 
     def _marginal(self, k: int, rest: Any) -> Prior:
         """What elimination left of the one keyframe that it reached."""
@@ -168,15 +203,14 @@ class KeyframeGraph:
         return Prior(k, about, root, table[:, -1])
 
     def _add_prior(self, prior: Prior) -> None:
-        self._terms.append(_Whitened(prior, prior.covariance, math.inf))
+        self._terms.append(_Whitened.of(prior, math.inf))
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
         k = self.last
         self._time[k] = state.time
-        self._values.insert(X(k), gtsam.Pose3(gtsam.Rot3(state.R_WB), state.p_W))
-        self._values.insert(V(k), state.v_W)
-        self._values.insert(B(k), gtsam.imuBias.ConstantBias(state.b_a, state.b_g))
+        about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
+        about.insert_into(self._values, k)
         self._tree = None
 
     def _optimise(self, most_rounds: int) -> int:
@@ -245,6 +279,11 @@ class _Whitened:
     whitener: FloatArray
     limit: float
 
+    @classmethod
+    def of(cls, term: Term, limit: float) -> _Whitened:
+        """A term with the squared norm of its white residual from which it is an outlier."""
+        return cls(term, np.linalg.inv(np.linalg.cholesky(term.covariance)), limit)
+
     @property
     def first(self) -> int:
         """The first keyframe it touches."""
@@ -266,13 +305,13 @@ class _Whitened:
         return gtsam.JacobianFactor(*arguments)
 
 
-def _prior(state: NavState) -> Prior:
-    """A state's covariance as what is known of keyframe 0."""
+def _prior(k: int, state: NavState) -> Prior:
+    """A state's covariance as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
     covariance = to_invariant @ state.covariance @ to_invariant.T
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    return Prior(0, about, root, np.zeros(CORE))
+    return Prior(k, about, root, np.zeros(CORE))
 
 
 def _world_from_local(R_WB: FloatArray) -> FloatArray:

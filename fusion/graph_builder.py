@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
@@ -96,6 +96,9 @@ class GraphBuilder:
         before = self.graph.last
         if epoch.gap:
             self.close()
+        if epoch.anew is not None and guess is not None:
+            self._begin_apart(guess)
+            return True
         self.count = 0 if epoch.gap else self.count + 1
         self._append(epoch)
         inside = [fix for fix in fixes if fix.time < epoch.stop - _SAME_TIME]
@@ -152,6 +155,23 @@ class GraphBuilder:
         self._joints = [k for k in self._joints if k >= joint]
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= joint}
 
+    def dump(self) -> dict[str, Any]:
+        """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
+        return {
+            "count": self.count,
+            "joints": self._joints,
+            "pending": [epoch.dump() for epoch in self._pending],
+            "segments": [[k, [s.dump() for s in pieces]] for k, pieces in self.segments.items()],
+            "graph": self.graph.dump(),
+        }
+
+    def load(self, dump: dict[str, Any]) -> None:
+        """Become what was dumped."""
+        self.count, self._joints = dump["count"], list(dump["joints"])
+        self._pending = [Epoch.loaded(epoch) for epoch in dump["pending"]]
+        self.segments = {k: [Segment.loaded(s) for s in pieces] for k, pieces in dump["segments"]}
+        self.graph.load(dump["graph"])
+
     def reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
         R, v, p, b_g, b_a = self.graph.pose(k)
@@ -162,6 +182,13 @@ class GraphBuilder:
                 return _part_of_way((R, v, p), ahead, share, segment.duration)
             R, v, p = ahead
         return R, v, p
+
+    def _begin_apart(self, state: NavState) -> None:
+        """Behind a gap too long to be bridged: from the filter's new start."""
+        self.count = 0
+        k = self.graph.add_apart(state)
+        self.segments[k] = []
+        self._joints.append(k)
 
     def _append(self, epoch: Epoch) -> None:
         R, _, _, b_g, b_a = self.graph.pose(self.graph.last)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
@@ -42,6 +43,7 @@ class GraphRecipe:
         self._fallbacks = 0
         self._why = ""
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
+        self._builder: GraphBuilder
         self._begin(self._filter.state(), 0)
 
     def step(
@@ -49,7 +51,7 @@ class GraphRecipe:
     ) -> NavState:
         """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
         state = self._filter.step(epoch, measurement, fixes)
-        if state.world != self._world:
+        if state.world != self._world or epoch.anew is not None:
             self._begin(state, 0 if epoch.gap else self._builder.count + 1)
             return self.state(in_gap=epoch.gap)
         if self._builder.step(epoch, measurement, fixes, self._filter.held):
@@ -95,6 +97,25 @@ class GraphRecipe:
             return health
         note = f"graph fell back to the filter {self._fallbacks} times, last for {self._why}"
         return replace(health, notes=[*health.notes, note])
+
+    def dump(self) -> dict[str, Any]:
+        """A stream's recipe for `load`: arrays, numbers, text, lists and dictionaries."""
+        return {
+            "filter": self._filter.dump(),
+            "builder": self._builder.dump(),
+            "ahead": self._ahead.checkpoint(),
+            "world": self._world,
+            "fallbacks": self._fallbacks,
+            "why": self._why,
+        }
+
+    def load(self, dump: dict[str, Any]) -> None:
+        """Become what was dumped by a recipe of the same configuration."""
+        self._filter.load(dump["filter"])
+        self._builder.load(dump["builder"])
+        self._ahead.rewind(dump["ahead"])
+        self._world = dump["world"]
+        self._fallbacks, self._why = dump["fallbacks"], dump["why"]
 
     def _begin(self, first: NavState, count: int) -> None:
         """A new graph from a state of the filter."""

@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
@@ -75,6 +76,12 @@ class KeyframeState(NamedTuple):
             bias.gyroscope(),
             bias.accelerometer(),
         )
+
+    def insert_into(self, values: Any, k: int) -> None:
+        """Make this keyframe k of gtsam `Values`."""
+        values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
+        values.insert(V(k), self.v_W)
+        values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
 
     def error_from(self, other: KeyframeState) -> FloatArray:
         """Right-invariant error (15,) about another: theta, rho_v, rho_p, b_g, b_a."""
@@ -288,6 +295,24 @@ class GyroBias:
         """In B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
+
+
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (Prior, Displacement, Position, Velocity, Heading, GyroBias)
+}
+
+
+def dumped(term: Term) -> tuple[str, dict[str, Any]]:
+    """A term's kind and fields: arrays, numbers and, for a prior, the list of its state."""
+    values = {name: list(v) if name == "about" else v for name, v in vars(term).items()}
+    return type(term).__name__, values
+
+
+def loaded(kind: str, values: dict[str, Any]) -> Term:
+    """A term from what `dumped` gave."""
+    known = {name: KeyframeState(*v) if name == "about" else v for name, v in values.items()}
+    term: Term = _KINDS[kind](**known)
+    return term
 
 
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:

@@ -75,6 +75,18 @@ class Segment:
         """Length of the segment [s]."""
         return self.stop - self.start
 
+    def dump(self) -> dict[str, Any]:
+        """Everything that `loaded` needs; the samples folded as gtsam's own text archive."""
+        head = {"start": self.start, "stop": self.stop, "gravity": self.gravity}
+        return {**head, "pim": self.pim.serialize()}
+
+    @classmethod
+    def loaded(cls, dump: dict[str, Any]) -> Segment:
+        """A segment from its `dump`, equal to the last bit."""
+        pim = gtsam.PreintegratedCombinedMeasurements(_params(ImuNoise(), dump["gravity"], 1.0))
+        pim.deserialize(dump["pim"])
+        return cls(dump["start"], dump["stop"], dump["gravity"], pim)
+
     def predict(
         self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -213,3 +213,36 @@ def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any)
 @pytest.mark.slow
 def test_the_memory_of_an_hour_does_not_grow(make_walk: Make, still_model: Any) -> None:
     assert grown(make_walk(1, 30.0, 50.0), still_model, 120.0, 3600.0) < 60_000
+
+
+@pytest.mark.parametrize("stop", [3.0, 11.37])
+def test_a_stream_goes_on_in_another_navigator(
+    walk: ImuSequence, make_oracle: Make, stop: float
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
+    cut = int(np.searchsorted(walk.time, stop))
+    one = lagged(oracle)
+    for row in rows[:cut]:
+        one.push(*row)
+    other = lagged(oracle)
+    other.restore(one.snapshot())
+    for row in rows[cut:]:
+        one.push(*row)
+        other.push(*row)
+    assert np.abs(one.state.p_W - other.state.p_W).max() < 1e-9
+    np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_behind_a_long_gap_it_begins_anew(
+    make_walk: Make, make_oracle: Make, without: Make
+) -> None:
+    walk = make_walk(1, 80.0, 50.0)
+    holed = without(walk, (walk.time > 8.0) & (walk.time < 70.0))
+    oracle = make_oracle(holed, walk.truth, CONFIG)
+    navigator = lagged(oracle)
+    for state in stream(navigator, holed):
+        assert_sound(state)
+    track = navigator.run(holed)
+    assert np.isfinite(track.covariance).all()
+    assert track.health.notes[0].startswith("graph of")
