@@ -108,7 +108,7 @@ class StateCloningEkf(ErrorStateEngine):
         to_world = np.eye(CLONE)
         to_world[3:, :3] = -skew(self._X[1 + slot, :, 4])
         P = self.P[first : first + CLONE, first : first + CLONE]
-        return np.asarray(to_world @ P @ to_world.T)
+        return _symmetric(to_world @ P @ to_world.T)
 
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
@@ -127,7 +127,8 @@ class StateCloningEkf(ErrorStateEngine):
         """
         X = self._X[0]
         to_world = world_from_invariant(X[:, 3], X[:, 4])
-        return np.asarray(to_world @ self.P[:CORE, :CORE] @ to_world.T)
+        # Far from the origin the products' rounding would leave it asymmetric.
+        return _symmetric(to_world @ self.P[:CORE, :CORE] @ to_world.T)
 
     def initialise(
         self,
@@ -409,3 +410,7 @@ class StateCloningEkf(ErrorStateEngine):
         if not 0 <= slot < self.slots or self._clone_time[slot] is None:
             held = [k for k, time in enumerate(self._clone_time) if time is not None]
             raise InputError("slot", repr(slot), f"one that holds a clone: {held}")
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T))

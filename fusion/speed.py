@@ -48,6 +48,7 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         "filter_engine_ratio": engine.ratio,
         "run_s_per_min": medians["run"],
         "run_network_s_per_min": medians["run_network"],
+        **push_speed(model),
         "update_rate_hz": default.config.filter.update_rate,
         **windows_speed(),
         "network": [asdict(speed) for speed in network_speed(model.training_form)],
@@ -71,6 +72,28 @@ def windows_speed(seconds: float = 600.0) -> dict[str, float]:
     }
 
 
+def push_speed(model: DisplacementModel) -> dict[str, float]:
+    """Microseconds of one `push` in a stream: without a state (median), with a network update."""
+    sequence = demonstration()
+    navigator = Navigator(model, NavigatorConfig())
+    plain, with_update = [], []
+    rows = zip(sequence.time.tolist(), sequence.gyro.tolist(), sequence.accel.tolist(), strict=True)
+    updates = 0
+    for row in rows:
+        began = perf_counter()
+        state = navigator.push(*row)
+        seconds = perf_counter() - began
+        if state is None:
+            plain.append(seconds)
+        elif navigator.health.updates > updates:
+            updates = navigator.health.updates
+            with_update.append(seconds)
+    return {
+        "push_us_median": 1e6 * float(np.median(plain)),
+        "push_us_with_update_p99": 1e6 * float(np.percentile(with_update, 99)),
+    }
+
+
 def speed_table(report: dict[str, Any]) -> str:
     """The report for a person."""
     lines = [
@@ -86,6 +109,10 @@ def speed_table(report: dict[str, Any]) -> str:
     lines.append(
         f"training windows: {report['windows_built_s_per_hour']:.2f} s per hour of data from CSV, "
         f"{report['windows_cached_s_per_hour']:.3f} s from the cache, one process"
+    )
+    lines.append(
+        f"push: {report['push_us_median']:.1f} us in the median, "
+        f"{report['push_us_with_update_p99'] / 1e3:.1f} ms with a network update (99th percentile)"
     )
     lines += [
         f"network, batch {n['batch']}: {n['inference_form']:.3f} ms/window "

@@ -151,7 +151,7 @@ def assert_sound(state: NavState) -> None:
 @pytest.mark.parametrize("backend", ["ekf", pytest.param("graph", marks=pytest.mark.slow)])
 def test_no_sequence_of_faults_breaks_a_stream(backend: str) -> None:
     @settings(
-        max_examples=25 if backend == "ekf" else 8,
+        max_examples=25 if backend == "ekf" else 5,
         deadline=None,
         derandomize=True,
         suppress_health_check=list(HealthCheck),
