@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig as NavigatorConfig
     from stario.fusion.config import read_config as read_config
     from stario.fusion.ekf import StateCloningEkf as StateCloningEkf
+    from stario.fusion.fixes import heading_fix as heading_fix
+    from stario.fusion.fixes import position_fix as position_fix
+    from stario.fusion.fixes import read_fixes as read_fixes
+    from stario.fusion.fixes import velocity_fix as velocity_fix
     from stario.fusion.navigator import Navigator as Navigator
     from stario.fusion.recipe import PriorPose as PriorPose
     from stario.fusion.state import Health as Health
@@ -26,7 +30,11 @@ _MODULES = {
     "StateCloningEkf": "ekf",
     "Track": "state",
     "demonstration": "compare",
+    "heading_fix": "fixes",
+    "position_fix": "fixes",
     "read_config": "config",
+    "read_fixes": "fixes",
+    "velocity_fix": "fixes",
 }
 
 __all__ = [
@@ -39,6 +47,10 @@ __all__ = [
     "StateCloningEkf",
     "Track",
     "demonstration",
+    "heading_fix",
+    "position_fix",
     "read_config",
+    "read_fixes",
+    "velocity_fix",
 ]
 __getattr__ = lazy_attributes("stario.fusion", _MODULES)
