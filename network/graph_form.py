@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from stario.network.displacement import DisplacementNetwork
 from stario.network.fast_stario import Depthwise, FastStarIO, Gate, Product, Stage, Star, Wings
 from stario.network.folding import folded
-from stario.network.stario import StarIO
+from stario.network.stario import EPSILON, StarIO
 
 
 def graph_form(network: DisplacementNetwork) -> DisplacementNetwork:
@@ -115,7 +115,7 @@ class _StarGraph(nn.Module):
             for weight, bias in zip(weights, biases.chunk(2), strict=True)
         )
         self.wings = _WingsGraph(star.wings)
-        self.register_buffer("project", star.project.weight)
+        self.register_buffer("project", star.project.weight / star.wings.factor)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B L, C) to (B L, C)."""
@@ -129,35 +129,34 @@ class _StarGraph(nn.Module):
 
 
 class _WingsGraph(nn.Module):
-    """As `Wings`, with a place between both wings that keeps their convolutions apart."""
+    """As `Wings`, but pooled by means, with a place between both wings that keeps them apart."""
 
-    count: Tensor
-    floor: Tensor
     mu: Tensor
     xi: Tensor
     taps: Tensor
 
     def __init__(self, wings: Wings) -> None:
         super().__init__()
-        self.inner, self.epsilon = wings.inner, float(wings.epsilon)
-        for name in ("count", "floor", "mu", "xi"):
-            values: Tensor = getattr(wings, name)
+        self.inner = wings.inner
+        for name in ("mu", "xi"):
+            values: Tensor = getattr(wings, name) * wings.count
             parts = values[: self.inner], torch.zeros(1), values[self.inner :]
             self.register_buffer(name, torch.cat(parts))
-        taps = wings.previous, wings.present, wings.following
+        # Here r is whole: the factor that `Wings` leaves to the taps is taken off them.
+        taps = [tap / wings.factor for tap in (wings.previous, wings.present, wings.following)]
         kernels = [torch.stack([tap[end] for tap in taps]) for end in (0, -1)]
         self.register_buffer("taps", torch.stack(kernels).unsqueeze(1))
 
     def forward(self, star: Tensor) -> Tensor:
-        """Weights (B, L, D) x r / factor."""
+        """Weights (B, L, D) x r."""
         square = star * star
-        over_channels = square.sum(2)
-        energy = over_channels.sum(1, keepdim=True) + self.epsilon
-        total = torch.cat([F.pad(star.sum(1), (0, 1)), star.sum(2)], dim=1)
-        squares = torch.cat([F.pad(square.sum(1), (0, 1)), over_channels], dim=1)
-        variance = (squares * self.count - total * total).clamp(min=0.0)
-        deviation = torch.sqrt(variance + energy * self.floor)
-        pooled = (total * self.mu + deviation * self.xi).unsqueeze(1)
+        over_channels = square.mean(2)
+        energy = over_channels.mean(1, keepdim=True) + EPSILON
+        mean = torch.cat([F.pad(star.mean(1), (0, 1)), star.mean(2)], dim=1)
+        squares = torch.cat([F.pad(square.mean(1), (0, 1)), over_channels], dim=1)
+        variance = (squares - mean * mean).clamp(min=0.0)
+        deviation = torch.sqrt(variance + energy * EPSILON)
+        pooled = (mean * self.mu + deviation * self.xi).unsqueeze(1)
         r = torch.pow(energy, -0.5).unsqueeze(1)
         weights = torch.sigmoid(F.conv1d(pooled, self.taps, padding=1) * r) * r
         return weights[:, :1, : self.inner] + weights[:, 1, self.inner + 1 :].unsqueeze(2)
