@@ -79,7 +79,8 @@ def test_a_stream_is_the_same_track_also_when_continued(walk, without) -> None:
 
 
 def test_the_track_with_true_attitude_remembers_too(walk) -> None:
-    track = network_track_true_attitude(Counting(), walk, NavigatorConfig())
+    config = NavigatorConfig(filter=FilterConfig(update_rate=1))
+    track = network_track_true_attitude(Counting(), walk, config)
     speed = track.trajectory.velocity_W[:, 0]
     assert (np.diff(speed) >= 0.0).all()
     assert speed[-1] == len(track.trajectory.time) - 2
