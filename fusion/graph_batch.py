@@ -53,8 +53,8 @@ def smooth(
         not determine one.
     """
     builder = GraphBuilder(config, _loosened(filtered[0], prior))
-    for (epoch, measurement, fixes, held), state in zip(taken, filtered[1:], strict=True):
-        builder.step(epoch, measurement, fixes, held, guess=state)
+    for (epoch, measurement, fixes, held, segment), state in zip(taken, filtered[1:], strict=True):
+        builder.step(epoch, measurement, fixes, held, state, segment)
     builder.close(filtered[-1])
     try:
         solution = builder.graph.solve()

@@ -300,7 +300,7 @@ class Navigator:
             states.append(recipe.step(epoch, measurement, due))
             if recipe.smoothed is not None and (not poses or recipe.smoothed is not poses[-1]):
                 poses.append(recipe.smoothed)
-            taken.append(Taken(epoch, measurement, due, recipe.held))
+            taken.append(Taken(epoch, measurement, due, recipe.held, recipe.segment))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)

@@ -25,6 +25,7 @@ from stario.fusion.innovations import InnovationLog, count, is_gated
 from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import exp_so3
+from stario.fusion.preintegration import Segment
 from stario.fusion.rest import RestDetector
 from stario.fusion.segments import segment_of
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
@@ -99,6 +100,7 @@ class FilterRecipe:
         smoothed: the newest pose that left the window, corrected by all of it; None at first, and
             where mean velocities are measured.
         held: what the last step measured at rest, None where it moved or was refused.
+        segment: the last step's samples, None where fixes cut them.
     """
 
     def __init__(
@@ -121,6 +123,7 @@ class FilterRecipe:
         self._log = InnovationLog(keep_rows=not streaming)
         self._rest = RestDetector(per_window, f.rest_noise)
         self.held: Held | None = None
+        self.segment: Segment | None = None
         self.smoothed: SmoothedPose | None = None
         self._gated_since: float | None = None
         self._world = WorldFrame(
@@ -249,6 +252,8 @@ class FilterRecipe:
                 self._propagate(piece)
             for fix in due:
                 self._take_fix(fix)
+        if fixes:
+            self.segment = None
         self.held = self._hold_still() if self._rest.at_rest(epoch) else None
         if measurement is not None:
             self._update(epoch, measurement)
@@ -280,7 +285,8 @@ class FilterRecipe:
     def _propagate(self, epoch: Epoch) -> None:
         ekf, p_W = self.ekf, self.ekf.p_W
         before = None if self._uses_clones else ekf.v_W
-        ekf.propagate(segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config))
+        self.segment = segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config)
+        ekf.propagate(self.segment)
         if before is not None:
             self._velocity_steps.append(ekf.v_W - before)
         if epoch.gap:
