@@ -30,6 +30,7 @@ COMMANDS = (
     "models",
     "export",
     "benchmark",
+    "backends",
 )
 
 
@@ -521,3 +522,29 @@ def test_training_goes_on_past_what_fails_and_keeps_its_windows(
 def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
     assert_one_line_error(stario("train", "missing.csv"), "missing.csv", "nothing there")
     assert not (tmp_path / "runs").exists()
+
+
+def test_run_with_the_graph_names_its_track(
+    stario, recording: Path, tmp_path: Path, undrawn
+) -> None:
+    done = stario("run", recording, "--backend", "graph", "--out", "out", "--json")
+    assert done.code == 0
+    assert json.loads(done.out)["graph"]["ate_m"] > 0.0
+    assert len(read_tum(tmp_path / "out" / "graph.tum").time) > 100
+    notes = json.loads((tmp_path / "out" / "health.json").read_text())["notes"]
+    assert notes[0].startswith("graph of")
+
+
+def test_an_unknown_back_end_is_one_line(stario, recording: Path) -> None:
+    done = stario("run", recording, "--backend", "ukf")
+    assert done.code == 1
+    assert "backend: found 'ukf'" in done.err
+    assert len(done.err.strip().splitlines()) == 1
+
+
+def test_backends_compares_filter_and_graph(stario) -> None:
+    done = stario("backends", "--walks", "1", "--seconds", "10", "--json")
+    assert done.code == 0
+    content = json.loads(done.out)
+    assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
+    assert content["scores"][0]["name"] == "walk 0"
