@@ -13,6 +13,8 @@ from stario.fusion.preintegration import Segment, preintegrate
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 
+_GAP_STEPS = 10
+
 
 def segment_of(
     epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
@@ -42,8 +44,10 @@ def _unseen(
         gyro_noise=config.filter.gap_gyro_noise,
         accel_noise=config.filter.gap_accel_noise,
     )
-    gyro, accel = np.tile(b_g, (2, 1)), np.tile(hover, (2, 1))
-    return preintegrate(epoch.time, gyro, accel, b_g, b_a, noise, config.gravity)
+    # In one step position and velocity would be in error together: no graph can invert that.
+    time = np.linspace(epoch.start, epoch.stop, _GAP_STEPS + 1)
+    gyro, accel = np.tile(b_g, (len(time), 1)), np.tile(hover, (len(time), 1))
+    return preintegrate(time, gyro, accel, b_g, b_a, noise, config.gravity)
 
 
 def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:

@@ -214,7 +214,7 @@ def test_outliers_are_weighed_down(walk: ImuSequence, make_oracle: Make) -> None
     assert ate(track, walk) < 0.6 * ate(graph(model, open_gate).run(walk), walk)
 
 
-@pytest.mark.parametrize("length", [0.3, 3.0])
+@pytest.mark.parametrize("length", [0.3, 1.0, 3.0])
 def test_a_gap_is_crossed_and_its_sigma_covers_the_error(
     walk: ImuSequence, make_oracle: Make, without: Make, length: float
 ) -> None:
@@ -222,6 +222,7 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(
     track = graph(make_oracle(holed, walk.truth, CONFIG)).run(holed)
     assert (~track.trajectory.valid).sum() == 1
     assert np.isfinite(track.covariance).all()
+    assert track.health.notes[0].startswith("graph of")  # it did not fall back
     at_end = walk.truth.at(np.clip(track.time[-1:], 0.0, walk.time[-1]))
     turn = about_z(float(yaw_of(at_end.attitude_WB * track.trajectory.attitude_WB[-1].inv())[0]))
     start = walk.truth.position_W[0]
