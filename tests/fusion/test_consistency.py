@@ -14,9 +14,14 @@ from stario.fusion.preintegration import preintegrate
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.simulate import PHONE_IMU
 
 TRIAL = Trial(noise=ImuNoise())
-PHONE_GYROSCOPE = Trial(noise=ImuNoise(gyro_noise=2e-3), gyro_bias_sigma=1e-2)
+PHONE = Trial(
+    noise=PHONE_IMU.noise,
+    gyro_bias_sigma=PHONE_IMU.gyro_turn_on,
+    accel_bias_sigma=PHONE_IMU.accel_turn_on,
+)
 
 
 def assert_honest(result: Consistency) -> None:
@@ -39,8 +44,8 @@ def test_nees_of_five_minutes_is_within_its_bounds() -> None:
 
 
 @pytest.mark.slow
-def test_nees_of_half_an_hour_with_a_poor_gyroscope_is_within_its_bounds() -> None:
-    result = consistency(PHONE_GYROSCOPE, seconds=1800.0)
+def test_nees_of_half_an_hour_with_a_phone_is_within_its_bounds() -> None:
+    result = consistency(PHONE, seconds=1800.0)
     assert 12.7 < result.nees < 17.5
     assert 0.5 < result.yaw < 1.7
 
