@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.along_track import AlongTrack
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.lie import exp_so3
 from stario.fusion.navigator import Observed, Predictor
 from stario.fusion.preintegration import preintegrate
 from stario.fusion.state import Track
@@ -22,7 +23,9 @@ from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
+    clean_samples,
     imu_in_world,
+    runs,
 )
 
 
@@ -75,19 +78,23 @@ def network_track_true_attitude(
 ) -> Track:
     """The papers' protocol: windows rotated by the true attitude, displacements chained.
 
+    Where the truth has a gap its attitude is carried on by the gyroscope: a track that lacks the
+    displacements of seconds would tell of the gap and not of the network.
+
     Raises:
         InputError: the recording has no truth, or no second of it with valid truth.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
     began = perf_counter()
-    time, windows = _true_windows(sequence, 1.0 / config.filter.update_rate)
+    truth = _carried_through_gaps(sequence, sequence.truth)
+    time, windows = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
     displacement = _along(model, time, windows, config.filter.window_updates)
     done = perf_counter()
     middle = time + 0.5 * WINDOW_SECONDS
     ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
-    attitude = sequence.truth.at(ticks).attitude_WB
+    attitude = truth.at(ticks).attitude_WB
     trajectory = _chained(ticks, attitude, middle, displacement / WINDOW_SECONDS)
     return Track(
         trajectory,
@@ -113,12 +120,28 @@ def _along(
     return np.concatenate(displacements)
 
 
+def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
+    """Poses at the samples from the first to the last true one, without gaps in the attitude."""
+    time, gyro, _ = clean_samples(sequence)
+    known = np.flatnonzero(truth.covers(time))
+    if len(known) == 0:
+        raise InputError(f"{sequence.name}: truth", "none that is valid", "at least a second of it")
+    inside = slice(known[0], known[-1] + 1)
+    time, gyro = time[inside], gyro[inside]
+    poses = truth.at(time)
+    R_WB = poses.attitude_WB.as_matrix()
+    turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    for start, stop in runs(~truth.covers(time)):
+        for k in range(start, stop):
+            R_WB[k] = R_WB[k - 1] @ exp_so3(turns[k - 1])
+    return Trajectory(time, poses.position_W, Rotation.from_matrix(R_WB))
+
+
 def _true_windows(
-    sequence: ImuSequence, period: float
+    sequence: ImuSequence, truth: Trajectory, period: float
 ) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
     """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
-    assert sequence.truth is not None  # checked by the caller
-    grid, imu_W, usable = imu_in_world(sequence, sequence.truth)
+    grid, imu_W, usable = imu_in_world(sequence, truth)
     bad_before = np.concatenate([[0], np.cumsum(~usable)])
     stride = round(period * WINDOW_RATE)
     starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)
