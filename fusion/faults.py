@@ -85,7 +85,6 @@ def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, Na
     walk = generate_walk(seed, seconds, style=style)
     known = FilterConfig(
         covariance_scale=1.0,
-        gate_seconds=6.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         accel_motion_noise=0.0,
