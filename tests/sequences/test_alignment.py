@@ -109,3 +109,20 @@ def test_too_little_to_tell_leaves_the_mount_alone() -> None:
     valid[::2] = True  # no stretch is whole
     turn = heading_turn(truth.time, imu.gyro, imu.accel, truth.position_W, truth.attitude_WB, valid)
     assert turn.magnitude() == 0.0
+
+
+def test_single_frames_turned_about_any_axis_are_masked() -> None:
+    imu, truth = recorded("handheld")
+    _, attitude_WV = captured(truth, 0.004)
+    rng = np.random.default_rng(2)
+    struck = np.arange(500, len(truth) - 500, 400)
+    axes = rng.standard_normal((len(struck), 3))
+    turns = np.deg2rad(15.0) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    quat = attitude_WV.as_quat()
+    quat[struck] = (attitude_WV[struck] * Rotation.from_rotvec(turns)).as_quat()
+    valid = np.ones(len(truth), dtype=np.bool_)
+    aligned = align_tracked_body(
+        imu.time, imu.gyro, imu.accel, truth.time, Rotation.from_quat(quat), valid
+    )
+    assert not aligned.valid[struck].any()
+    assert aligned.valid.mean() > 0.99
