@@ -34,9 +34,6 @@ _LAG_STEP_S = 0.0025
 _LEFT_LAG_S = 0.04
 _CORRELATED_S = 0.1
 
-Difference = Callable[[Rotation, Rotation, int], FloatArray]
-"""How far two attitudes' rotations over some samples are from each other [rad]."""
-
 
 @dataclass(frozen=True)
 class BodyAlignment:
@@ -91,7 +88,7 @@ def align_tracked_body(
     lag = _lag(gyro_B, truth_time, attitude_WV, valid, max_lag)
     time = truth_time + lag
     attitude_B = gyro_B.attitude(time)
-    valid = valid & ~_disagreeing(time, attitude_WV, attitude_B, _angle_error)
+    valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
     pieces = _pieces(time, attitude_WV, attitude_B, valid)
     start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
     _check_length("capture that agrees with the gyroscope", time[start:stop])
@@ -110,7 +107,8 @@ def align_tracked_body(
         mounts = [mount * turn for mount in mounts]
         attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     # With the mount known, glitches about another axis than the motion's show as well.
-    kept &= ~_disagreeing(time, attitude_WB, gyro_B.attitude(time), _turn_error)
+    drift = attitude_WB * gyro_B.attitude(time).inv()
+    kept &= ~_disagreeing(time, drift, Rotation.identity(len(drift)))
     return BodyAlignment(
         lag=lag,
         correlation=_correlation(time, attitude_WB, gyro_B, kept),
@@ -264,15 +262,13 @@ def _best_lag(score: Callable[[float], float], reach: float) -> float:
     return float(lags[best] + np.clip(offset, -1, 1) * _LAG_STEP_S)
 
 
-def _disagreeing(
-    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, difference: Difference
-) -> BoolArray:
+def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
     """Samples whose rotation to most neighbours, before and after, contradicts the gyroscope."""
     n = len(time)
     dt = float(np.median(np.diff(time)))
     ahead, behind = np.zeros(n), np.zeros(n)
     for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
-        error = difference(attitude_WV, attitude_B, stride) > _GLITCH_RAD
+        error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
         ahead[: n - stride] += error
         behind[stride:] += error
     enough = len(_STRIDES_S) / 2
@@ -286,12 +282,6 @@ def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> Fl
         for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
     )
     return np.asarray(2.0 * np.abs(half_V - half_B), dtype=np.float64)
-
-
-def _turn_error(attitude_WB: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
-    """Angle between the rotations over `stride` samples, both about the axes of B."""
-    turn_W, turn_B = (q[:-stride].inv() * q[stride:] for q in (attitude_WB, attitude_B))
-    return np.asarray((turn_W.inv() * turn_B).magnitude(), dtype=np.float64)
 
 
 def _pieces(
