@@ -334,9 +334,10 @@ def _fit(
     if time[stop - 1] - time[start] < _MIN_FIT_S:
         return None
     stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
-    part_V, part_B = attitude_WV[start:stop], attitude_B[start:stop]
-    phi_V = (part_V[:-stride].inv() * part_V[stride:]).as_rotvec()
-    phi_B = (part_B[:-stride].inv() * part_B[stride:]).as_rotvec()
+    # Rotations that overlap by more than two thirds say little new.
+    before = np.arange(start, stop - stride, max(1, stride // 3))
+    phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
+    phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
     weights = np.ones(len(phi_V))
     mount = Rotation.identity()
     for _ in range(5):
