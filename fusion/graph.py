@@ -19,6 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from stario.fusion.graph_terms import KeyframeState, Prior, Term, dumped, loaded
@@ -140,10 +141,7 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Forget the keyframes before one, keeping what they say of it.
-
-        No measurement may reach across it.
-        """
+        """Forget the keyframes before one, keeping what they say of it and of those behind it."""
         old = [k for k in self._time if k < before]
         if not old:
             return
@@ -151,14 +149,16 @@ class KeyframeGraph:
         for _first, factor in (item for item in self._factors if item[0] < before):
             touched.add(factor)
         linear = touched.linearize(self._values)
+        reached = [before]
         for term in self._terms:
             if term.first < before:
                 linear.push_back(term.factor(self._values))
+                reached += [k for k in term.term.keyframes if k > before]
         keys = [key(k) for k in old for key in (X, V, B)]
         _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         self._factors = [item for item in self._factors if item[0] >= before]
         self._terms = [term for term in self._terms if term.first >= before]
-        self._add_prior(self._marginal(before, rest))
+        self._add_prior(self._marginal(range(before, max(reached) + 1), rest))
         for key in keys:
             self._values.erase(key)
         for k in old:
@@ -194,13 +194,15 @@ class KeyframeGraph:
         self._factors.append((i, imu))
         self._segments[i] = segment
 
-    def _marginal(self, k: int, rest: Any) -> Prior:
-        """What elimination left of the one keyframe that it reached."""
-        A, b = rest.jacobian(_ordering([X(k), V(k), B(k)]))
-        table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[:CORE]
-        about = self.pose(k)
-        root = table[:, :-1] @ np.linalg.inv(about.invariant_from_local())
-        return Prior(k, about, root, table[:, -1])
+    def _marginal(self, reached: range, rest: Any) -> Prior:
+        """What elimination left of the keyframes that it reached."""
+        for k in reached:  # a window may reach a pose alone: columns of the rest as well
+            rest.push_back(_says_nothing(k))
+        A, b = rest.jacobian(_ordering([key(k) for k in reached for key in (X, V, B)]))
+        table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
+        about = tuple(self.pose(k) for k in reached)
+        to_local = block_diag(*(np.linalg.inv(state.invariant_from_local()) for state in about))
+        return Prior(reached[0], about, table[:, :-1] @ to_local, table[:, -1])
 
     def _add_prior(self, prior: Prior) -> None:
         self._terms.append(_Whitened.of(prior, math.inf))
@@ -300,9 +302,7 @@ class _Whitened:
         """The linear factor, linearised and weighed at `Values`."""
         residual, blocks, weight = self.weigh(values)
         scaled = weight * self.whitener
-        arguments: list[Any] = [part for key, H in blocks for part in (key, scaled @ H)]
-        arguments += [scaled @ residual, gtsam.noiseModel.Unit.Create(len(residual))]
-        return gtsam.JacobianFactor(*arguments)
+        return _linear_factor([(key, scaled @ H) for key, H in blocks], scaled @ residual)
 
 
 def _prior(k: int, state: NavState) -> Prior:
@@ -311,7 +311,7 @@ def _prior(k: int, state: NavState) -> Prior:
     to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
     covariance = to_invariant @ state.covariance @ to_invariant.T
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    return Prior(k, about, root, np.zeros(CORE))
+    return Prior(k, (about,), root, np.zeros(CORE))
 
 
 def _world_from_local(R_WB: FloatArray) -> FloatArray:
@@ -323,6 +323,18 @@ def _world_from_local(R_WB: FloatArray) -> FloatArray:
     matrix[9:12, 12:15] = np.eye(3)
     matrix[12:15, 9:12] = np.eye(3)
     return matrix
+
+
+def _says_nothing(k: int) -> Any:
+    """A factor without information on a keyframe."""
+    blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
+    return _linear_factor(blocks, np.zeros(1))
+
+
+def _linear_factor(blocks: list[tuple[int, FloatArray]], b: FloatArray) -> Any:
+    """A `JacobianFactor` of white rows; from Python only a conditional takes any number of keys."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    return gtsam.JacobianFactor(gtsam.GaussianConditional(blocks, 1, b, unit))
 
 
 def _ordering(keys: list[int]) -> Any:

@@ -43,10 +43,9 @@ class Taken(NamedTuple):
 class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
-    Keyframes stand where windows meet, one a second, at both ends of a gap and at the times of
-    fixes that come in time. More of them bring nothing: the IMU binds them as well over a second
-    as over a tenth. Windows that overlap two of these are left out: on the training and validation
-    recordings they bring 1 % at a quarter more time, and they could not be forgotten one by one.
+    Keyframes stand where windows begin and end, one a second or two where updates come in even
+    number, at both ends of a gap and at the times of fixes that come in time. More of them bring
+    nothing: the IMU binds them as well over half a second as over a tenth.
 
     Args:
         config: noise, filter and graph settings.
@@ -64,11 +63,13 @@ class GraphBuilder:
         self.graph = KeyframeGraph(first, config.filter.gate)
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
-        output_rate = config.filter.output_rate
-        self._window = round(output_rate * WINDOW_SECONDS)  # epochs
+        f = config.filter
+        self._overlap = 1 if f.update_rate % 2 else 2
+        self._window = round(f.output_rate * WINDOW_SECONDS)  # epochs
+        self._spacing = self._window // self._overlap  # epochs
         self._pending: list[Epoch] = []
         # Keyframes where windows end and begin, by the count of epochs; a gap ends them all.
-        self._joints: dict[int, int] = {count: 0} if count % self._window == 0 else {}
+        self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
 
     @property
     def newest(self) -> Segment:
@@ -109,7 +110,7 @@ class GraphBuilder:
         inside = [fix for fix in fixes if fix.time < epoch.stop - _SAME_TIME]
         for fix in inside:
             self.fix(fix)
-        due = self.count % self._window == 0
+        due = self.count % self._spacing == 0
         if due or len(inside) < len(fixes):
             self.close(guess)
         if due:
@@ -217,7 +218,7 @@ class GraphBuilder:
             self._append(epoch)
 
     def _measure(self, i: int, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
-        covariance = covariance_N * self._config.filter.covariance_scale
+        covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if not _usable(d_N, covariance):
             return
         assert epoch.R_NB_window is not None  # a window always comes with its first attitude
@@ -226,7 +227,7 @@ class GraphBuilder:
     def _hold_still(self, held: Held) -> None:
         zero, k = np.zeros(3), self.graph.last
         # One keyframe stands for the epochs since the one before.
-        covariance = held.covariance / self._window
+        covariance = held.covariance / self._spacing
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
         self.graph.add(GyroBias(k, held.b_g, covariance[3:, 3:]))
 

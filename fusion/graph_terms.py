@@ -34,7 +34,7 @@ class Linearised(NamedTuple):
 
 
 class Term(Protocol):
-    """A measurement of one or two keyframes."""
+    """A measurement of one keyframe or several."""
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -104,7 +104,7 @@ class KeyframeState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of a keyframe: root error = offset, with white noise of 1.
+    """What is known of successive keyframes together: root error = offset, white with a norm of 1.
 
     The error is right-invariant, so that a turn about the vertical and a shift are the same
     directions wherever the keyframes have moved since: what was marginalised cannot come to know
@@ -112,21 +112,21 @@ class Prior:
     and a stream's yaw then is reported twice as certain as it is.
 
     Attributes:
-        k: keyframe.
-        about: the state the error is counted from.
-        root: (15, 15).
-        offset: (15,).
+        k: the first of the keyframes.
+        about: n states, of keyframe k and those behind it, that the error is counted from.
+        root: (m, 15 n).
+        offset: (m,).
     """
 
     k: int
-    about: KeyframeState
+    about: tuple[KeyframeState, ...]
     root: FloatArray
     offset: FloatArray
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """The one."""
-        return (self.k,)
+        """All of them."""
+        return tuple(range(self.k, self.k + len(self.about)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -135,10 +135,13 @@ class Prior:
 
     def linearise(self, values: Any) -> Linearised:
         """In the rows of the root."""
-        state = KeyframeState.of(values, self.k)
-        residual = self.offset - self.root @ state.error_from(self.about)
-        H = self.root @ state.invariant_from_local()
-        blocks = [(X(self.k), H[:, :6]), (V(self.k), H[:, 6:9]), (B(self.k), H[:, 9:])]
+        residual, blocks = self.offset, []
+        for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
+            root = self.root[:, CORE * n : CORE * (n + 1)]
+            state = KeyframeState.of(values, k)
+            residual = residual - root @ state.error_from(about)
+            H = root @ state.invariant_from_local()
+            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
         return Linearised(residual, blocks)
 
 
@@ -303,14 +306,17 @@ _KINDS: dict[str, Any] = {
 
 
 def dumped(term: Term) -> tuple[str, dict[str, Any]]:
-    """A term's kind and fields: arrays, numbers and, for a prior, the list of its state."""
-    values = {name: list(v) if name == "about" else v for name, v in vars(term).items()}
+    """A term's kind and fields: arrays, numbers and, for a prior, the list of its states."""
+    values = {n: [list(s) for s in v] if n == "about" else v for n, v in vars(term).items()}
     return type(term).__name__, values
 
 
 def loaded(kind: str, values: dict[str, Any]) -> Term:
     """A term from what `dumped` gave."""
-    known = {name: KeyframeState(*v) if name == "about" else v for name, v in values.items()}
+    known = {
+        name: tuple(KeyframeState(*s) for s in v) if name == "about" else v
+        for name, v in values.items()
+    }
     term: Term = _KINDS[kind](**known)
     return term
 

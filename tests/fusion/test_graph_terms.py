@@ -41,7 +41,7 @@ def moved(values: Any, key: int, step: np.ndarray) -> Any:
 
 
 def terms(rng: np.random.Generator, values: Any) -> list[Term]:
-    state = KeyframeState.of(values, 0)
+    state, next_state = (KeyframeState.of(values, k) for k in (0, 1))
     # A window's levelled attitude differs from the world's in yaw, and a little in tilt.
     R_NB = exp_so3(np.array([0.0, 0.0, 0.9])) @ state.R_WB
     return [
@@ -50,7 +50,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Velocity(0, rng.normal(size=3), EYE, rng.normal(size=3)),
         Heading(0, exp_so3(np.array([0.0, 0.0, 0.3])) @ state.R_WB, np.eye(1)),
         GyroBias(0, rng.normal(size=3), EYE),
-        Prior(0, state, rng.normal(size=(15, 15)), rng.normal(size=15)),
+        Prior(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
     ]
 
 
@@ -106,20 +106,21 @@ def test_a_displacement_says_nothing_of_tilt() -> None:
 
 
 def test_a_prior_that_knows_no_yaw_learns_none_wherever_it_is_linearised() -> None:
-    """The direction of a turn about the vertical stays in its null space as the keyframe moves."""
+    """The direction of a turn about the vertical stays in its null space as keyframes move."""
     rng = np.random.default_rng(5)
-    about = KeyframeState.of(random_values(rng), 0)
-    root = rng.normal(size=(15, 15))
-    root[:, 2] = 0.0
-    prior = Prior(0, about, root, np.zeros(15))
+    there = random_values(rng)
+    root = rng.normal(size=(30, 30))
+    root[:, 17] = -root[:, 2]  # it knows the turn from one to the next
+    prior = Prior(0, tuple(KeyframeState.of(there, k) for k in (0, 1)), root, np.zeros(30))
     values = random_values(rng)
-    state = KeyframeState.of(values, 0)
     up = np.array([0.0, 0.0, 1.0])
-    turn = {  # gtsam's tangent of a world turned about its origin
-        X(0): np.concatenate([state.R_WB.T @ up, state.R_WB.T @ np.cross(up, state.p_W)]),
-        V(0): np.cross(up, state.v_W),
-        B(0): np.zeros(6),
-    }
+    turn = {}  # gtsam's tangent of a world turned about its origin
+    for k in (0, 1):
+        state = KeyframeState.of(values, k)
+        R_BW = state.R_WB.T
+        turn[X(k)] = np.concatenate([R_BW @ up, R_BW @ np.cross(up, state.p_W)])
+        turn[V(k)] = np.cross(up, state.v_W)
+        turn[B(k)] = np.zeros(6)
     change = sum(H @ turn[key] for key, H in prior.linearise(values).blocks)
     np.testing.assert_allclose(change, 0.0, atol=1e-12)
 
