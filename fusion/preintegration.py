@@ -83,7 +83,7 @@ class Segment:
     @classmethod
     def loaded(cls, dump: dict[str, Any]) -> Segment:
         """A segment from its `dump`, equal to the last bit."""
-        pim = gtsam.PreintegratedCombinedMeasurements(_params(ImuNoise(), dump["gravity"], 1.0))
+        pim = gtsam.PreintegratedCombinedMeasurements(_params(ImuNoise(), dump["gravity"]))
         pim.deserialize(dump["pim"])
         return cls(dump["start"], dump["stop"], dump["gravity"], pim)
 
@@ -143,7 +143,6 @@ def preintegrate(
     b_a: FloatArray,
     noise: ImuNoise,
     gravity: float,
-    noise_scale: float = 1.0,
 ) -> Segment:
     """Fold the samples of an interval into a segment.
 
@@ -155,8 +154,6 @@ def preintegrate(
         b_a: (3,) accelerometer bias [m/s^2], likewise.
         noise: noise densities over this interval.
         gravity: magnitude [m/s^2].
-        noise_scale: factor on the white densities (saturated or violent stretches); the walks of
-            the biases stay.
 
     Raises:
         InputError: fewer than two samples, shapes that differ, time that does not increase, or a
@@ -164,7 +161,7 @@ def preintegrate(
     """
     _check_samples(time, gyro, accel)
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
-    params = _params(noise, gravity, noise_scale)
+    params = _params(noise, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     integrate = pim.integrateMeasurement
     # gtsam subtracts the bias itself, so it is added back here.
@@ -207,6 +204,7 @@ def corrected_increments(
 
 
 _SHARES = np.array([1.0 / 24.0, 1.0 / 12.0])
+_EYE = np.eye(3)
 _IDENTITY = np.eye(CORE)
 _BIAS_SWAP = np.zeros((CORE, CORE))
 _BIAS_SWAP[9:12, 12:15] = np.eye(3)
@@ -225,14 +223,13 @@ def _nav_transition(dt: float, gravity: float) -> FloatArray:
 
 # Few: constant noise needs one, and noise that grows with motion never comes twice.
 @lru_cache(maxsize=4)
-def _params(noise: ImuNoise, gravity: float, noise_scale: float) -> Any:
+def _params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
-    eye = np.eye(3)
-    params.setGyroscopeCovariance(eye * (noise.gyro_noise * noise_scale) ** 2)
-    params.setAccelerometerCovariance(eye * (noise.accel_noise * noise_scale) ** 2)
-    params.setIntegrationCovariance(eye * _POSITION_NOISE**2)
-    params.setBiasOmegaCovariance(eye * noise.gyro_walk**2)
-    params.setBiasAccCovariance(eye * noise.accel_walk**2)
+    params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2)
+    params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
+    params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
+    params.setBiasOmegaCovariance(_EYE * noise.gyro_walk**2)
+    params.setBiasAccCovariance(_EYE * noise.accel_walk**2)
     return params
 
 

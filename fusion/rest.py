@@ -54,15 +54,19 @@ class RestDetector:
             self._sums.clear()
             return False
         rows = np.hstack([epoch.gyro[1:], epoch.accel[1:]])
-        head = (len(rows), epoch.stop - epoch.start)
-        self._sums.append(np.concatenate([head, rows.sum(axis=0), np.square(rows).sum(axis=0)]))
-        return len(self._sums) == self._sums.maxlen and self._quiet()
+        totals = np.ones(len(rows)) @ rows, np.einsum("ni,ni->i", rows, rows)
+        sums = np.concatenate([(len(rows), epoch.stop - epoch.start), *totals])
+        self._sums.append(sums)
+        if len(self._sums) < (self._sums.maxlen or 0):
+            return False
+        # Scatter adds up: an epoch with more than a second may have settles it.
+        return self._quiet(sums, len(self._sums)) and self._quiet(np.sum(self._sums, axis=0))
 
-    def _quiet(self) -> bool:
-        sums = np.sum(self._sums, axis=0)
+    def _quiet(self, sums: FloatArray, share: int = 1) -> bool:
+        """Whether a second may scatter like this; `sums` are of one of so many equal shares."""
         count, seconds = float(sums[0]), float(sums[1])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
-        freedom = 3.0 * (count - 1.0)
+        freedom = 3.0 * (share * count - 1.0)
         bound = self._scale**2 * count / seconds * _chi2_quantile(freedom)
         gyro, accel = float(scatter[:3].sum()), float(scatter[3:].sum())
         return (

@@ -53,18 +53,17 @@ def _unseen(
 def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:
     """White noise that grows with motion: scale and alignment errors act like it."""
     noise, f = config.noise, config.filter
+    gyro, accel = noise.gyro_noise, noise.accel_noise
     # What a saturated sensor missed is as unknown as what happens in a gap.
     if epoch.flags.gyro:
-        noise = replace(noise, gyro_noise=max(noise.gyro_noise, f.gap_gyro_noise))
+        gyro = max(gyro, f.gap_gyro_noise)
     if epoch.flags.accel:
-        noise = replace(noise, accel_noise=max(noise.accel_noise, f.gap_accel_noise))
-    if f.gyro_motion_noise == 0.0 and f.accel_motion_noise == 0.0:
-        return noise
-    rate = math.sqrt(float(np.square(epoch.gyro).sum() / len(epoch.gyro)))
-    excess = np.linalg.norm(epoch.accel, axis=1) - config.gravity
-    motion = math.sqrt(float(np.square(excess).mean()))
-    return replace(
-        noise,
-        gyro_noise=math.hypot(noise.gyro_noise, f.gyro_motion_noise * rate),
-        accel_noise=math.hypot(noise.accel_noise, f.accel_motion_noise * motion),
-    )
+        accel = max(accel, f.gap_accel_noise)
+    if f.gyro_motion_noise > 0.0:
+        rate = math.sqrt(float(np.vdot(epoch.gyro, epoch.gyro)) / len(epoch.gyro))
+        gyro = math.hypot(gyro, f.gyro_motion_noise * rate)
+    if f.accel_motion_noise > 0.0:
+        excess = np.sqrt(np.einsum("ni,ni->n", epoch.accel, epoch.accel)) - config.gravity
+        motion = math.sqrt(float(excess @ excess) / len(excess))
+        accel = math.hypot(accel, f.accel_motion_noise * motion)
+    return ImuNoise(gyro, accel, noise.gyro_walk, noise.accel_walk)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -204,10 +206,13 @@ def test_noise_is_that_of_perturbed_samples() -> None:
     )
 
 
-def test_noise_scale_acts_on_the_white_noise_alone() -> None:
+def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
     x = state()
-    plain = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY).linearise(*x).noise
-    scaled = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY, 3.0).linearise(*x).noise
+    loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
+    plain, scaled = (
+        preintegrate(*samples(200), x[3], x[4], noise, GRAVITY).linearise(*x).noise
+        for noise in (NOISE, loud)
+    )
     np.testing.assert_allclose(np.diag(scaled)[:9], 9.0 * np.diag(plain)[:9], rtol=0.02)
     np.testing.assert_array_equal(scaled[9:, 9:], plain[9:, 9:])
 
