@@ -7,50 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import CONFIG, FILTER, NOISE, VELOCITY, Broken, ate, stream, streamed_off
 
-from stario.fusion import Navigator, NavState, Track
-from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion import Navigator, Track
+from stario.fusion.config import NavigatorConfig
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import align, evaluate_track, pose_errors
-from stario.sequences.noise import ImuNoise
+from stario.sequences.metrics import align
 from stario.sequences.sequence import ImuSequence
 
-# Settings that fit the oracle and the simulated phone; the defaults fit networks and real ones.
-FILTER = FilterConfig(
-    update_rate=10,
-    covariance_scale=1.0,
-    gyro_bias_sigma=3e-3,
-    accel_bias_sigma=0.05,
-    accel_motion_noise=0.0,
-)
-NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
-CONFIG = NavigatorConfig(NOISE, FILTER)
-VELOCITY = NavigatorConfig(NOISE, replace(FILTER, measurement="velocity"))
-
 Make = Callable[..., Any]
-
-
-def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
-    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
-    states = [navigator.push(*row) for row in rows]
-    return [state for state in states if state is not None]
-
-
-def streamed_off(states: list[NavState], track: Track) -> float:
-    """Largest distance [m] between a stream's states and the track, at the stream's times."""
-    rows = np.searchsorted(track.time, [s.time for s in states])
-    np.testing.assert_array_equal(track.time[rows], [s.time for s in states])
-    position = np.array([s.p_W for s in states])
-    return float(np.linalg.norm(track.trajectory.position_W[rows] - position, axis=1).max())
-
-
-def ate(track: Track, sequence: ImuSequence) -> float:
-    return evaluate_track(track.trajectory, sequence.truth).ate_m
-
-
-def final_error(track: Track, sequence: ImuSequence) -> float:
-    error = pose_errors(align(track.trajectory, sequence.truth, "first"), sequence.truth)
-    return float(np.linalg.norm(error.position_W[-1]))
 
 
 @pytest.fixture(scope="module")
@@ -98,22 +63,6 @@ def test_states_stay_finite_under_bursts_of_nan(walk: ImuSequence, make_oracle: 
             assert np.isfinite(value).all()
         assert np.linalg.eigvalsh(state.covariance).min() > -1e-9
     assert len(navigator.health.gaps) > 5
-
-
-class Broken:
-    """A network that answers with what no filter can use, one window in three."""
-
-    def __init__(self, inner: Any, mean: float, variance: float) -> None:
-        self.inner, self.mean, self.variance, self.count = inner, mean, variance, 0
-
-    def predict(self, windows):
-        mean, covariance = self.inner.predict(windows)
-        for k in range(len(mean)):
-            self.count += 1
-            if self.count % 3 == 0:
-                mean[k, 0] += self.mean
-                covariance[k, 0, 0] = self.variance
-        return mean, covariance
 
 
 @pytest.mark.parametrize(

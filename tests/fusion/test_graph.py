@@ -9,41 +9,28 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import GRAPH as CONFIG
+from support import Broken, ate
 
-from stario.fusion import Navigator, Track
+from stario.fusion import Navigator
 from stario.fusion.backends import score_walk, summary
-from stario.fusion.config import FilterConfig, NavigatorConfig, config_from_dict
+from stario.fusion.config import NavigatorConfig, config_from_dict
 from stario.fusion.fixes import heading_fix, position_fix, velocity_fix
 from stario.fusion.graph import IndeterminateError, KeyframeGraph
 from stario.fusion.preintegration import preintegrate
 from stario.fusion.recipe import PriorPose
 from stario.fusion.state import NavState
 from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.metrics import evaluate_track, position_nees
+from stario.sequences.metrics import position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
 
-NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
-CONFIG = NavigatorConfig(
-    NOISE,
-    FilterConfig(
-        covariance_scale=1.0,
-        gyro_bias_sigma=3e-3,
-        accel_bias_sigma=0.05,
-        accel_motion_noise=0.0,
-    ),
-)
-
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
     return Navigator(model, config, backend="graph", **more)
-
-
-def ate(track: Track, sequence: ImuSequence, alignment: str = "first") -> float:
-    return evaluate_track(track.trajectory, sequence.truth, alignment=alignment).ate_m
 
 
 # --- what it is good for ---------------------------------------------------------------------
@@ -175,22 +162,6 @@ def test_a_perfect_sensor_is_no_reason_to_fail(walk: ImuSequence, make_oracle: M
 
 
 # --- bad input -------------------------------------------------------------------------------
-
-
-class Broken:
-    """Answers with what no estimator can use, one window in three."""
-
-    def __init__(self, inner: Any, mean: float, variance: float) -> None:
-        self.inner, self.mean, self.variance, self.count = inner, mean, variance, 0
-
-    def predict(self, windows):
-        mean, covariance = self.inner.predict(windows)
-        for k in range(len(mean)):
-            self.count += 1
-            if self.count % 3 == 0:
-                mean[k, 0] += self.mean
-                covariance[k, 0, 0] = self.variance
-        return mean, covariance
 
 
 @pytest.mark.parametrize(("mean", "variance"), [(np.nan, 1e-4), (0.0, np.inf), (0.0, -1.0)])

@@ -10,29 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import GRAPH as CONFIG
+from support import stream
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.graph import IndeterminateError, KeyframeGraph
 from stario.fusion.recipe import PriorPose
-from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
-
-NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
-CONFIG = NavigatorConfig(
-    NOISE,
-    FilterConfig(
-        covariance_scale=1.0, gyro_bias_sigma=3e-3, accel_bias_sigma=0.05, accel_motion_noise=0.0
-    ),
-)
-
-
-def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
-    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
-    return [s for row in rows if (s := navigator.push(*row)) is not None]
 
 
 def lagged(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:

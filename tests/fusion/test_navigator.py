@@ -7,52 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import CONFIG, VELOCITY, ate, stream, streamed_off
 
-from stario.fusion import Navigator, NavState, PriorPose, Track
+from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.tracks import inertial_track
-from stario.sequences.metrics import align, evaluate_track, pose_errors, position_nees
+from stario.sequences.metrics import align, pose_errors, position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulate import PERFECT_IMU, ImuErrors
 
-# Settings that fit the oracle and the simulated phone; the defaults fit networks and real ones.
-FILTER = FilterConfig(
-    update_rate=10,
-    covariance_scale=1.0,
-    gyro_bias_sigma=3e-3,
-    accel_bias_sigma=0.05,
-    accel_motion_noise=0.0,
-)
-NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
-CONFIG = NavigatorConfig(NOISE, FILTER)
-VELOCITY = NavigatorConfig(NOISE, replace(FILTER, measurement="velocity"))
-
 Make = Callable[..., Any]
-
-
-def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
-    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
-    states = [navigator.push(*row) for row in rows]
-    return [state for state in states if state is not None]
-
-
-def streamed_off(states: list[NavState], track: Track) -> float:
-    """Largest distance [m] between a stream's states and the track, at the stream's times."""
-    rows = np.searchsorted(track.time, [s.time for s in states])
-    np.testing.assert_array_equal(track.time[rows], [s.time for s in states])
-    position = np.array([s.p_W for s in states])
-    return float(np.linalg.norm(track.trajectory.position_W[rows] - position, axis=1).max())
-
-
-def ate(track: Track, sequence: ImuSequence) -> float:
-    return evaluate_track(track.trajectory, sequence.truth).ate_m
-
-
-def final_error(track: Track, sequence: ImuSequence) -> float:
-    error = pose_errors(align(track.trajectory, sequence.truth, "first"), sequence.truth)
-    return float(np.linalg.norm(error.position_W[-1]))
 
 
 @pytest.fixture(scope="module")
