@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-    from stario.fusion.intake import Epoch
+    from stario.fusion.epochs import Epoch
 
 FixKind = Literal["position", "heading", "velocity"]
 

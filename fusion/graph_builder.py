@@ -10,11 +10,11 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.epochs import Epoch
 from stario.fusion.fixes import Fix, cut
 from stario.fusion.graph import KeyframeGraph
 from stario.fusion.graph_terms import Displacement, GyroBias, Heading, Position, Term, Velocity
 from stario.fusion.history import Measurement
-from stario.fusion.intake import Epoch
 from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.preintegration import Segment

@@ -12,11 +12,11 @@ from typing import Any
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
+from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.fixes import Fix
 from stario.fusion.graph import IndeterminateError
 from stario.fusion.graph_builder import GraphBuilder
 from stario.fusion.history import Measurement
-from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.recipe import FilterRecipe, PriorPose
 from stario.fusion.state import Health, Innovations, NavState
 

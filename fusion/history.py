@@ -15,8 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from stario.fusion.epochs import Epoch
 from stario.fusion.fixes import Fix, by_time
-from stario.fusion.intake import Epoch
 from stario.fusion.lie import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 

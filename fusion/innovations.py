@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.engine import UpdateResult
-from stario.fusion.intake import IntakeCounts
+from stario.fusion.epochs import IntakeCounts
 from stario.fusion.state import Health, Innovations, NavState
 
 

@@ -20,11 +20,12 @@ from stario.fusion.along_track import AlongTrack
 from stario.fusion.along_track import Predictor as Predictor
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.epochs import Epoch, Start
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
 from stario.fusion.graph_batch import smooth
 from stario.fusion.graph_builder import Taken
 from stario.fusion.graph_lag import GraphRecipe
-from stario.fusion.intake import Epoch, Intake, Start, all_epochs
+from stario.fusion.intake import Intake, all_epochs
 from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track, track_from_states

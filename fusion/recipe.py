@@ -18,11 +18,11 @@ from scipy.stats import chi2
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import GateMode, UpdateResult
+from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.fixes import Fix, parts
 from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
 from stario.fusion.innovations import InnovationLog, count, is_gated
-from stario.fusion.intake import Epoch, IntakeCounts, Start
 from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import exp_so3
 from stario.fusion.preintegration import Segment

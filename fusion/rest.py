@@ -22,7 +22,7 @@ from collections import deque
 
 import numpy as np
 
-from stario.fusion.intake import Epoch
+from stario.fusion.epochs import Epoch
 from stario.fusion.jacobians import Block
 from stario.fusion.lie import FloatArray
 from stario.sequences.noise import ImuNoise

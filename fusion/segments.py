@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.intake import Epoch
+from stario.fusion.epochs import Epoch
 from stario.fusion.preintegration import Segment, preintegrate
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
+from stario.sequences.boxes import box_of, excess, frame_around, rounds, size_of
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.metrics import PoseErrors, pose_errors
@@ -79,27 +80,27 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     """
     ways = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
     way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
-    boxes = {name: _box(way) for name, way in ways.items() if np.isfinite(way).any()}
+    boxes = {name: box_of(way) for name, way in ways.items() if np.isfinite(way).any()}
     if way_truth is not None and np.isfinite(way_truth[1]).any():
         way_home = way_truth[1]
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track that did not run away.
-        way_home = ways[sorted(boxes, key=lambda name: _size(boxes[name]))[(len(boxes) - 1) // 2]]
+        way_home = ways[sorted(boxes, key=lambda name: size_of(boxes[name]))[(len(boxes) - 1) // 2]]
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
-    home = _box(way_home)
-    near = [box for box in boxes.values() if _excess(box, home) <= 0.5 * _size(home)]
-    frame = _frame(np.array([home, *near]))
+    home = box_of(way_home)
+    near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
+    frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
-    fine = 0.6 if _rounds(way_home, home) > _CROWDED else 1.0
+    fine = 0.6 if rounds(way_home, home) > _CROWDED else 1.0
     if way_truth is not None:
         _draw_way(axes, way_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
         label, colour = _style(name, k)
-        far = _excess(box, home)
-        if far > 0.5 * _size(home):
+        far = excess(box, home)
+        if far > 0.5 * size_of(home):
             label += f" (leaves the figure, by {_distance(far)})"
         _draw_way(axes, ways[name], label, colour, width=1.3 * fine, order=3)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -316,24 +317,6 @@ def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     return ticks[:-1] + step / 2, np.where(known, speed, np.nan)
 
 
-def _box(way: FloatArray) -> FloatArray:
-    return np.array([np.nanmin(way, axis=0), np.nanmax(way, axis=0)])
-
-
-def _size(box: FloatArray) -> float:
-    return max(float(np.ptp(box, axis=0).max()), 1.0)
-
-
-def _excess(box: FloatArray, home: FloatArray) -> float:
-    """How far [m] one box reaches beyond another, in x or y."""
-    return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
-
-
-def _rounds(way: FloatArray, box: FloatArray) -> float:
-    """Length of a way over the size of its box: how often it comes by the same place."""
-    return float(np.nansum(np.linalg.norm(np.diff(way, axis=0), axis=1))) / _size(box)
-
-
 def _distance(metres: float) -> str:
     return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
 
@@ -345,15 +328,6 @@ def _draw_way(
     known = way[np.isfinite(way).all(axis=1)]
     axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
     axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
-
-
-def _frame(boxes: FloatArray) -> FloatArray:
-    """Corners (2, 2), lower left and upper right, of a frame around boxes (n, 2, 2)."""
-    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    half = np.maximum(0.5 * (high - low), 0.5) * 1.08
-    half = np.maximum(half, 0.6 * half.max())  # a straight way, too, gets a frame of some width
-    center = 0.5 * (low + high)
-    return np.array([center - half, center + half])
 
 
 def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:

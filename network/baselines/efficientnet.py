@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from stario.network.baselines.parts import ConvNorm, inverted_residuals
+from stario.network.baselines.parts import ConvNorm, inverted_residuals, mobile_head
 
 _ROWS = (
     (1, 16, 1, 1, 3),
@@ -31,12 +31,7 @@ class EfficientNetB0(nn.Module):
             ConvNorm(6, 32, 3, 2),
             nn.SiLU(),
             inverted_residuals(32, _ROWS, nn.SiLU),
-            ConvNorm(320, 1280),
-            nn.SiLU(),
-            nn.AdaptiveAvgPool1d(1),
-            nn.Flatten(),
-            nn.Dropout(0.5),
-            nn.Linear(1280, outputs),
+            mobile_head(320, nn.SiLU, outputs),
         )
 
     def forward(self, windows: Tensor) -> Tensor:

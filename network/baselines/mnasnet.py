@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from stario.network.baselines.parts import ConvNorm, inverted_residuals
+from stario.network.baselines.parts import ConvNorm, inverted_residuals, mobile_head
 
 _ROWS = (
     (3, 24, 3, 2, 3),
@@ -33,12 +33,7 @@ class MnasNet(nn.Module):
             nn.ReLU6(),
             ConvNorm(32, 16),
             inverted_residuals(16, _ROWS, nn.ReLU6),
-            ConvNorm(320, 1280),
-            nn.ReLU6(),
-            nn.AdaptiveAvgPool1d(1),
-            nn.Flatten(),
-            nn.Dropout(0.5),
-            nn.Linear(1280, outputs),
+            mobile_head(320, nn.ReLU6, outputs),
         )
 
     def forward(self, windows: Tensor) -> Tensor:

@@ -168,3 +168,15 @@ def inverted_residuals(
             blocks.append(InvertedResidual(inputs, width, expand, first, kernel, activation))
             inputs = width
     return nn.Sequential(*blocks)
+
+
+def mobile_head(inputs: int, activation: type[nn.Module], outputs: int) -> nn.Sequential:
+    """Features (B, C, L) of `inverted_residuals` to (B, outputs): 1280 channels, their mean."""
+    return nn.Sequential(
+        ConvNorm(inputs, 1280),
+        activation(),
+        nn.AdaptiveAvgPool1d(1),
+        nn.Flatten(),
+        nn.Dropout(0.5),
+        nn.Linear(1280, outputs),
+    )

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.intake import Epoch, Intake, IntakeCounts, all_epochs
+from stario.fusion.epochs import Epoch, IntakeCounts
+from stario.fusion.intake import Intake, all_epochs
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulate import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SECONDS, windows_of, world_streams

@@ -1,0 +1,174 @@
+"""The commands for many recordings: compare, evaluate, train, backends."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences.files import read_tum
+from stario.sequences.readers.own_csv import read_own_csv, write_csv
+
+# --- compare and evaluate ----------------------------------------------------------------------
+
+
+def test_compare_speaks_json_and_writes_the_same(stario, recording: Path, tmp_path: Path) -> None:
+    done = stario("compare", recording, "--out", "out", "--json")
+    assert done.code == 0
+    assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
+    assert (tmp_path / "out/walk/plan.png").stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
+    done = stario("compare", recording)
+    assert done.err == ""
+    for name in ("walk: 12.0 s", "inertial", "network", "network_true_attitude", "ekf"):
+        assert name in done.out
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "walk.csv").write_bytes(recording.read_bytes())
+    done = stario("compare", "a", "b", "--out", "out", "--json")
+    assert set(json.loads(done.out)["recordings"]) == {"walk", "walk-2"}
+    assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    sequence = read_own_csv(recording)
+    write_csv(tmp_path / "short.csv", sequence.slice(0.0, 1.0))
+    (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
+    for bad in ("short.csv", "broken.csv"):
+        done = stario("compare", bad, recording, "--out", "out", "--json")
+        assert done.code == 1
+        assert set(json.loads(done.out)["recordings"]) == {"walk"}
+        (line,) = done.err.splitlines()
+        assert line.startswith("stario: skipped: ")
+        assert bad.removesuffix(".csv") in line
+        stario("compare", bad, "--out", "none").assert_one_line_error(bad.removesuffix(".csv"))
+        assert not (tmp_path / "none").exists()
+
+
+def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_path: Path) -> None:
+    done = stario("evaluate", recording)
+    assert done.code == 0
+    assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
+    done = stario("evaluate", recording, "--json")
+    assert json.loads(done.out)["over_recordings"]["ekf"]["ate_m"]["median"] > 0.0
+    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    stario("evaluate", "blind.csv").assert_one_line_error("truth")
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_batch_goes_on_past_what_fails_and_says_so(
+    stario, recording: Path, tmp_path: Path, jobs: int
+) -> None:
+    walk = read_own_csv(recording)
+    write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
+    write_csv(tmp_path / "blind.csv", walk.without_truth())
+    (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
+    (tmp_path / "list.txt").write_text("deg.csv\nnosuch.csv\n\nblind.csv\nbroken.csv\n")
+    done = stario(
+        "evaluate", recording, "list.txt", "missing", recording, "--jobs", jobs,
+        "--out", "out", "--json",
+    )  # fmt: skip
+    assert done.code == 1
+    figures = json.loads(done.out)
+    assert set(figures["recordings"]) == {"walk", "walk-2"}
+    assert json.loads((tmp_path / "out/metrics.json").read_text())["recordings"].keys() == {
+        "walk", "walk-2"
+    }  # fmt: skip
+    lines = done.err.splitlines()
+    assert all(line.startswith("stario: skipped: ") for line in lines)
+    reasons = ("--gyro-unit", "nosuch.csv", "an empty entry", "truth", "ax: found 'x'", "missing")
+    assert len(lines) == len(reasons)
+    for reason in reasons:
+        assert sum(reason in line for line in lines) == 1
+
+
+# --- train -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path: Path) -> None:
+    settings = {"epoch_windows": 64, "batch": 32, "epochs": 1}
+    (tmp_path / "tiny.json").write_text(json.dumps(settings))
+    done = stario(
+        "train", recording, "--generated", 1, "--config", "tiny.json", "--out", "trained",
+        "--seed", 3,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    weights = Path(done.out.strip())
+    assert weights == Path("trained/model.safetensors")
+    assert "epoch 1" in done.err
+    card = json.loads((tmp_path / "trained/model.json").read_text())
+    assert card["recipe"]["seed"] == 3
+    assert any("recorded" in words for words in card["trained_on"])
+    assert stario("run", recording, "--model", weights, "--out", "out").code == 0
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(bytes(content))
+    stario("run", recording, "--model", weights).assert_one_line_error("model.safetensors")
+
+
+def test_training_goes_on_past_what_fails_and_keeps_its_windows(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
+    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
+    call = ("train", recording, "list.txt", "--generated", 1, "--config", "tiny.json")
+    done = stario(*call, "--out", "a", "--cache", "kept")
+    assert done.code == 1
+    assert Path(done.out.strip()) == Path("a/model.safetensors")
+    lines = [line for line in done.err.splitlines() if line.startswith("stario: skipped")]
+    assert len(lines) == 2
+    assert "nosuch.csv" in lines[0]
+    assert "blind: truth" in lines[1]
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
+    assert len(kept) == 2  # the recording's and the generated walk's
+    assert stario(*call, "--out", "b", "--cache", "kept").code == 1
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()} == kept
+    first, second = ((tmp_path / out / "model.safetensors").read_bytes() for out in "ab")
+    assert first == second
+
+
+def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
+    stario("train", "missing.csv").assert_one_line_error("missing.csv", "nothing there")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_run_with_the_graph_names_its_track(
+    stario, recording: Path, tmp_path: Path, undrawn
+) -> None:
+    done = stario("run", recording, "--backend", "graph", "--out", "out", "--json")
+    assert done.code == 0
+    assert json.loads(done.out)["graph"]["ate_m"] > 0.0
+    assert len(read_tum(tmp_path / "out" / "graph.tum").time) > 100
+    notes = json.loads((tmp_path / "out" / "health.json").read_text())["notes"]
+    assert notes[0].startswith("graph of")
+
+
+def test_an_unknown_back_end_is_one_line(stario, recording: Path) -> None:
+    done = stario("run", recording, "--backend", "ukf")
+    assert done.code == 1
+    assert "backend: found 'ukf'" in done.err
+    assert len(done.err.strip().splitlines()) == 1
+
+
+def test_backends_compares_filter_and_graph(stario) -> None:
+    done = stario("backends", "--walks", "1", "--seconds", "10", "--json")
+    assert done.code == 0
+    content = json.loads(done.out)
+    assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
+    assert content["scores"][0]["name"] == "walk 0"
