@@ -32,6 +32,7 @@ from stario.fusion.jacobians import (
 )
 from stario.fusion.lie import FloatArray, exp_times, skew
 from stario.fusion.preintegration import CORE, Segment
+from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
@@ -118,6 +119,12 @@ class StateCloningEkf(ErrorStateEngine):
     def core_covariance(self) -> FloatArray:
         """Covariance (15, 15) of the right-invariant error theta, rho_v, rho_p, d_bg, d_ba."""
         return np.array(self.P[:CORE, :CORE])
+
+    def state(self, in_gap: bool = False, world: int = 0) -> NavState:
+        """The newest state as callers get it."""
+        covariance = self.world_covariance()
+        core = self.R_WB, self.v_W, self.p_W, self.b_g, self.b_a
+        return NavState(self.time, *core, covariance, in_gap, world)
 
     def world_covariance(self) -> FloatArray:
         """Covariance (15, 15) in plain terms.

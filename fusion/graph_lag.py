@@ -73,18 +73,7 @@ class GraphRecipe:
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
-        ahead = self._ahead
-        return NavState(
-            time=ahead.time,
-            R_WB=ahead.R_WB,
-            v_W=ahead.v_W,
-            p_W=ahead.p_W,
-            b_g=ahead.b_g,
-            b_a=ahead.b_a,
-            covariance=ahead.world_covariance(),
-            in_gap=in_gap,
-            world=self._world,
-        )
+        return self._ahead.state(in_gap, self._world)
 
     def innovations(self) -> Innovations:
         """Those of the filter alongside."""

@@ -172,18 +172,7 @@ class FilterRecipe:
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
-        ekf = self.ekf
-        return NavState(
-            time=ekf.time,
-            R_WB=ekf.R_WB,
-            v_W=ekf.v_W,
-            p_W=ekf.p_W,
-            b_g=ekf.b_g,
-            b_a=ekf.b_a,
-            covariance=ekf.world_covariance(),
-            in_gap=in_gap,
-            world=len(self._world.changes),
-        )
+        return self.ekf.state(in_gap, len(self._world.changes))
 
     @property
     def world_changes(self) -> list[WorldChange]:
