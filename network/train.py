@@ -74,7 +74,8 @@ def train(
         Path of the model's weights.
 
     Raises:
-        InputError: no stretch to learn from or to validate on.
+        InputError: no stretch to learn from or to validate on, or the loss of a step is not
+            finite. The folder then holds the last epoch's checkpoint, as it was.
         ConfigError: the checkpoint belongs to another recipe, or the batch cannot be shared out to
             the processes that the launcher started.
     """
@@ -163,11 +164,27 @@ class _Run:
         loss = loss_with_sigma(squared, log_sigma) if likelihood else squared.sum(1).mean()
         self.optimiser.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        self._check_finite(float(loss.detach()), float(norm))
         self.optimiser.step()
         self.step += 1
         self._average()
         return float(squared.detach().sum(1).mean())
+
+    def _check_finite(self, loss: float, norm: float) -> None:
+        """Stop before a step that would spoil every weight.
+
+        The gradient's norm is looked at as well: it is infinite one step before the loss is, and
+        the processes have it in common, so that all of them stop.
+        """
+        if math.isfinite(loss) and math.isfinite(norm):
+            return
+        raise InputError(
+            "loss",
+            f"{loss:g} with a gradient of norm {norm:g} in step {self.step + 1}",
+            "finite numbers",
+            f"train in another folder with a `rate` below {self.config.rate:g}",
+        )
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -180,13 +197,13 @@ class _Run:
                 value.copy_(current[name])
 
     def epochs_since_best(self) -> int:
-        """Epochs since the smallest validation error.
+        """Epochs since the smallest validation error; one that is not finite is never smaller.
 
         Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
         with it count.
         """
         first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
-        errors = [r.validation_error for r in self.history]
+        errors = [_or_infinite(r.validation_error) for r in self.history]
         if len(errors) >= first:
             errors = errors[first - 1 :]
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
@@ -204,7 +221,7 @@ class _Run:
     def record(self, report: EpochReport) -> None:
         """Keep the best weights and write checkpoint and log."""
         self.history.append(report)
-        if self.epochs_since_best() == 0:
+        if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
         if not self.workers.leads:
             return
@@ -286,6 +303,11 @@ def _sampler(
             raise InputError("streams", "none long enough", f"one of {reach} samples at 200 Hz")
         streams, weights = [s for s, _ in pairs], [w for _, w in pairs]
     return WindowSampler(streams, weights, config.augmentation, config.seed, config.successive)
+
+
+def _or_infinite(error: float) -> float:
+    """NumPy takes what is not a number for the smallest."""
+    return error if math.isfinite(error) else math.inf
 
 
 def _set_dropout(network: nn.Module, share: float) -> None:

@@ -2,6 +2,7 @@ import hashlib
 import json
 import math
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from stario.network.recipe import (
     training_config,
 )
 from stario.network.train import EpochReport, train
+from stario.network.validation import ValidationSet
 from stario.sequences.errors import ConfigError, InputError, ReadError, StarioError, WeightsError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream, windows_of
@@ -135,6 +137,44 @@ def test_a_killed_and_resumed_run_gives_the_same_weights(
     assert resumed.keys() == expected.keys()
     for name, value in expected.items():
         assert torch.equal(resumed[name], value), name
+
+
+@pytest.mark.parametrize(("spoilt", "kept"), [({3}, {4}), ({4}, {3}), ({3, 4}, {1, 2})])
+def test_an_epoch_without_a_finite_error_is_never_the_best(
+    finished: tuple[Path, list[EpochReport]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    spoilt: set[int],
+    kept: set[int],
+) -> None:
+    """The likelihood begins with epoch 3; with nothing of its own it keeps what was before."""
+    whole, epoch = ValidationSet.errors, count(1)
+
+    def errors(self: ValidationSet, network: DisplacementNetwork) -> dict[str, float]:
+        found = whole(self, network)
+        return found | {"c": math.nan} if next(epoch) in spoilt else found
+
+    monkeypatch.setattr(ValidationSet, "errors", errors)
+    model = load_model(run(tmp_path))
+    choice = [r.validation_by_recording for r in finished[1] if r.epoch in kept]
+    assert model.card.figures["validation_mse_m2"] in choice
+
+
+def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(tmp_path: Path) -> None:
+    spoilt = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
+
+    def spoil(report: EpochReport) -> None:
+        for stream in spoilt:
+            stream.imu_W[:] = np.nan
+
+    with pytest.raises(InputError, match=r"loss: found nan .* in step 9.*`rate` below 0\.001"):
+        train(TINY, spoilt, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=spoil)
+    state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
+    assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
+    assert not (tmp_path / "model.safetensors").exists()
+    reports: list[EpochReport] = []
+    run(tmp_path, on_epoch=reports.append)
+    assert [r.epoch for r in reports] == [2, 3, 4]
 
 
 def test_a_finished_run_is_not_trained_on(
