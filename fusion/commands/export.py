@@ -12,8 +12,15 @@ from stario.sequences.errors import InputError
 
 def export(
     model: Annotated[
-        str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
+        str,
+        typer.Option(
+            "--model",
+            help="Network: a name of `stario models`, default, or a weights file with its card.",
+        ),
     ] = "default",
+    runs: Annotated[
+        Path, typer.Option(help="Folder of training runs, where named networks are found.")
+    ] = Path("runs"),
     format: Annotated[str, typer.Option("--format", help="Format of the file: onnx.")] = "onnx",
     out: Annotated[
         Path | None, typer.Option("--out", help="File to write; else the network's name here.")
@@ -21,11 +28,11 @@ def export(
 ) -> None:
     """Export a network with its calibration; `--model FILE.onnx` then runs it anywhere."""
     from stario.network.export import export_onnx
-    from stario.network.model import load_model
+    from stario.network.model import load_model, weights_named
 
     if format != "onnx":
         raise InputError("--format", repr(format), "onnx")
-    loaded = load_model(model)
+    loaded = load_model(weights_named(model, runs))
     path = out or Path(f"{loaded.name}.onnx")
     if path.suffix != ".onnx":
         raise InputError("--out", str(path), "a name that ends in .onnx")

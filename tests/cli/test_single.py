@@ -10,11 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from stario.fusion.cli import app
 from stario.fusion.config import read_config
+from stario.network.architectures import build_network
+from stario.network.card import Card
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import save_model
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
@@ -215,6 +220,25 @@ def test_inspect_names_what_mends_a_recording(stario, recording: Path, tmp_path:
     assert mended["problems"] == []
     assert mended == json.loads((tmp_path / "runs/g/inspection.json").read_text())
     assert mended["rate_hz"] == pytest.approx(100.0)
+
+
+# --- export ------------------------------------------------------------------------------------
+
+
+def test_export_takes_a_networks_name(stario, tmp_path: Path) -> None:
+    """That of its run; StarIO without one is the default, another is told how to train."""
+    pytest.importorskip("onnx")
+    done = stario("export", "--model", "StarIO")
+    assert (done.code, done.out) == (0, "StarIO.onnx\n")
+    stario("export", "--model", "R-ResNet").assert_one_line_error(
+        "runs/R-ResNet/model.safetensors", "stario train --model 'R-ResNet'"
+    )
+    torch.manual_seed(0)
+    network = DisplacementNetwork(build_network("R-ResNet"))
+    save_model(tmp_path / "mine/R-ResNet/model.safetensors", network, Card(architecture="R-ResNet"))
+    done = stario("export", "--model", "R-ResNet", "--runs", "mine", "--out", "r.onnx")
+    assert done.code == 0, done.err
+    assert (tmp_path / "r.onnx").exists()
 
 
 # --- wrong input -------------------------------------------------------------------------------
