@@ -105,9 +105,9 @@ def heading_fix(time: float, yaw: Any, sigma: Any) -> Fix:
         InputError: a value is no number.
     """
     sigma = shaped("sigma", sigma, ())
-    return _fix(
-        time, "heading", np.atleast_1d(shaped("yaw", yaw, ())), np.reshape(sigma**2, (1, 1))
-    )
+    # A square alone would hide a wrong sign, which `fault` is to see.
+    variance = np.reshape(sigma * np.abs(sigma), (1, 1))
+    return _fix(time, "heading", np.atleast_1d(shaped("yaw", yaw, ())), variance)
 
 
 def by_time(fix: Fix) -> tuple[float, str]:

@@ -332,6 +332,26 @@ def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
     assert navigator.health.fixes == {"value that is not finite": 4}
 
 
+@pytest.mark.parametrize(
+    ("sigma", "reason"),
+    [
+        (-0.1, "covariance not positive definite"),
+        (0.0, "covariance not positive definite"),
+        (np.inf, "value that is not finite"),
+        (-np.inf, "value that is not finite"),
+    ],
+)
+def test_a_heading_whose_sigma_is_none_is_refused_and_counted(
+    walk: ImuSequence, model: Any, sigma: float, reason: str
+) -> None:
+    bad = heading_fix(5.0, 0.0, sigma)
+    assert Navigator(model, CONFIG).run(walk, fixes=[bad]).health.fixes == {reason: 1}
+    navigator = Navigator(model, CONFIG)
+    streamed(navigator, walk.slice(0.0, 2.0), [], 0.0)
+    navigator.update_heading(1.5, 0.0, sigma)
+    assert navigator.health.fixes == {reason: 1}
+
+
 def test_a_shape_that_does_not_fit_is_an_error_by_name(model: Any) -> None:
     navigator = Navigator(model, CONFIG)
     with pytest.raises(InputError, match="position"):
