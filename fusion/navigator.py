@@ -122,10 +122,10 @@ class Navigator:
             The newest state if this sample completed an update period, else None.
 
         Raises:
-            InputError: gyro or accel does not hold three numbers, or the first second's average
+            InputError: time is no number, gyro or accel does not hold three, or the first second's average
                 force cannot be gravity in m/s^2. The stream then begins anew.
         """
-        sample = (float(time), *_three("gyro", gyro), *_three("accel", accel))
+        sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
         for epoch in self._intake.push(sample):
             state = self._advance(epoch)
@@ -418,6 +418,13 @@ def _measurement(epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> Mea
     if epoch.suspect:
         covariance_N = SUSPECT_SCALE * covariance_N
     return d_N, floored(covariance_N, LEAST_SIGMA)
+
+
+def _seconds(time: float) -> float:
+    try:
+        return float(time)
+    except (TypeError, ValueError):
+        raise InputError("time", repr(time), "a number of seconds") from None
 
 
 def _three(name: str, value: Vector) -> tuple[float, float, float]:

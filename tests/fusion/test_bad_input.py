@@ -179,6 +179,12 @@ def test_a_sample_that_is_no_vector_is_refused_by_name(still_model: Any, vector:
         navigator.push(0.0, (0.0, 0.0, 0.0), vector)
 
 
+@pytest.mark.parametrize("time", ["x", None, (1.0, 2.0)])
+def test_a_time_that_is_no_number_is_refused_by_name(still_model: Any, time: Any) -> None:
+    with pytest.raises(InputError, match="time: found .*, expected a number"):
+        Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+
+
 def test_before_its_first_second_a_stream_has_no_state_but_a_report(
     walk: ImuSequence, still_model: Any
 ) -> None:
