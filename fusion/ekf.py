@@ -36,6 +36,11 @@ from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
+_FAR = 1e3
+"""Farther from the world's origin than this [m] positions are counted from a point nearby: in the
+right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
+digits for centimetres."""
+
 
 class StateCloningEkf(ErrorStateEngine):
     """Right-invariant EKF over the current state and `slots` cloned poses.
@@ -56,8 +61,9 @@ class StateCloningEkf(ErrorStateEngine):
         self.slots = slots
         self.time = math.nan
         # Row 0 is the current pose, row 1 + s the clone in slot s: one stack to correct at once.
-        # Columns R, v, p; a clone's v is not used and stays zero.
+        # Columns R, v, p; a clone's v is not used and stays zero. p is counted from the origin.
         self._X: FloatArray = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
+        self._origin_W = np.zeros(3)
         self._b_g = np.zeros(3)
         self._b_a = np.zeros(3)
         self._clone_time: list[float | None] = [None] * slots
@@ -77,7 +83,7 @@ class StateCloningEkf(ErrorStateEngine):
     @property
     def p_W(self) -> FloatArray:
         """Position (3,) [m]."""
-        return np.array(self._X[0, :, 4])
+        return np.asarray(self._X[0, :, 4] + self._origin_W)
 
     @property
     def b_g(self) -> FloatArray:
@@ -96,7 +102,8 @@ class StateCloningEkf(ErrorStateEngine):
             InputError: the slot holds no clone.
         """
         self._check_slot(slot)
-        return np.array(self._X[1 + slot, :, :3]), np.array(self._X[1 + slot, :, 4])
+        X = self._X[1 + slot]
+        return np.array(X[:, :3]), np.asarray(X[:, 4] + self._origin_W)
 
     def clone_covariance(self, slot: int) -> FloatArray:
         """Covariance (6, 6) of a clone's rotation about the world's axes [rad] and position [m].
@@ -171,10 +178,12 @@ class StateCloningEkf(ErrorStateEngine):
         check_covariance(covariance)
 
         self.time = checked("time", time, ()).item()
-        self._set_pose(R, arrays["v_W"], arrays["p_W"])
+        self._origin_W = arrays["p_W"] if np.linalg.norm(arrays["p_W"]) > _FAR else np.zeros(3)
+        p = arrays["p_W"] - self._origin_W
+        self._set_pose(R, arrays["v_W"], p)
         self._b_g, self._b_a = arrays["b_g"], arrays["b_a"]
         self._clone_time = [None] * self.slots
-        from_world = np.linalg.inv(world_from_invariant(arrays["v_W"], arrays["p_W"]))
+        from_world = np.linalg.inv(world_from_invariant(arrays["v_W"], p))
         core = from_world @ covariance @ from_world.T
         self.P[:] = 0.0
         self.P[:CORE, :CORE] = 0.5 * (core + core.T)
@@ -236,6 +245,9 @@ class StateCloningEkf(ErrorStateEngine):
             R: (3, 3) rotation about the vertical.
             shift: (3,) [m].
         """
+        origin = R @ self._origin_W + shift
+        self._origin_W = origin if np.linalg.norm(origin) > _FAR else np.zeros(3)
+        shift = origin - self._origin_W  # what is left of it for the poses
         self._X = R @ self._X
         self._X[:, :, 4] += shift
         A = np.eye(self.dim_x)
@@ -255,10 +267,11 @@ class StateCloningEkf(ErrorStateEngine):
             about_W: (3,) the point that stays [m].
             sigma: of the turn [rad].
         """
+        x, y, _ = about_W - self._origin_W
         N = np.zeros((self.dim_x, 1))
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
-            N[rho, 0], N[rho + 1, 0] = about_W[1], -about_W[0]  # -e3 x p
+            N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
         self._loosen(N, sigma)
 
     def loosen_position(self, sigma: float) -> None:
@@ -284,6 +297,7 @@ class StateCloningEkf(ErrorStateEngine):
         return {
             "time": self.time,
             "X": self._X.copy(),
+            "origin": self._origin_W,
             "b_g": self._b_g,
             "b_a": self._b_a,
             "P": self.P.copy(),
@@ -293,7 +307,7 @@ class StateCloningEkf(ErrorStateEngine):
     def rewind(self, checkpoint: dict[str, Any]) -> None:
         """Go back to a checkpoint of a filter with as many slots; the checkpoint stays usable."""
         self.time = checkpoint["time"]
-        self._X = checkpoint["X"].copy()
+        self._X, self._origin_W = checkpoint["X"].copy(), checkpoint["origin"]
         self._b_g, self._b_a = checkpoint["b_g"], checkpoint["b_a"]
         self.P = checkpoint["P"].copy()
         self._clone_time = list(checkpoint["clone_time"])
@@ -371,9 +385,9 @@ class StateCloningEkf(ErrorStateEngine):
         gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
         """Current position (3,) [m] with covariance (3, 3) [m^2]."""
-        predicted = self.p_W
-        blocks = position_jacobian(predicted)
-        return self.update_linear(p_W - predicted, blocks, covariance, gate, gate_mode)
+        predicted = self._X[0, :, 4]
+        residual, blocks = p_W - self._origin_W - predicted, position_jacobian(predicted)
+        return self.update_linear(residual, blocks, covariance, gate, gate_mode)
 
     def update_velocity_W(
         self,

@@ -69,6 +69,10 @@ class Fix:
     value: FloatArray
     covariance: FloatArray
 
+    def shifted(self, by: FloatArray) -> Fix:
+        """The fix in a world whose origin lies at -`by` (3,) [m]."""
+        return replace(self, value=self.value + by) if self.kind == "position" else self
+
     def fault(self) -> str:
         """Why it cannot be used; empty where it can."""
         numbers = (np.atleast_1d(self.time), self.value, self.covariance)

@@ -36,6 +36,9 @@ _MOVED = 1e-3
 _LOST_SIGMA = 1e5
 """Nobody walks so far, so fast or so biased: a state this uncertain [m, m/s, rad, ...] is free."""
 
+_LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
+"""Of a prior: smaller ones are rounding."""
+
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
 
 
@@ -141,7 +144,11 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Forget the keyframes before one, keeping what they say of it and of those behind it."""
+        """Forget the keyframes before one, keeping what they say of it and of those behind it.
+
+        Raises:
+            IndeterminateError: what is forgotten is not determined.
+        """
         old = [k for k in self._time if k < before]
         if not old:
             return
@@ -155,7 +162,10 @@ class KeyframeGraph:
                 linear.push_back(term.factor(self._values))
                 reached += [k for k in term.term.keyframes if k > before]
         keys = [key(k) for k in old for key in (X, V, B)]
-        _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+        try:
+            _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+        except RuntimeError as error:  # gtsam's way to report it
+            raise IndeterminateError(self._named(str(error))) from error
         self._factors = [item for item in self._factors if item[0] >= before]
         self._terms = [term for term in self._terms if term.first >= before]
         self._add_prior(self._marginal(range(before, max(reached) + 1), rest))
@@ -296,6 +306,9 @@ class _Whitened:
         residual, blocks = self.term.linearise(values)
         white = self.whitener @ residual
         squared = float(white @ white)
+        if not math.isfinite(squared):
+            kind = type(self.term).__name__.lower()
+            raise IndeterminateError(f"a {kind} that is not finite")
         return residual, blocks, (self.limit / squared) ** 0.5 if squared > self.limit else 1.0
 
     def factor(self, values: Any) -> Any:
@@ -309,9 +322,16 @@ def _prior(k: int, state: NavState) -> Prior:
     """A state's covariance as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
-    covariance = to_invariant @ state.covariance @ to_invariant.T
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    root = _root_information(to_invariant @ state.covariance @ to_invariant.T)
     return Prior(k, (about,), root, np.zeros(CORE))
+
+
+def _root_information(covariance: FloatArray) -> FloatArray:
+    """A root of the inverse; directions that rounding left without variance are given a little."""
+    scale = np.sqrt(np.maximum(covariance.diagonal(), _LEAST_VARIANCE))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    values = np.maximum(values, _LEAST_CORRELATED)
+    return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
 def _world_from_local(R_WB: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from stario.fusion.graph_builder import GraphBuilder, Taken
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.preintegration import Segment
 from stario.fusion.state import NavState
-from stario.fusion.world import UNKNOWN_YAW
+from stario.fusion.world import UNKNOWN_YAW, WorldChange
 
 _UNKNOWN_POSITION = 1e4
 """Standard deviation of a position that only fixes tell [m]."""
@@ -38,6 +38,7 @@ def smooth(
     filtered: Sequence[NavState],
     prior: NavState,
     taken: Sequence[Taken],
+    changes: Sequence[WorldChange],
     config: NavigatorConfig,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
@@ -46,22 +47,28 @@ def smooth(
         filtered: the filter's states in one world: the start and one for each epoch.
         prior: the start before any fix moved or turned the world.
         taken: what the filter took in, epoch by epoch.
+        changes: how fixes moved and turned the world since the start.
         config: noise, filter and graph settings.
 
     Returns:
         The graph's states with their marginal covariances; the filter's own where the graph does
         not determine one.
     """
-    builder = GraphBuilder(config, _loosened(filtered[0], prior))
-    for (epoch, measurement, fixes, held, segment), state in zip(taken, filtered[1:], strict=True):
-        builder.step(epoch, measurement, fixes, held, state, segment)
-    builder.close(filtered[-1])
+    origin = filtered[0].p_W  # near the track: see `StateCloningEkf`
+    local = [state.shifted(-origin) for state in filtered]
+    builder = GraphBuilder(config, _loosened(local[0], prior, changes))
+    for (epoch, measurement, fixes, held, segment), state in zip(taken, local[1:], strict=True):
+        near = [fix.shifted(-origin) for fix in fixes]
+        builder.step(epoch, measurement, near, held, state, segment)
+    builder.close(local[-1])
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:
         return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
     solved = {state.time: state for state in filled(builder.graph, builder.segments)}
-    states = [replace(solved[f.time], in_gap=f.in_gap, world=f.world) for f in filtered]
+    states = [
+        replace(solved[f.time], in_gap=f.in_gap, world=f.world).shifted(origin) for f in filtered
+    ]
     note = (
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
         f"{solution.weighed_down} measurements weighed down"
@@ -69,16 +76,18 @@ def smooth(
     return Smoothed(states, note)
 
 
-def _loosened(first: NavState, prior: NavState) -> NavState:
+def _loosened(first: NavState, prior: NavState, changes: Sequence[WorldChange]) -> NavState:
     """The prior in the last world: what fixes told of position and yaw is theirs to tell again."""
-    if first.world == prior.world:
-        return prior
+    changes = [change for change in changes if change.since <= first.time]
+    if not changes:
+        return replace(first, covariance=prior.covariance)
     turn = first.R_WB @ prior.R_WB.T
     to_last = np.kron(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), turn)
     to_last[9:, 9:] = np.eye(6)
     covariance = to_last @ prior.covariance @ to_last.T
-    covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
-    if not np.allclose(turn, np.eye(3)):
+    if any(change.placed for change in changes):
+        covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
+    if not all(change.placed for change in changes):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)
 

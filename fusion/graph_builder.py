@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.epochs import Epoch
-from stario.fusion.fixes import Fix, cut
+from stario.fusion.fixes import Fix
 from stario.fusion.graph import KeyframeGraph
 from stario.fusion.graph_terms import Displacement, GyroBias, Heading, Position, Term, Velocity
 from stario.fusion.history import Measurement
@@ -21,10 +21,11 @@ from stario.fusion.preintegration import Segment
 from stario.fusion.recipe import Held
 from stario.fusion.segments import segment_of
 from stario.fusion.state import NavState
+from stario.fusion.suspects import Flags
 from stario.sequences.windows import WINDOW_SECONDS
 
 _SAME_TIME = 1e-6
-"""A fix this close to a keyframe [s] measures it."""
+"""A fix this close to a keyframe [s] is at it."""
 
 Pose = tuple[FloatArray, FloatArray, FloatArray]
 """R_WB (3, 3), v_W (3,), p_W (3,)."""
@@ -44,8 +45,8 @@ class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
     Keyframes stand where windows begin and end, one a second or two where updates come in even
-    number, at both ends of a gap and at the times of fixes that come in time. More of them bring
-    nothing: the IMU binds them as well over half a second as over a tenth.
+    number, and at both ends of a gap. More of them bring nothing: the IMU binds them as well over
+    half a second as over a tenth, and tells what lies between a keyframe and a fix.
 
     Args:
         config: noise, filter and graph settings.
@@ -107,20 +108,16 @@ class GraphBuilder:
             return True
         self.count = 0 if epoch.gap else self.count + 1
         self._append(epoch, segment)
-        inside = [fix for fix in fixes if fix.time < epoch.stop - _SAME_TIME]
-        for fix in inside:
-            self.fix(fix)
         due = self.count % self._spacing == 0
-        if due or len(inside) < len(fixes):
-            self.close(guess)
         if due:
+            self.close(guess)
             began = self._joints.get(self.count - self._window)
             if measurement is not None and began is not None:
                 self._measure(began, epoch, *measurement)
             self._joints[self.count] = self.graph.last
             if held is not None:
                 self._hold_still(held)
-        for fix in fixes[len(inside) :]:
+        for fix in fixes:
             self.fix(fix)
         return self.graph.last > before
 
@@ -141,27 +138,24 @@ class GraphBuilder:
         self.segments[graph.add_keyframe(whole, guess)] = []
 
     def fix(self, fix: Fix) -> bool:
-        """Take in a fix; False where it is older than the graph.
-
-        Behind the last keyframe it makes one of its own; between older ones it measures the one
-        before it, the IMU telling what lies between.
-        """
+        """Take in a fix up to now, which measures the keyframe before it; False where none is."""
         graph = self.graph
-        if fix.time > graph.time(graph.last) + _SAME_TIME:
-            self._split(fix.time)
-        held = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
-        if not held:
+        before = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
+        if not before:
             return False
-        graph.add(self._fix_term(fix, held[-1]))
+        graph.add(self._fix_term(fix, before[-1]))
         return True
 
     def forget(self, time: float) -> None:
-        """Marginalise the keyframes before a time [s], up to where windows meet."""
-        old = [k for k in self._joints.values() if self.graph.time(k) <= time]
-        joint = max(old, default=0)
-        self.graph.marginalise(joint)
-        self._joints = {n: k for n, k in self._joints.items() if k >= joint}
-        self.segments = {k: pieces for k, pieces in self.segments.items() if k >= joint}
+        """Marginalise the keyframes before the last one up to a time [s].
+
+        Raises:
+            IndeterminateError: they are not determined.
+        """
+        first = max((k for k in self.graph.keyframes if self.graph.time(k) <= time), default=0)
+        self.graph.marginalise(first)
+        self._joints = {n: k for n, k in self._joints.items() if k >= first}
+        self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
 
     def dump(self) -> dict[str, Any]:
         """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
@@ -206,17 +200,6 @@ class GraphBuilder:
         self.segments[self.graph.last].append(segment)
         self._pending.append(epoch)
 
-    def _split(self, time: float) -> None:
-        """Make a keyframe at a time within the epochs since the last one."""
-        before, after = _cut_at(self._pending, time)
-        self._pending = []
-        self.segments[self.graph.last] = []
-        for epoch in before:
-            self._append(epoch)
-        self.close()
-        for epoch in after:
-            self._append(epoch)
-
     def _measure(self, i: int, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if not _usable(d_N, covariance):
@@ -236,10 +219,12 @@ class GraphBuilder:
         dt = fix.time - graph.time(k)
         R_k, v_k, p_k, _, _ = graph.pose(k)
         R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.reckoned(k, fix.time)
+        drift = self._config.noise.accel_noise**2 * max(dt, 0.0) * np.eye(3)  # of what the IMU adds
         if fix.kind == "position":
-            return Position(k, fix.value, fix.covariance, dt, p - p_k - dt * v_k)
+            covariance = fix.covariance + dt**2 / 3.0 * drift
+            return Position(k, fix.value, covariance, dt, p - p_k - dt * v_k)
         if fix.kind == "velocity":
-            return Velocity(k, fix.value, fix.covariance, v - v_k)
+            return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
         turn = np.array([0.0, 0.0, fix.value[0] - yaw_twist(R)])
         return Heading(k, exp_so3(turn) @ R_k, fix.covariance)
 
@@ -258,22 +243,6 @@ def _part_of_way(start: Pose, end: Pose, share: float, duration: float) -> Pose:
     return exp_so3(share * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * share * duration * (v0 + v)
 
 
-def _cut_at(epochs: Sequence[Epoch], time: float) -> tuple[list[Epoch], list[Epoch]]:
-    """Epochs before and after a time [s]; the one it falls into is cut."""
-    before: list[Epoch] = []
-    after: list[Epoch] = []
-    for epoch in epochs:
-        if epoch.stop <= time + _SAME_TIME:
-            before.append(epoch)
-        elif epoch.start >= time - _SAME_TIME:
-            after.append(epoch)
-        else:
-            first, second = cut(epoch, time)
-            before.append(first)
-            after.append(second)
-    return before, after
-
-
 def _merged(epochs: Sequence[Epoch]) -> Epoch:
     """Epochs without gaps as one; each begins with the sample that ended the one before."""
     first, rest = epochs[0], epochs[1:]
@@ -288,4 +257,5 @@ def _merged(epochs: Sequence[Epoch]) -> Epoch:
         gap=False,
         attitudes=first.attitudes,
         R_NB=epochs[-1].R_NB,
+        flags=Flags(any(e.flags.gyro for e in epochs), any(e.flags.accel for e in epochs)),
     )

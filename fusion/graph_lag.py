@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
@@ -43,6 +45,7 @@ class GraphRecipe:
         self._fallbacks = 0
         self._why = ""
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
+        self._origin_W = np.zeros(3)  # of the graph's positions: see `StateCloningEkf`
         self._builder: GraphBuilder
         self._begin(self._filter.state(), 0)
 
@@ -54,7 +57,8 @@ class GraphRecipe:
         if state.world != self._world or epoch.anew is not None:
             self._begin(state, 0 if epoch.gap else self._builder.count + 1)
             return self.state(in_gap=epoch.gap)
-        if self._builder.step(epoch, measurement, fixes, self._filter.held):
+        accepted = [fix.shifted(-self._origin_W) for fix in self._filter.accepted]
+        if self._builder.step(epoch, measurement, accepted, self._filter.held):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -67,13 +71,15 @@ class GraphRecipe:
         state = self._filter.state()
         if state.world != self._world:
             self._begin(state, self._builder.count)
-        elif self._builder.fix(fix):
+        elif any(taken is fix for taken in self._filter.accepted) and self._builder.fix(
+            fix.shifted(-self._origin_W)
+        ):
             self._solve()
         return True
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
-        return self._ahead.state(in_gap, self._world)
+        return self._ahead.state(in_gap, self._world).shifted(self._origin_W)
 
     def innovations(self) -> Innovations:
         """Those of the filter alongside."""
@@ -93,6 +99,7 @@ class GraphRecipe:
             "filter": self._filter.dump(),
             "builder": self._builder.dump(),
             "ahead": self._ahead.checkpoint(),
+            "origin": self._origin_W,
             "world": self._world,
             "fallbacks": self._fallbacks,
             "why": self._why,
@@ -103,12 +110,13 @@ class GraphRecipe:
         self._filter.load(dump["filter"])
         self._builder.load(dump["builder"])
         self._ahead.rewind(dump["ahead"])
-        self._world = dump["world"]
+        self._world, self._origin_W = dump["world"], dump["origin"]
         self._fallbacks, self._why = dump["fallbacks"], dump["why"]
 
     def _begin(self, first: NavState, count: int) -> None:
         """A new graph from a state of the filter."""
-        self._world = first.world
+        self._world, self._origin_W = first.world, first.p_W
+        first = first.shifted(-self._origin_W)
         self._builder = GraphBuilder(self._config, first, count)
         self._take(first)
 

@@ -301,7 +301,7 @@ class Navigator:
             states.append(recipe.step(epoch, measurement, due))
             if recipe.smoothed is not None and (not poses or recipe.smoothed is not poses[-1]):
                 poses.append(recipe.smoothed)
-            taken.append(Taken(epoch, measurement, due, recipe.held, recipe.segment))
+            taken.append(Taken(epoch, measurement, recipe.accepted, recipe.held, recipe.segment))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
@@ -309,7 +309,7 @@ class Navigator:
         prior, states = states[0], in_last_world(states, recipe.world_changes)
         notes = []
         if self.backend == "graph":
-            whole = smooth(states, prior, taken, self.config)
+            whole = smooth(states, prior, taken, recipe.world_changes, self.config)
             states, notes, poses = whole.states, [whole.note], []
         health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
         track = track_from_states(

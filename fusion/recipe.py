@@ -101,6 +101,7 @@ class FilterRecipe:
             where mean velocities are measured.
         held: what the last step measured at rest, None where it moved or was refused.
         segment: the last step's samples, None where fixes cut them.
+        accepted: fixes that the last call of `step` or `late_fix` took in, in order.
     """
 
     def __init__(
@@ -124,6 +125,7 @@ class FilterRecipe:
         self._rest = RestDetector(per_window, f.rest_noise)
         self.held: Held | None = None
         self.segment: Segment | None = None
+        self.accepted: list[Fix] = []
         self.smoothed: SmoothedPose | None = None
         self._gated_since: float | None = None
         self._world = WorldFrame(
@@ -149,6 +151,7 @@ class FilterRecipe:
         if self._history is not None:
             before = self.checkpoint() if self._history.due() else None
             self._history.add(Step(epoch, measurement, list(fixes), before))
+        self.accepted = []
         self._step(epoch, measurement, fixes)
         return self.state(in_gap=epoch.gap)
 
@@ -159,7 +162,7 @@ class FilterRecipe:
         """
         if self._history is None or fix.time < max(self._start, self.ekf.time - WINDOW_SECONDS):
             return False
-        done = False
+        done, self.accepted = False, []
         for step in self._history.insert(fix):
             if not done:
                 assert step.before is not None  # the first one has it
@@ -270,6 +273,7 @@ class FilterRecipe:
         turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
         R_WB, b_g, b_a = turn @ start.R_WB, ekf.b_g, ekf.b_a
         ekf.initialise(epoch.stop, R_WB, np.zeros(3), ekf.p_W, b_g, b_a, covariance)
+        self._world.lose_yaw(ekf)
 
     def _propagate(self, epoch: Epoch) -> None:
         ekf, p_W = self.ekf, self.ekf.p_W
@@ -280,10 +284,13 @@ class FilterRecipe:
             self._velocity_steps.append(ekf.v_W - before)
         if epoch.gap:
             ekf.loosen_yaw(p_W, min(GAP_TURN * (epoch.stop - epoch.start), UNKNOWN_YAW))
+            self._world.lose_yaw(ekf)
 
     def _take_fix(self, fix: Fix) -> None:
         result, change = self._world.apply(self.ekf, fix)
         self._log.add_fix(result)
+        if result.accepted:
+            self.accepted.append(fix)
         if change is not None:
             turned = [change.R @ step for step in self._velocity_steps]
             self._velocity_steps.clear()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,10 @@ class NavState:
     def quat_xyzw(self) -> FloatArray:
         """Attitude as a unit quaternion (4,), x y z w."""
         return np.asarray(Rotation.from_matrix(self.R_WB).as_quat())
+
+    def shifted(self, by: FloatArray) -> NavState:
+        """The state in a world whose origin lies at -`by` (3,) [m]."""
+        return replace(self, p_W=self.p_W + by)
 
 
 @dataclass(frozen=True, eq=False)

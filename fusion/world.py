@@ -7,6 +7,9 @@ turns it about that point: a second position far enough away, a velocity, or a h
 a small correction, so neither goes through the filter's linearisation: the world is moved and
 turned exactly (the right-invariant error turns with it), then the filter is told that this shift or
 turn was not known at all, then the fix is an ordinary measurement.
+
+Behind a gap in which the direction was lost the same holds of the track from there on: the next
+position places it, the next direction turns it, and what was before the gap stays where it is.
 """
 
 from __future__ import annotations
@@ -50,6 +53,8 @@ class WorldChange:
         R: (3, 3) rotation about the vertical.
         shift: (3,) [m].
         pivot: (3,) the point of the new world that a wrong turn would leave where it is [m].
+        placed: whether it is the shift of a position fix, not a turn.
+        since: states before this time [s] are none of its, for they were in the new world already.
         yaw_sigma: of the turn [rad].
         position_covariance: (3, 3) of the shift [m^2].
     """
@@ -58,6 +63,8 @@ class WorldChange:
     R: FloatArray
     shift: FloatArray
     pivot: FloatArray
+    placed: bool
+    since: float
     yaw_sigma: float = 0.0
     position_covariance: FloatArray | None = None
 
@@ -74,7 +81,7 @@ class WorldFrame:
     def __init__(self, placed: bool, oriented: bool, gate: float) -> None:
         self.placed, self.oriented = placed, oriented
         self.changes: list[WorldChange] = []
-        self._pivot = np.zeros(3)
+        self._pivot, self._since = np.zeros(3), -math.inf
         self._gates = {n: float(chi2.ppf(gate, n)) for n in (1, 3)}
 
     def apply(self, ekf: StateCloningEkf, fix: Fix) -> tuple[UpdateResult, WorldChange | None]:
@@ -98,19 +105,26 @@ class WorldFrame:
         self.changes.append(change)
         return result, change
 
+    def lose_yaw(self, ekf: StateCloningEkf) -> None:
+        """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
+        if self.oriented and ekf.world_covariance()[2, 2] > KNOWN_YAW**2:
+            self.placed = self.oriented = False
+            self._pivot, self._since = ekf.p_W, ekf.time
+
     def checkpoint(self) -> dict[str, Any]:
         """Everything that `rewind` needs."""
         return {
             "placed": self.placed,
             "oriented": self.oriented,
             "pivot": self._pivot,
+            "since": self._since,
             "changes": [vars(change) for change in self.changes],
         }
 
     def rewind(self, checkpoint: dict[str, Any]) -> None:
         """Go back to a checkpoint."""
         self.placed, self.oriented = checkpoint["placed"], checkpoint["oriented"]
-        self._pivot = checkpoint["pivot"]
+        self._pivot, self._since = checkpoint["pivot"], checkpoint["since"]
         self.changes = [WorldChange(**change) for change in checkpoint["changes"]]
 
     def _place(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange:
@@ -119,7 +133,7 @@ class WorldFrame:
         left = np.trace(fix.covariance) + np.trace(ekf.world_covariance()[6:9, 6:9])
         ekf.loosen_position(_MUCH_LARGER * math.sqrt(left))
         self.placed, self._pivot = True, fix.value
-        return WorldChange(fix.time, np.eye(3), shift, fix.value)
+        return WorldChange(fix.time, np.eye(3), shift, fix.value, True, self._since)
 
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange | None:
         turn, sigma = self._turn(ekf, fix)
@@ -131,7 +145,7 @@ class WorldFrame:
         ekf.move_world(R, shift)
         ekf.loosen_yaw(self._pivot, UNKNOWN_YAW)
         self.oriented = True
-        return WorldChange(fix.time, R, shift, self._pivot)
+        return WorldChange(fix.time, R, shift, self._pivot, False, self._since)
 
     def _turn(self, ekf: StateCloningEkf, fix: Fix) -> tuple[float, float]:
         """Turn of the world a fix asks for, and how well it tells it [rad]."""
@@ -141,7 +155,10 @@ class WorldFrame:
         first, seen, ours = 3, fix.value, ekf.v_W
         if fix.kind == "position":
             first, seen, ours = 6, fix.value - self._pivot, ekf.p_W - self._pivot
-        P = ekf.world_covariance()[first : first + 2, first : first + 2]
+        P = ekf.world_covariance()
+        by_yaw = P[first : first + 2, 2]
+        # What of it comes from the yaw is what the fix is to tell.
+        P = P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2]
         arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
         across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
         turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
@@ -163,7 +180,7 @@ def in_last_world(states: list[NavState], changes: list[WorldChange]) -> list[Na
     independent of theirs; that is on the safe side, for the fix saw the track's own errors too.
     """
     for change in changes:
-        states = [state if state.time >= change.time else _moved(state, change) for state in states]
+        states = [_after(state, change) for state in states]
     return states
 
 
@@ -174,7 +191,7 @@ def smoothed_track(poses: list[SmoothedPose], changes: list[WorldChange]) -> Tra
     rows = []
     for pose in poses:
         R_WB, p_W, covariance = pose.R_WB, pose.p_W, pose.covariance[3:, 3:]
-        for change in changes[pose.world :]:
+        for change in (c for c in changes[pose.world :] if pose.time >= c.since):
             R_WB, p_W = change.R @ R_WB, change.R @ p_W + change.shift
             covariance = change.R @ covariance @ change.R.T
             across = skew(p_W - change.pivot) @ [0.0, 0.0, -change.yaw_sigma]
@@ -189,6 +206,14 @@ def smoothed_track(poses: list[SmoothedPose], changes: list[WorldChange]) -> Tra
         attitude_WB=Rotation.from_matrix(np.array(attitude)),
         position_covariance_W=np.array(covariances),
     )
+
+
+def _after(state: NavState, change: WorldChange) -> NavState:
+    if state.time >= change.time:
+        return state
+    if state.time < change.since:
+        return replace(state, world=state.world + 1)
+    return _moved(state, change)
 
 
 def _moved(state: NavState, change: WorldChange) -> NavState:
