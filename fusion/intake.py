@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from stario.fusion.attitude import LevelledAttitude, start_from_gravity
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
+from stario.fusion.gyro_unit import GyroUnitWatch
 from stario.fusion.suspects import Flags, Screen
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
@@ -77,6 +78,7 @@ class Intake:
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
         self._screen = Screen()
+        self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
         self.counts = IntakeCounts()
         self.start: Start | None = None
 
@@ -253,6 +255,7 @@ class Intake:
             "suspect": list(self._suspect),
             "tail": self._tail,
             "largest": self._screen.largest,
+            "gyro_unit": self.gyro_unit.checkpoint(),
             "counts": asdict(self.counts),
             "start": self.start and vars(self.start),
         }
@@ -274,6 +277,8 @@ class Intake:
             values.clear()
             values.extend(checkpoint[name])
         self._tail, self._screen.largest = checkpoint["tail"], checkpoint["largest"]
+        if "gyro_unit" in checkpoint:  # snapshots from before the watch lack it
+            self.gyro_unit.rewind(checkpoint["gyro_unit"])
         counts = checkpoint["counts"]
         gaps = [(float(start), float(length)) for start, length in counts["gaps"]]
         self.counts = IntakeCounts(**(counts | {"gaps": gaps}))

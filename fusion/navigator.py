@@ -122,12 +122,14 @@ class Navigator:
             The newest state if this sample completed an update period, else None.
 
         Raises:
-            InputError: time is no number, gyro or accel does not hold three, or the first second's average
-                force cannot be gravity in m/s^2. The stream then begins anew.
+            InputError: time is no number, gyro or accel does not hold three, the first second's
+                average force cannot be gravity in m/s^2, or gyro cannot be in rad/s, which shows
+                once the device turns. In the last two cases the stream then begins anew.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
         for epoch in self._intake.push(sample):
+            self._check_gyro(epoch)
             state = self._advance(epoch)
         return state
 
@@ -362,6 +364,14 @@ class Navigator:
             self._fixes.hold(fix)
         elif not self._recipe.late_fix(fix):
             self._fixes.refuse("too late")
+
+    def _check_gyro(self, epoch: Epoch) -> None:
+        try:
+            self._intake.gyro_unit.look(epoch)
+        except InputError:
+            self._intake, self._recipe = Intake(self.config), None
+            self._network = self._along_track()
+            raise
 
     def _checked_start(self) -> Start:
         """A stream cannot be checked as a whole before it runs: its first second is."""

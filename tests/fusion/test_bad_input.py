@@ -14,6 +14,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import align
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.walks import CARRY_WAYS
 
 Make = Callable[..., Any]
 
@@ -153,6 +154,68 @@ def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
     assert streamed_off(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
 
 
+def after_a_still_start(walk: ImuSequence) -> ImuSequence:
+    """The walk behind ten seconds at rest in its first attitude."""
+    step = walk.time[1] - walk.time[0]
+    rest = round(10.0 / step)
+    noise = 0.01 * np.random.default_rng(0).standard_normal((rest, 6))
+    up_B = walk.truth.attitude_WB[0].apply([0.0, 0.0, 9.80665], inverse=True)
+    return replace(
+        walk,
+        time=step * np.arange(rest + len(walk)),
+        gyro=np.vstack([noise[:, :3], walk.gyro]),
+        accel=np.vstack([up_B + noise[:, 3:], walk.accel]),
+        truth=None,
+    )
+
+
+@pytest.mark.parametrize("carry", CARRY_WAYS)
+def test_a_stream_in_degrees_is_refused_once_the_device_turns(
+    make_walk: Make, still_model: Any, carry: str
+) -> None:
+    right = after_a_still_start(make_walk(3, 26.0, carry=carry))
+    navigator, expected = Navigator(still_model), Navigator(still_model)
+    for row in zip(right.time[:300], right.gyro[:300], right.accel[:300], strict=True):
+        navigator.push(*row)
+    with pytest.raises(InputError, match=r"gyro: found turns .*, expected rad/s; .*deg/s"):
+        stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
+    assert navigator.state is None
+    # The stream has begun anew, and in rad/s it is never refused.
+    states = stream(navigator, right)
+    assert len(states) == len(stream(expected, right)) > 300
+    np.testing.assert_array_equal(states[-1].p_W, expected.state.p_W)
+
+
+def test_a_device_that_tumbles_for_a_moment_is_not_taken_for_degrees(
+    make_walk: Make, still_model: Any
+) -> None:
+    walk = make_walk(3, 26.0)
+    gyro = walk.gyro.copy()
+    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anybody turns it
+    assert stream(Navigator(still_model), replace(walk, gyro=gyro))
+
+
+def test_the_watch_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:
+    wrong = after_a_still_start(walk)
+    wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
+
+    def refused_at(stop: float) -> float:
+        """The time at which the stream is refused, continued elsewhere at a time."""
+        navigator = Navigator(still_model)
+        for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):
+            if time == stop:
+                data, navigator = navigator.snapshot(), Navigator(still_model)
+                navigator.restore(data)
+            try:
+                navigator.push(time, gyro, accel)
+            except InputError:
+                return float(time)
+        return np.inf
+
+    whole = refused_at(np.nan)
+    assert refused_at(float(wrong.time[1710])) == whole < 26.0
+
+
 @pytest.mark.parametrize("seconds", [0.0, 0.02, 0.9, 1.4])
 def test_a_recording_that_is_too_short_is_a_clear_error(
     walk: ImuSequence, still_model: Any, seconds: float
@@ -181,7 +244,7 @@ def test_a_sample_that_is_no_vector_is_refused_by_name(still_model: Any, vector:
 
 @pytest.mark.parametrize("time", ["x", None, (1.0, 2.0)])
 def test_a_time_that_is_no_number_is_refused_by_name(still_model: Any, time: Any) -> None:
-    with pytest.raises(InputError, match="time: found .*, expected a number"):
+    with pytest.raises(InputError, match=r"time: found .*, expected a number"):
         Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
 
 
