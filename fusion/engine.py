@@ -22,6 +22,9 @@ from stario.fusion.preintegration import CORE
 
 GateMode = Literal["inflate", "reject"]
 
+_FAR_BETTER = 1e9
+"""A measurement of so many times less variance than the state's costs the difference its digits."""
+
 
 class UpdateResult(NamedTuple):
     """What became of one measurement.
@@ -163,10 +166,21 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
         self.x_post = self.x
-        # P is symmetric: its transpose is the same matrix in the order BLAS updates in place.
-        self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1, overwrite_c=1).T
+        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
+            self._correct_as_joseph(blocks)
+        else:
+            # P is symmetric: its transpose is the same matrix in the order BLAS updates in place.
+            self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1, overwrite_c=1).T
         self._last_downdate = W
         self._log_likelihood = self._likelihood = self._mahalanobis = None
+
+    def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
+        """(I - K H) P (I - K H)^T + K R K^T: dearer, but no difference of large numbers."""
+        A = np.eye(self.dim_x)
+        for first, H in blocks:
+            A[:, first : first + H.shape[1]] -= self.K @ H
+        P = A @ self.P @ A.T + self.K @ self.R @ self.K.T
+        self.P = 0.5 * (P + P.T)
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

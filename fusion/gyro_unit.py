@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.epochs import Epoch
-from stario.sequences.checks import _average_force, _check_gyro
+from stario.sequences.checks import average_force, check_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import GYRO_UNITS
@@ -81,10 +81,10 @@ class GyroUnitWatch:
 
 def _check_piece(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
     whole = [slice(0, len(time))]
-    _check_gyro(
+    check_gyro(
         "stream",
         gyro,
         float(np.median(np.linalg.norm(accel, axis=1))),
-        _average_force(time, gyro, accel, whole),
-        _average_force(time, gyro * GYRO_UNITS["deg/s"], accel, whole),
+        average_force(time, gyro, accel, whole),
+        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, whole),
     )

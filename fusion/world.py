@@ -40,8 +40,9 @@ FAR_ENOUGH = 0.3
 """Two positions tell the yaw when it is then known to this [rad]; half its square, what the
 linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
-_MUCH_LARGER = 1e3
-"""An unknown shift is this many times what the measurement leaves of it."""
+_MUCH_LARGER, _LARGEST = 1e3, 1e5
+"""An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
+beyond, the covariance keeps no digits for the fix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ class WorldFrame:
         shift = fix.value - ekf.p_W
         ekf.move_world(np.eye(3), shift)
         left = np.trace(fix.covariance) + np.trace(ekf.world_covariance()[6:9, 6:9])
-        ekf.loosen_position(_MUCH_LARGER * math.sqrt(left))
+        ekf.loosen_position(min(_MUCH_LARGER * math.sqrt(left), _LARGEST))
         self.placed, self._pivot = True, fix.value
         return WorldChange(fix.time, np.eye(3), shift, fix.value, True, self._since)
 

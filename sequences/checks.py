@@ -73,9 +73,9 @@ def check_units(sequence: ImuSequence) -> None:
         )
     pieces = _pieces(time)
     force = float(np.median(np.linalg.norm(accel, axis=1)))
-    average = _average_force(time, gyro, accel, pieces)
-    in_degrees = _average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
-    _check_gyro(sequence.name, gyro, force, average, in_degrees)
+    average = average_force(time, gyro, accel, pieces)
+    in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
+    check_gyro(sequence.name, gyro, force, average, in_degrees)
     _check_force(sequence, force, average)
     _check_direction(sequence)
 
@@ -105,9 +105,21 @@ def _check_time(sequence: ImuSequence) -> None:
     raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
 
 
-def _check_gyro(
+def check_gyro(
     name: str, gyro: FloatArray, force: float, average: float, in_degrees: float
 ) -> None:
+    """Refuse a gyroscope whose turns the accelerometer contradicts.
+
+    Args:
+        name: of the recording.
+        gyro: (N, 3) [rad/s].
+        force: median size of the specific force [m/s^2].
+        average: `average_force` of it [m/s^2].
+        in_degrees: the same with the gyroscope read as deg/s.
+
+    Raises:
+        InputError: it cannot be in rad/s.
+    """
     speed = float(np.percentile(np.linalg.norm(gyro, axis=1), 95))
     # A swinging arm presses the device outward: its samples exceed their average, which is
     # gravity all the same. So an average that is gravity, in either unit, clears the gyroscope.
@@ -203,7 +215,7 @@ def _pieces(time: FloatArray) -> list[slice]:
     return [slice(start, start + length) for start in starts]
 
 
-def _average_force(
+def average_force(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice]
 ) -> float:
     """Size [m/s^2] of a piece's force averaged in the frame of its first sample; the median."""
