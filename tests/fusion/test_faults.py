@@ -79,3 +79,10 @@ def test_faults_are_drawn_from_the_seed() -> None:
                 and np.array_equal(first.gyro, sequence.gyro)
                 and np.array_equal(first.accel, sequence.accel)
             )
+
+
+def test_five_false_seconds_cost_little_with_either_back_end() -> None:
+    sequence, config = matched_walk(60.0, seed=1)
+    block = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
+    for result in run_faults(sequence, config, only=block):
+        assert result.error_with < result.error_without + 0.3
