@@ -54,6 +54,9 @@ def train(
         Path | None, typer.Option(help="Captured trajectories (npz) to drive a simulated IMU.")
     ] = None,
     generated: Annotated[int, typer.Option(min=0, help="Number of generated walks of 60 s.")] = 150,
+    recorded_only: Annotated[
+        bool, typer.Option("--recorded-only", help="Learn from no simulated walk at all.")
+    ] = False,
     config: Annotated[
         Path | None, typer.Option("--config", help="JSON file with settings of the recipe.")
     ] = None,
@@ -96,6 +99,8 @@ def train(
         paths or [], validation or [], data, partial(_streams_of, reading, folder, jobs)
     )
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
+    if recorded_only:
+        walks, generated = None, 0
     material = gather(
         recorded + held_out if last_stage else recorded,
         _captured(walks, recipe.seed, folder) if walks else [],

@@ -143,6 +143,14 @@ def test_training_goes_on_past_what_fails_and_keeps_its_windows(
     assert first == second
 
 
+def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
+    done = stario("train", recording, "--recorded-only", "--config", "tiny.json", "--out", "alone")
+    assert done.code == 0, done.err
+    trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
+    assert [words.split(":")[0] for words in trained_on] == ["recorded"]
+
+
 def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
     stario("train", "missing.csv").assert_one_line_error("missing.csv", "nothing there")
     assert not (tmp_path / "runs").exists()
