@@ -34,7 +34,7 @@ from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
 
-_MOST_STEPS = 3
+_MOST_STEPS = 1
 """Of Levenberg-Marquardt per round: no more pay before the measurements are linearised anew."""
 
 _MOVED = 1e-3
@@ -120,7 +120,7 @@ class KeyframeGraph:
         self._terms.append(_Whitened.of(term, limit))
         self._tree = None
 
-    def solve(self, most_rounds: int = 5) -> Solution:
+    def solve(self, most_rounds: int = 10) -> Solution:
         """Move the keyframes to where everything known fits best.
 
         Args:
