@@ -44,14 +44,17 @@ class Taken(NamedTuple):
 class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
-    Keyframes stand where windows begin and end, one a second or two where updates come in even
-    number, and at both ends of a gap. More of them bring nothing: the IMU binds them as well over
-    half a second as over a tenth, and tells what lies between a keyframe and a fix.
+    Keyframes stand where windows begin and end, `overlap` a second, and at both ends of a gap. More
+    of them bring nothing: the IMU binds them as well over half a second as over a tenth, and tells
+    what lies between a keyframe and a fix. A stream does better with both windows of a second, a
+    whole track with one, trusted as both together (on the validation recordings 0.91 and 0.92 of
+    the filter's error instead of 1.02 and 0.97, with two networks that had not seen them).
 
     Args:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: epochs since the start or the last gap, where a graph is begun anew.
+        overlap: windows that begin within the length of one: 1, or 2 where updates come as often.
 
     Attributes:
         graph: the graph so far.
@@ -59,15 +62,16 @@ class GraphBuilder:
         count: epochs since the start or the last gap.
     """
 
-    def __init__(self, config: NavigatorConfig, first: NavState, count: int = 0) -> None:
+    def __init__(
+        self, config: NavigatorConfig, first: NavState, count: int = 0, overlap: int = 1
+    ) -> None:
         self._config = config
         self.graph = KeyframeGraph(first, config.filter.gate)
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
-        f = config.filter
-        self._overlap = 1 if f.update_rate % 2 else 2
-        self._window = round(f.output_rate * WINDOW_SECONDS)  # epochs
-        self._spacing = self._window // self._overlap  # epochs
+        self._overlap = overlap
+        self._window = round(config.filter.output_rate * WINDOW_SECONDS)  # epochs
+        self._spacing = self._window // overlap  # epochs
         self._pending: list[Epoch] = []
         # Keyframes where windows end and begin, by the count of epochs; a gap ends them all.
         self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}

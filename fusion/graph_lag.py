@@ -117,7 +117,8 @@ class GraphRecipe:
         """A new graph from a state of the filter."""
         self._world, self._origin_W = first.world, first.p_W
         first = first.shifted(-self._origin_W)
-        self._builder = GraphBuilder(self._config, first, count)
+        overlap = 1 if self._config.filter.update_rate % 2 else 2
+        self._builder = GraphBuilder(self._config, first, count, overlap)
         self._take(first)
 
     def _solve(self) -> None:
