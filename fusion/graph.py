@@ -45,8 +45,8 @@ _LOST_SIGMA = 1e5
 
 _FALSE, _FALSE_WAY = 0.5, 0.75
 """Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,
-as the filter does. Displacements go wrong in rows that overlap, and count less: five seconds of
-them off by 1 m cost 0.08 to 0.24 m in three walks, 0.5 to 0.6 m with the half."""
+as the filter does. Displacements go wrong in rows, and count less: five seconds of them, two a
+second, off by 1 m cost 0.08 to 0.24 m in three walks, 0.5 to 0.6 m with the half."""
 
 _LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
