@@ -277,8 +277,7 @@ class Intake:
             values.clear()
             values.extend(checkpoint[name])
         self._tail, self._screen.largest = checkpoint["tail"], checkpoint["largest"]
-        if "gyro_unit" in checkpoint:  # snapshots from before the watch lack it
-            self.gyro_unit.rewind(checkpoint["gyro_unit"])
+        self.gyro_unit.rewind(checkpoint["gyro_unit"])
         counts = checkpoint["counts"]
         gaps = [(float(start), float(length)) for start, length in counts["gaps"]]
         self.counts = IntakeCounts(**(counts | {"gaps": gaps}))
