@@ -1,11 +1,13 @@
 """Absolute fixes: in time, late or ahead, in stream and batch, and the world they tell."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import support
 from scipy.spatial.transform import Rotation
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
@@ -27,14 +29,7 @@ from stario.sequences.simulate import ImuErrors
 
 NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
-FILTER = FilterConfig(
-    update_rate=1,
-    covariance_scale=1.0,
-    gyro_bias_sigma=3e-3,
-    accel_bias_sigma=0.05,
-    accel_motion_noise=0.0,
-)
-CONFIG = NavigatorConfig(noise=NOISE, filter=FILTER)
+CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate=1))
 VELOCITY = NavigatorConfig(
     noise=NOISE, filter=FilterConfig(update_rate=10, measurement="velocity", covariance_scale=1.0)
 )
