@@ -24,10 +24,10 @@ from stario.fusion.jacobians import (
     CLONE,
     displacement_jacobian,
     heading_jacobian,
+    in_plain_terms,
     mean_velocity_jacobian,
     position_jacobian,
     velocity_jacobian,
-    world_from_invariant,
     yaw_twist,
 )
 from stario.fusion.lie import FloatArray, exp_times, skew
@@ -113,10 +113,8 @@ class StateCloningEkf(ErrorStateEngine):
         """
         self._check_slot(slot)
         first = CORE + CLONE * slot
-        to_world = np.eye(CLONE)
-        to_world[3:, :3] = -skew(self._X[1 + slot, :, 4])
         P = self.P[first : first + CLONE, first : first + CLONE]
-        return _symmetric(to_world @ P @ to_world.T)
+        return in_plain_terms(P, self._X[1 + slot, :, 4])
 
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
@@ -139,10 +137,7 @@ class StateCloningEkf(ErrorStateEngine):
         Order: rotation error about the world's axes [rad], velocity error [m/s] and position error
         [m] in W, biases [rad/s], [m/s^2], each true minus estimate (R = (I + [theta]x) R^).
         """
-        X = self._X[0]
-        to_world = world_from_invariant(X[:, 3], X[:, 4])
-        # Far from the origin the products' rounding would leave it asymmetric.
-        return _symmetric(to_world @ self.P[:CORE, :CORE] @ to_world.T)
+        return in_plain_terms(self.P[:CORE, :CORE], self._X[0, :, 3:].T)
 
     def initialise(
         self,
@@ -183,10 +178,8 @@ class StateCloningEkf(ErrorStateEngine):
         self._set_pose(R, arrays["v_W"], p)
         self._b_g, self._b_a = arrays["b_g"], arrays["b_a"]
         self._clone_time = [None] * self.slots
-        from_world = np.linalg.inv(world_from_invariant(arrays["v_W"], p))
-        core = from_world @ covariance @ from_world.T
         self.P[:] = 0.0
-        self.P[:CORE, :CORE] = 0.5 * (core + core.T)
+        self.P[:CORE, :CORE] = in_plain_terms(covariance, -np.array((arrays["v_W"], p)))
         self.x[:] = 0.0
         self._last_downdate = None
 
@@ -431,7 +424,3 @@ class StateCloningEkf(ErrorStateEngine):
         if not 0 <= slot < self.slots or self._clone_time[slot] is None:
             held = [k for k, time in enumerate(self._clone_time) if time is not None]
             raise InputError("slot", repr(slot), f"one that holds a clone: {held}")
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T))

@@ -86,11 +86,20 @@ def yaw_twist(R_WB: FloatArray) -> float:
     return math.atan2(s, c) if s * s + c * c > _UPSIDE_DOWN else math.nan
 
 
-def world_from_invariant(v_W: FloatArray, p_W: FloatArray) -> FloatArray:
-    """(15, 15) plain errors from invariant ones: v - v^ = rho_v - [v^]x theta, same for p."""
-    matrix = np.eye(CORE)
-    matrix[3:9, 0:3] = -skew(np.array((v_W, p_W))).reshape(6, 3)
-    return matrix
+def in_plain_terms(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
+    """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
+
+    Args:
+        P: (n, n) of theta, then a rho for each vector, then whatever does not change.
+        vectors_W: (k, 3) velocity and position, or one of them.
+    """
+    A = skew(vectors_W).reshape(-1, 3)
+    stop = 3 + len(A)
+    plain = P.copy()
+    plain[3:stop] -= A @ P[:3]
+    plain[:, 3:stop] -= plain[:, :3] @ A.T
+    # Far from the origin the products' rounding would leave it asymmetric.
+    return np.asarray(0.5 * (plain + plain.T))
 
 
 _UPSIDE_DOWN = 0.01

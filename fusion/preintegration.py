@@ -221,8 +221,8 @@ def _nav_transition(dt: float, gravity: float) -> FloatArray:
     return transition
 
 
-# Few: constant noise needs one, and noise that grows with motion never comes twice.
-@lru_cache(maxsize=4)
+# Noise that grows with motion comes in steps (`segments`): the range in use fits.
+@lru_cache(maxsize=512)
 def _params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2)

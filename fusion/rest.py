@@ -43,8 +43,9 @@ class RestDetector:
 
     def __init__(self, epochs: int, scale: float) -> None:
         self._scale = scale
-        # Of each epoch: samples, seconds, sums of gyro and accel, sums of their squares.
-        self._sums: deque[FloatArray] = deque(maxlen=epochs)
+        # Of each epoch: samples, seconds, sums of gyro and accel, sums of their squares; None where
+        # it alone moves more than a second at rest may.
+        self._sums: deque[FloatArray | None] = deque(maxlen=epochs)
 
     def at_rest(self, epoch: Epoch) -> bool:
         """Take an epoch in; whether nothing moved over the second that ends with it."""
@@ -53,26 +54,35 @@ class RestDetector:
         if epoch.gap:
             self._sums.clear()
             return False
-        rows = np.hstack([epoch.gyro[1:], epoch.accel[1:]])
-        totals = np.ones(len(rows)) @ rows, np.einsum("ni,ni->i", rows, rows)
-        sums = np.concatenate([(len(rows), epoch.stop - epoch.start), *totals])
-        self._sums.append(sums)
-        if len(self._sums) < (self._sums.maxlen or 0):
+        self._sums.append(None if self._moves(epoch) else _sums_of(epoch))
+        known = [sums for sums in self._sums if sums is not None]
+        if len(known) < (self._sums.maxlen or 0):
             return False
-        # Scatter adds up: an epoch with more than a second may have settles it.
-        return self._quiet(sums, len(self._sums)) and self._quiet(np.sum(self._sums, axis=0))
+        return self._quiet(np.sum(known, axis=0))
 
-    def _quiet(self, sums: FloatArray, share: int = 1) -> bool:
-        """Whether a second may scatter like this; `sums` are of one of so many equal shares."""
-        count, seconds = float(sums[0]), float(sums[1])
+    def _moves(self, epoch: Epoch) -> bool:
+        """Whether the epoch's force alone scatters more than a second may: scatter adds up."""
+        accel = epoch.accel[1:]
+        count = len(accel)
+        total = accel.sum(axis=0)
+        scatter = float(np.vdot(accel, accel) - total @ total / count)
+        bound = self._bound(count * (self._sums.maxlen or 1), count / (epoch.stop - epoch.start))
+        return scatter > bound * PHONE_IMU.noise.accel_noise**2
+
+    def _quiet(self, sums: FloatArray) -> bool:
+        """Whether a second may scatter like this."""
+        count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
-        freedom = 3.0 * (share * count - 1.0)
-        bound = self._scale**2 * count / seconds * _chi2_quantile(freedom)
+        bound = self._bound(count, count / float(sums[1]))
         gyro, accel = float(scatter[:3].sum()), float(scatter[3:].sum())
         return (
             gyro <= bound * PHONE_IMU.noise.gyro_noise**2
             and accel <= bound * PHONE_IMU.noise.accel_noise**2
         )
+
+    def _bound(self, count: float, rate: float) -> float:
+        """Of the scatter of so many samples in three axes, over the density's square."""
+        return self._scale**2 * rate * _chi2_quantile(3.0 * (count - 1.0))
 
     def measurement(
         self, v_W: FloatArray, b_g: FloatArray, noise: ImuNoise
@@ -88,7 +98,7 @@ class RestDetector:
             noise: densities the filter assumes.
         """
         epochs = len(self._sums)
-        table = np.array(self._sums)
+        table = np.array(list(self._sums))
         rates = table[:, 2:5] / table[:, :1]
         seconds = float(table[:, 1].mean())
         hidden = max(noise.accel_noise, PHONE_IMU.noise.accel_noise) ** 2 * WINDOW_SECONDS
@@ -98,14 +108,20 @@ class RestDetector:
         residual = np.concatenate([-v_W, rates[epochs // 2] - b_g])
         return residual, [(3, _BY_VELOCITY), (9, _BY_BIAS)], covariance
 
-    def checkpoint(self) -> list[FloatArray]:
+    def checkpoint(self) -> list[FloatArray | None]:
         """Everything that `rewind` needs."""
         return list(self._sums)
 
-    def rewind(self, checkpoint: list[FloatArray]) -> None:
+    def rewind(self, checkpoint: list[FloatArray | None]) -> None:
         """Go back to a checkpoint."""
         self._sums.clear()
         self._sums.extend(checkpoint)
+
+
+def _sums_of(epoch: Epoch) -> FloatArray:
+    rows = np.hstack([epoch.gyro[1:], epoch.accel[1:]])
+    totals = np.ones(len(rows)) @ rows, np.einsum("ni,ni->i", rows, rows)
+    return np.concatenate([(len(rows), epoch.stop - epoch.start), *totals])
 
 
 _BY_VELOCITY = np.eye(6, 3)

@@ -15,6 +15,8 @@ from stario.sequences.sequence import FloatArray
 
 _GAP_STEPS = 10
 
+_STEP = 0.02
+
 
 def segment_of(
     epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
@@ -61,9 +63,14 @@ def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:
         accel = max(accel, f.gap_accel_noise)
     if f.gyro_motion_noise > 0.0:
         rate = math.sqrt(float(np.vdot(epoch.gyro, epoch.gyro)) / len(epoch.gyro))
-        gyro = math.hypot(gyro, f.gyro_motion_noise * rate)
+        gyro = _in_steps(math.hypot(gyro, f.gyro_motion_noise * rate))
     if f.accel_motion_noise > 0.0:
         excess = np.sqrt(np.einsum("ni,ni->n", epoch.accel, epoch.accel)) - config.gravity
         motion = math.sqrt(float(excess @ excess) / len(excess))
-        accel = math.hypot(accel, f.accel_motion_noise * motion)
+        accel = _in_steps(math.hypot(accel, f.accel_motion_noise * motion))
     return ImuNoise(gyro, accel, noise.gyro_walk, noise.accel_walk)
+
+
+def _in_steps(density: float) -> float:
+    """The next of densities 2 % apart: gtsam's parameters for it are then made once, not always."""
+    return math.exp(math.ceil(math.log(density) / _STEP) * _STEP) if density > 0.0 else 0.0
