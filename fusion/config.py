@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.levelling import LEVELLING_RATE
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SECONDS
@@ -142,7 +143,7 @@ class NavigatorConfig:
     filter: FilterConfig = field(default_factory=FilterConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     gravity: float = STANDARD_GRAVITY
-    levelling_rate: float = 0.06
+    levelling_rate: float = LEVELLING_RATE
 
     def __post_init__(self) -> None:
         if not 9.5 < self.gravity < 10.1:

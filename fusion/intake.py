@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.fusion.attitude import LevelledAttitude, start_from_gravity
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.gyro_unit import GyroUnitWatch
 from stario.fusion.suspects import Flags, Screen
+from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     MAX_IMU_GAP,
@@ -33,9 +33,6 @@ from stario.sequences.windows import (
     WINDOW_SECONDS,
     resample,
 )
-
-START_SECONDS = 1.0
-"""Length of the stretch whose mean specific force levels the first attitude [s]."""
 
 LONG_GAP = 10.0
 """Behind a gap longer than this [s] nothing of attitude and speed is left: it begins anew there."""

@@ -141,7 +141,7 @@ def _true_windows(
     sequence: ImuSequence, truth: Trajectory, period: float
 ) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
     """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
-    grid, imu_W, usable = imu_in_world(sequence, truth)
+    grid, imu_W, usable = imu_in_world(sequence, truth, "true")
     bad_before = np.concatenate([[0], np.cumsum(~usable)])
     stride = round(period * WINDOW_RATE)
     starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)

@@ -13,7 +13,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulate import PHONE_IMU, simulate_imu
 from stario.sequences.stream_cache import cached
 from stario.sequences.walks import generate_walk
-from stario.sequences.windows import WorldStream, world_streams
+from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,9 @@ def simulated_streams(
     return cached(key, build, folder)
 
 
-def captured_streams(walks: dict[str, list[Trajectory]], seed: int) -> list[WorldStream]:
+def captured_streams(
+    walks: dict[str, list[Trajectory]], seed: int, attitude: Attitude = "levelled"
+) -> list[WorldStream]:
     """Stretches of a simulated phone's IMU along captured trajectories.
 
     Captures are smoothed, and the rumble of wheels does not survive it: what then moves too
@@ -133,11 +135,13 @@ def captured_streams(walks: dict[str, list[Trajectory]], seed: int) -> list[Worl
             sensor = int(rng.integers(2**31))
             simulated = simulate_imu(piece, 200.0, PHONE_IMU, sensor, name=name)
             if np.linalg.norm(simulated.accel, axis=1).std() > _SMOOTH:
-                streams += world_streams(simulated)
+                streams += world_streams(simulated, attitude=attitude)
     return streams
 
 
-def generated_streams(count: int, seconds: float, seed: int) -> list[WorldStream]:
+def generated_streams(
+    count: int, seconds: float, seed: int, attitude: Attitude = "levelled"
+) -> list[WorldStream]:
     """Stretches of a simulated phone's IMU along generated walks."""
     rng = np.random.default_rng(seed)
     streams = []
@@ -145,5 +149,6 @@ def generated_streams(count: int, seconds: float, seed: int) -> list[WorldStream
         walk, sensor = (int(k) for k in rng.integers(2**31, size=2))
         trajectory = generate_walk(walk, seconds)
         name = f"walk-{index}"
-        streams += world_streams(simulate_imu(trajectory, 200.0, PHONE_IMU, sensor, name=name))
+        simulated = simulate_imu(trajectory, 200.0, PHONE_IMU, sensor, name=name)
+        streams += world_streams(simulated, attitude=attitude)
     return streams

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from stario.network.augment import Augmentation
 from stario.sequences.errors import ConfigError
+from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
     # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 walks of ten seconds.
@@ -58,6 +59,8 @@ class TrainingConfig:
         patience: epochs without a better validation error after which training stops.
         precision: "float32" or "bfloat16" (mixed; nearly twice as fast where there is support).
         device: "auto", "cpu" or "cuda".
+        attitude: by which windows are turned into the world: "levelled" by the IMU, as in use, or
+            "true", the papers' protocol.
         successive: windows in a row, one second apart, that a step draws from one place; more than
             one only for a network that remembers earlier windows.
         seed: of initial weights, draws and dropout.
@@ -81,6 +84,7 @@ class TrainingConfig:
     patience: int = 20
     precision: str = "float32"
     device: str = "auto"
+    attitude: Attitude = "levelled"
     successive: int = 1
     seed: int = 0
     augmentation: Augmentation = field(default_factory=Augmentation)
@@ -104,6 +108,8 @@ class TrainingConfig:
             )
         if self.device not in ("auto", "cpu", "cuda"):
             raise ConfigError("device", repr(self.device), "auto, cpu or cuda")
+        if self.attitude not in ("levelled", "true"):
+            raise ConfigError("attitude", repr(self.attitude), "levelled or true")
 
     @property
     def steps_per_epoch(self) -> int:

@@ -32,7 +32,7 @@ from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
 from stario.sequences.readers import FORMATS
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WorldStream, world_streams
+from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +53,7 @@ def recorded(
     options: Mapping[str, object],
     folder: Path,
     jobs: int | None = None,
+    attitude: Attitude = "levelled",
 ) -> Iterator[list[WorldStream] | Skipped]:
     """The streams of each recording, from the cache or read, checked and put there.
 
@@ -62,14 +63,15 @@ def recorded(
         options: what `read` depends on besides the path, as plain values.
         folder: the cache's; shared with the processes that read.
         jobs: processes, as for `stario.sequences.batch.each`.
+        attitude: as for `world_streams`.
     """
-    work = partial(_stored, read=read, options=dict(options), folder=folder)
+    work = partial(_stored, read=read, options=dict(options), folder=folder, attitude=attitude)
     for path, outcome in zip(paths, each(work, paths, jobs), strict=True):
         # Another process hands over a file's name rather than what is in it.
         streams = _opened(outcome) if isinstance(outcome, Path) else outcome
         if streams is None:
             try:
-                streams = _streams(read(path))
+                streams = _streams(read(path), attitude)
             except StarioError as error:
                 streams = Skipped(str(path), str(error))
         yield streams
@@ -117,21 +119,23 @@ def _stored(
     read: Callable[[Path], ImuSequence],
     options: Mapping[str, object],
     folder: Path,
+    attitude: Attitude,
 ) -> Path | list[WorldStream]:
     """The cache's file of a recording, or its streams where nothing can be written."""
     if not path.exists():
-        return _streams(read(path))
+        return _streams(read(path), attitude)
     key = {"path": str(path.resolve()), "files": _stamps(path), "options": dict(options)}
+    key["attitude"] = attitude
     file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
     if _opened(file) is not None:
         return file
-    streams = _streams(read(path))
+    streams = _streams(read(path), attitude)
     return file if _written(file, streams) else streams
 
 
-def _streams(sequence: ImuSequence) -> list[WorldStream]:
+def _streams(sequence: ImuSequence, attitude: Attitude) -> list[WorldStream]:
     check_units(sequence)
-    streams = world_streams(sequence)
+    streams = world_streams(sequence, attitude=attitude)
     if not streams:
         raise InputError(
             f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from"

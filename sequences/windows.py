@@ -2,18 +2,24 @@
 
 A window that starts at t_i holds the 200 samples at t_i + k / 200 s, gyroscope then accelerometer,
 each rotated from the body into a gravity-aligned frame; its target is the displacement from t_i to
-t_j = t_i + 1 s in that frame (TLIO, Liu et al. 2020, section IV). The same functions serve
-training (true attitude) and the navigator (estimated attitude).
+t_j = t_i + 1 s in that frame (TLIO, Liu et al. 2020, section IV). For training the attitude is
+levelled by the IMU as in use, with the heading of the truth; or true, the papers' protocol.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
+from stario.sequences.levelling import levelled_attitudes
+from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence, Trajectory
 
 WINDOW_RATE = 200.0
@@ -27,6 +33,9 @@ WINDOW_SECONDS = WINDOW_SAMPLES / WINDOW_RATE
 
 MAX_IMU_GAP = 0.1
 """Longest distance [s] between IMU samples that is bridged by interpolation."""
+
+Attitude = Literal["levelled", "true"]
+"""By which training windows are turned into the world; see `world_streams`."""
 
 MIN_RATE, MAX_RATE = 40.0, 1200.0
 """Sampling rates [Hz] that are accepted (50 Hz to 1 kHz, with some slack for jitter)."""
@@ -68,18 +77,27 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
 
 
 def world_streams(
-    sequence: ImuSequence, min_seconds: float = 2.0 * WINDOW_SECONDS
+    sequence: ImuSequence,
+    min_seconds: float = 2.0 * WINDOW_SECONDS,
+    attitude: Attitude = "levelled",
 ) -> list[WorldStream]:
     """Cut a recording with truth into unbroken 200 Hz stretches in the world frame.
 
     No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`).
+
+    Args:
+        sequence: the recording.
+        min_seconds: shorter stretches are left out [s].
+        attitude: "levelled" by the IMU with the true heading, or "true". A device that was mounted
+            askew, or a truth that is, shows in the mean specific force under the true attitude:
+            a network learns from it which way the device faces, and misses that in use.
 
     Raises:
         InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
-    grid, imu_W, usable = imu_in_world(sequence, sequence.truth)
+    grid, imu_W, usable = imu_in_world(sequence, sequence.truth, attitude)
     known = sequence.truth.valid
     position_W = _interpolate(grid, sequence.truth.time[known], sequence.truth.position_W[known])
     return [
@@ -94,9 +112,9 @@ def world_streams(
 
 
 def imu_in_world(
-    sequence: ImuSequence, truth: Trajectory
+    sequence: ImuSequence, truth: Trajectory, attitude: Attitude
 ) -> tuple[FloatArray, NDArray[np.float32], BoolArray]:
-    """The IMU at 200 Hz turned by the true attitude.
+    """The IMU at 200 Hz turned into the world, by an attitude as for `world_streams`.
 
     Returns:
         Grid times (M,) [s], gyroscope and specific force in W (M, 6) float32, and (M,) where
@@ -107,10 +125,34 @@ def imu_in_world(
     """
     time, gyro, accel = clean_samples(sequence)
     attitude_WB = truth.at(time).attitude_WB
+    if attitude == "levelled":
+        attitude_WB = _levelled(time, gyro, accel, attitude_WB, truth.covers(time))
     grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
     imu_W = np.concatenate([attitude_WB.apply(gyro), attitude_WB.apply(accel)], axis=1)
     usable = truth.covers(grid) & ~_spans_gap(time, grid)
     return grid, resample(time, imu_W, grid).astype(np.float32), usable
+
+
+def _levelled(
+    time: FloatArray, gyro: FloatArray, accel: FloatArray, true_WB: Rotation, known: BoolArray
+) -> Rotation:
+    """Attitudes levelled by the IMU, turned about the vertical to the true ones.
+
+    Within a window the heading is the gyroscope's, as in use: the turn is averaged over a second.
+    """
+    R_NB = np.empty((len(time), 3, 3))
+    breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
+    for start, stop in pairwise([0, *breaks.tolist(), len(time)]):
+        part = slice(start, stop)
+        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
+    levelled_NB = Rotation.from_matrix(R_NB)
+    turn = yaw_of(true_WB * levelled_NB.inv())
+    second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
+    edges = np.union1d(breaks, np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
+    for start, stop in pairwise([0, *edges.tolist(), len(time)]):
+        part = slice(start, stop)
+        turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
+    return about_z(turn) * levelled_NB
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:

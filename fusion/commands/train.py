@@ -26,7 +26,7 @@ from stario.sequences.errors import ConfigError, InputError
 if TYPE_CHECKING:
     from stario.network.recipe import TrainingConfig
     from stario.sequences.batch import Skipped
-    from stario.sequences.windows import WorldStream
+    from stario.sequences.windows import Attitude, WorldStream
 
 
 @grouped
@@ -95,18 +95,17 @@ def train(
     if last_stage and start_from is None:
         raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     folder = cache or cache_folder()
-    recorded, held_out, skipped = _recorded(
-        paths or [], validation or [], data, partial(_streams_of, reading, folder, jobs)
-    )
+    streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
+    recorded, held_out, skipped = _recorded(paths or [], validation or [], data, streams_of)
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
     if recorded_only:
         walks, generated = None, 0
     material = gather(
         recorded + held_out if last_stage else recorded,
-        _captured(walks, recipe.seed, folder) if walks else [],
-        _generated(generated, recipe.seed, folder),
+        _captured(walks, recipe, folder) if walks else [],
+        _generated(generated, recipe.seed, recipe.attitude, folder),
     )
-    held_out = held_out or _generated(10, recipe.seed + 1, folder)
+    held_out = held_out or _generated(10, recipe.seed + 1, recipe.attitude, folder)
     if leads():
         for words in material.words:
             typer.echo(words, err=True)
@@ -172,7 +171,7 @@ def _recorded(
 
 
 def _streams_of(
-    reading: Reading, folder: Path, jobs: int, files: list[Path]
+    reading: Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
 ) -> tuple[list[list[WorldStream]], list[Skipped]]:
     from stario.sequences.batch import Skipped
     from stario.sequences.stream_cache import recorded
@@ -180,7 +179,7 @@ def _streams_of(
     recordings: list[list[WorldStream]] = []
     skipped: list[Skipped] = []
     with progress_bar("read", len(files)) as progress:
-        outcomes = recorded(files, reading.read, asdict(reading), folder, jobs)
+        outcomes = recorded(files, reading.read, asdict(reading), folder, jobs, attitude)
         for done, outcome in enumerate(outcomes, 1):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
@@ -190,18 +189,22 @@ def _streams_of(
     return recordings, skipped
 
 
-def _captured(walks: Path, seed: int, folder: Path) -> list[WorldStream]:
+def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldStream]:
     from stario.network.data import captured_streams, simulated_streams
     from stario.sequences.vicon import read_vicon_walks
 
-    return simulated_streams(
-        "captured", lambda: captured_streams(read_vicon_walks(walks), seed), folder, walks, seed
-    )
+    seed, attitude = recipe.seed, recipe.attitude
+
+    def build() -> list[WorldStream]:
+        return captured_streams(read_vicon_walks(walks), seed, attitude)
+
+    return simulated_streams("captured", build, folder, walks, seed, attitude)
 
 
-def _generated(count: int, seed: int, folder: Path) -> list[WorldStream]:
+def _generated(count: int, seed: int, attitude: Attitude, folder: Path) -> list[WorldStream]:
     from stario.network.data import generated_streams, simulated_streams
 
-    return simulated_streams(
-        "generated", lambda: generated_streams(count, 60.0, seed), folder, count, seed
-    )
+    def build() -> list[WorldStream]:
+        return generated_streams(count, 60.0, seed, attitude)
+
+    return simulated_streams("generated", build, folder, count, seed, attitude)

@@ -104,7 +104,7 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
     pairs = [(e.time[k], e.attitudes[k]) for e in epochs for k in range(len(e.time) - 1)]
     time, R = zip(*pairs, strict=True)
     truth = Trajectory(np.array(time), np.zeros((len(time), 3)), Rotation.from_matrix(np.stack(R)))
-    (stream,) = world_streams(replace(walk, truth=truth))
+    (stream,) = world_streams(replace(walk, truth=truth), attitude="true")
     theirs, _ = windows_of(stream, 20)
     ours = np.stack([e.window for e in epochs if e.window is not None])
     n = min(len(ours), len(theirs))

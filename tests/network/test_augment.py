@@ -43,7 +43,8 @@ def path(speed: float = 1.0, yaw: float = 0.0, mirrored: bool = False) -> Trajec
 
 def stream_of(trajectory: Trajectory, name: str = "path") -> WorldStream:
     """What a perfect IMU measures on the way."""
-    (stream,) = world_streams(simulate_imu(trajectory, errors=PERFECT_IMU, name=name))
+    recording = simulate_imu(trajectory, errors=PERFECT_IMU, name=name)
+    (stream,) = world_streams(recording, attitude="true")
     return stream
 
 

@@ -2,13 +2,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.intake import all_epochs
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import about_z
+from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulate import PERFECT_IMU, simulate_imu
 from stario.sequences.walks import WalkStyle, generate_walk
-from stario.sequences.windows import clean_samples, resample, windows_of, world_streams
+from stario.sequences.windows import (
+    Attitude,
+    clean_samples,
+    resample,
+    windows_of,
+    world_streams,
+)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +72,8 @@ def test_faster_sensors_are_averaged_and_do_not_alias() -> None:
 def test_streams_of_any_rate_show_the_same_walk(
     track: Trajectory, walk: ImuSequence, rate: float
 ) -> None:
-    (true,) = world_streams(walk)
-    (stream,) = world_streams(simulate_imu(track, rate=rate, errors=PERFECT_IMU))
+    (true,) = world_streams(walk, attitude="true")
+    (stream,) = world_streams(simulate_imu(track, rate=rate, errors=PERFECT_IMU), attitude="true")
     n = min(len(true), len(stream))
     off = np.abs(stream.imu_W[:n] - true.imu_W[:n])[2:-2]
     assert off[:, :3].mean() < (0.05 if rate < 200.0 else 0.01)
@@ -73,7 +82,7 @@ def test_streams_of_any_rate_show_the_same_walk(
 
 
 def test_the_target_is_the_displacement_of_the_windows_second(walk: ImuSequence) -> None:
-    (stream,) = world_streams(walk)
+    (stream,) = world_streams(walk, attitude="true")
     windows, targets = windows_of(stream, stride=50)
     assert windows.shape == (len(targets), 6, 200)
     truth = truth_of(walk)
@@ -90,7 +99,7 @@ def test_the_target_is_the_displacement_of_the_windows_second(walk: ImuSequence)
 
 def test_a_window_holds_the_motion_of_its_target(walk: ImuSequence) -> None:
     """Force integrated twice from the true first velocity gives the target: no shift in time."""
-    (stream,) = world_streams(walk)
+    (stream,) = world_streams(walk, attitude="true")
     velocity = truth_of(walk).velocity_W
     assert velocity is not None
     windows, targets = windows_of(stream, stride=100)
@@ -147,6 +156,44 @@ def test_turning_the_world_turns_window_and_target_alike(walk: ImuSequence) -> N
         assert np.abs(rows - turned_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
 
 
+def test_a_truth_that_is_mounted_askew_does_not_show_in_levelled_windows() -> None:
+    """Under it the mean specific force leans to where the device faces: a clue that use lacks."""
+    style = WalkStyle(carry="handheld")
+    walk = simulate_imu(generate_walk(7, 60.0, rate=200.0, style=style), 200.0, PERFECT_IMU)
+    truth = truth_of(walk)
+    askew = truth.attitude_WB * Rotation.from_rotvec([0.05, 0.0, 0.0])
+    tilted = replace(walk, truth=replace(truth, attitude_WB=askew))
+    settled = slice(20 * 200, None)
+
+    def off(attitude: Attitude) -> float:
+        (right,) = world_streams(walk, attitude=attitude)
+        (wrong,) = world_streams(tilted, attitude=attitude)
+        np.testing.assert_array_equal(right.position_W, wrong.position_W)
+        return float(np.abs(right.imu_W - wrong.imu_W)[settled, 3:5].mean())
+
+    assert off("true") > 0.2  # 9.8 sin 0.05 along one of two axes
+    assert off("levelled") < 0.02
+
+
+def test_levelled_windows_are_the_navigators_but_for_their_heading() -> None:
+    walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
+    (stream,) = world_streams(walk)
+    epochs, _ = all_epochs(walk, NavigatorConfig())
+    true_WB = truth_of(walk).attitude_WB
+    compared = 0
+    for epoch in epochs:
+        if epoch.window is None:
+            continue
+        first = round((epoch.stop - 1.0) * 200)
+        theirs = stream.imu_W[first : first + 200].T
+        levelled_NB = Rotation.from_matrix(epoch.R_NB_window)
+        turn = about_z(yaw_of(true_WB[first] * levelled_NB.inv()))
+        ours = np.concatenate([turn.apply(epoch.window[k : k + 3].T) for k in (0, 3)], axis=1).T
+        assert np.abs(ours - theirs).mean() < 0.1
+        compared += 1
+    assert compared > 25
+
+
 def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
     time[10], time[20], time[30] = time[9], time[5], np.nan
@@ -154,8 +201,8 @@ def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
     kept, _, _ = clean_samples(ImuSequence("bad", time, gyro, accel))
     expected = np.delete(walk.time, [10, 20, 30, 40, 50])
     assert np.array_equal(kept, expected)
-    (stream,) = world_streams(ImuSequence("bad", time, gyro, accel, walk.truth))
-    (true,) = world_streams(walk)
+    (stream,) = world_streams(ImuSequence("bad", time, gyro, accel, walk.truth), attitude="true")
+    (true,) = world_streams(walk, attitude="true")
     assert np.isfinite(stream.imu_W).all()
     assert np.abs(stream.position_W - true.position_W).max() < 1e-4
 

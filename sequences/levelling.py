@@ -2,7 +2,8 @@
 
 N is the frame this attitude is given in: gravity-aligned like W, its yaw zero at the start and
 drifting with the gyroscope. It needs neither truth nor network, so that windows can be prepared
-before any filter runs, and streaming and batch see the same ones.
+before any filter runs, streaming and batch see the same ones, and a network can be trained on what
+it will be shown.
 
 The tilt is corrected by a proportional-integral loop (Mahony et al. 2008): the specific force,
 averaged over an update period and seen in N, should point up; the mean of a walker's acceleration
@@ -13,12 +14,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stario.fusion.lie import exp_so3
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import FloatArray
+
+LEVELLING_RATE = 0.06
+"""Natural frequency of the levelling loop [rad/s]."""
+
+PERIOD = 0.1
+"""Between corrections of the tilt [s]."""
+
+START_SECONDS = 1.0
+"""Length of the stretch whose mean specific force levels the first attitude [s]."""
 
 STILL_ACCEL = 0.3
 """Deviation of the specific force [m/s^2] below which a device counts as held still."""
@@ -72,14 +83,37 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
-    """Attitudes (n + 1, 3, 3) at the samples from the one at the first sample."""
+    """Attitudes (n + 1, 3, 3) at the samples from the one at the first sample.
+
+    Mean rate and coning (Savage 1998), as in the filter's preintegration.
+    """
     dt = np.diff(time)[:, None]
-    # Mean rate and coning: the rotation vectors of `corrected_increments`, without its force.
     turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * np.cross(gyro[:-1], gyro[1:]))
     attitudes = np.empty((len(time), 3, 3))
     attitudes[0] = R_NB
-    for k, turn in enumerate(exp_so3(turns)):
+    for k, turn in enumerate(_exp(turns)):
         np.matmul(attitudes[k], turn, out=attitudes[k + 1])
+    return attitudes
+
+
+def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+    """Attitudes R_NB (n, 3, 3) at the samples of an unbroken stretch, as in use.
+
+    Args:
+        time: (n,) [s].
+        gyro: (n, 3) [rad/s] in B.
+        accel: (n, 3) [m/s^2] in B.
+    """
+    first = np.searchsorted(time, time[0] + START_SECONDS, side="right")
+    start = start_from_gravity(time[:first], gyro[:first], accel[:first])
+    loop = LevelledAttitude(start.R_WB, LEVELLING_RATE)
+    grid = np.arange(time[0] + PERIOD, time[-1], PERIOD)
+    ends = np.unique([0, *np.searchsorted(time, grid), len(time) - 1])
+    attitudes = np.empty((len(time), 3, 3))
+    attitudes[0] = start.R_WB
+    for begin, end in pairwise(ends.tolist()):
+        part = slice(begin, end + 1)
+        attitudes[part] = loop.advance(time[part], gyro[part], accel[part])
     return attitudes
 
 
@@ -125,5 +159,9 @@ class LevelledAttitude:
         error = np.array([up[1], -up[0], 0.0])
         if loop <= self._rate:
             self._bias_N -= self._rate**2 * dt * error
-        turned: FloatArray = exp_so3(1.414 * loop * dt * error) @ attitudes[-1]
+        turned: FloatArray = _exp(1.414 * loop * dt * error) @ attitudes[-1]
         return turned
+
+
+def _exp(theta: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_rotvec(theta).as_matrix())
