@@ -36,6 +36,8 @@ from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
+_NO_GAIN = np.zeros(3)
+
 _FAR = 1e3
 """Farther from the world's origin than this [m] positions are counted from a point nearby: in the
 right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
@@ -352,23 +354,28 @@ class StateCloningEkf(ErrorStateEngine):
         covariance: FloatArray,
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
+        gain_W: FloatArray = _NO_GAIN,
+        seconds: float = 0.0,
     ) -> UpdateResult:
         """Mean velocity of the window that ends now, for users who want no clones.
 
-        It is held against the current velocity. The two differ by about half the window times the
-        mean acceleration: the caller adds the IMU's own change of velocity, or inflates the
-        covariance by it. The yaw error enters as in `update_displacement`, v = (I + theta_z [e3]x)
-        v_mean + n, taken at the current pose.
+        The IMU's own gain since that mean makes it the velocity now, v = m + gain, and is as wrong
+        as attitude and accelerometer bias. The yaw error enters as in `update_displacement`,
+        m = (I + theta_z [e3]x) v_mean + n, taken at the current pose.
 
         Args:
             v_mean_W: (3,) [m/s] in the estimated world.
             covariance: (3, 3) [m^2/s^2].
             gate: NIS from which the measurement counts as an outlier, None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
+            gain_W: (3,) velocity now minus its mean over the window [m/s], from the IMU alone.
+            seconds: length of the window [s]; 0 for a velocity of now.
         """
-        v_W = self.v_W
-        blocks = mean_velocity_jacobian(v_W)
-        return self.update_linear(v_mean_W - v_W, blocks, covariance, gate, gate_mode)
+        X = self._X[0]
+        force_W = gain_W + np.array([0.0, 0.0, 0.5 * seconds * self.gravity])
+        blocks = mean_velocity_jacobian(X[:, 3], force_W, X[:, :3], seconds)
+        residual = v_mean_W + gain_W - X[:, 3]
+        return self.update_linear(residual, blocks, covariance, gate, gate_mode)
 
     def update_position_W(
         self,

@@ -20,6 +20,7 @@ CLONE = 6
 Block = tuple[int, FloatArray]
 """First column of the error state a Jacobian block stands at, and the block (m, width)."""
 
+_ACCEL_BIAS = 12
 _EYE = np.eye(3)
 _LAST_EYE = np.eye(3, CLONE, k=3)
 _LAST_MINUS_EYE = -_LAST_EYE
@@ -43,11 +44,24 @@ def displacement_jacobian(
     return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
 
 
-def mean_velocity_jacobian(v_W: FloatArray) -> list[Block]:
-    """Jacobian of a velocity seen in the estimated world: theta -[v]x - (e3 x v) e3^T, rho_v I."""
+def mean_velocity_jacobian(
+    v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
+) -> list[Block]:
+    """Jacobian of the residual of `StateCloningEkf.update_mean_velocity`.
+
+    With the mean m = v - gain and the force's part F of the gain, its errors -[F]x theta and
+    -R T/2 d_ba: theta -[v]x + [F]x - (e3 x m) e3^T, rho_v I, d_ba R T/2. Gravity being vertical,
+    the column of yaw is zero.
+
+    Args:
+        v_W: (3,) velocity now [m/s].
+        force_W: (3,) F [m/s].
+        R_WB: (3, 3) attitude.
+        seconds: length T of the window [s].
+    """
     H = np.zeros((3, CLONE))
-    H[:, :2], H[:, 3:] = -skew(v_W)[:, :2], _EYE
-    return [(0, H)]
+    H[:, :2], H[:, 3:] = skew(force_W - v_W)[:, :2], _EYE
+    return [(0, H), (_ACCEL_BIAS, 0.5 * seconds * R_WB)]
 
 
 def position_jacobian(p_W: FloatArray) -> list[Block]:

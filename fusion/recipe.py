@@ -25,6 +25,7 @@ from stario.fusion.history import Measurement as Measurement
 from stario.fusion.innovations import InnovationLog, count, is_gated
 from stario.fusion.jacobians import yaw_twist
 from stario.fusion.lie import exp_so3
+from stario.fusion.motion import WindowMotion
 from stario.fusion.preintegration import Segment
 from stario.fusion.rest import RestDetector
 from stario.fusion.segments import segment_of
@@ -118,11 +119,10 @@ class FilterRecipe:
             slots=f.window_updates if self._uses_clones else 0, gravity=config.gravity
         )
         self._slots: deque[int] = deque()
-        per_window = round(f.output_rate * WINDOW_SECONDS)
-        self._velocity_steps: deque[FloatArray] = deque(maxlen=per_window)
+        self._motion = WindowMotion()
         self._gates = {n: float(chi2.ppf(f.gate, n)) for n in (3, 6)}
         self._log = InnovationLog(keep_rows=not streaming)
-        self._rest = RestDetector(per_window, f.rest_noise)
+        self._rest = RestDetector(round(f.output_rate * WINDOW_SECONDS), f.rest_noise)
         self.held: Held | None = None
         self.segment: Segment | None = None
         self.accepted: list[Fix] = []
@@ -197,7 +197,7 @@ class FilterRecipe:
             "slots": list(self._slots),
             "gated_since": self._gated_since,
             "smoothed": self.smoothed and vars(self.smoothed),
-            "velocity_steps": list(self._velocity_steps),
+            "motion": self._motion.checkpoint(),
             "log": self._log.checkpoint(),
             "rest": self._rest.checkpoint(),
             "world": self._world.checkpoint(),
@@ -210,9 +210,7 @@ class FilterRecipe:
         self._gated_since = checkpoint["gated_since"]
         smoothed = checkpoint["smoothed"]
         self.smoothed = None if smoothed is None else SmoothedPose(**smoothed)
-        self._velocity_steps = deque(
-            checkpoint["velocity_steps"], maxlen=self._velocity_steps.maxlen
-        )
+        self._motion.rewind(checkpoint["motion"])
         self._log.rewind(checkpoint["log"])
         self._rest.rewind(checkpoint["rest"])
         self._world.rewind(checkpoint["world"])
@@ -276,12 +274,11 @@ class FilterRecipe:
         self._world.lose_yaw(ekf)
 
     def _propagate(self, epoch: Epoch) -> None:
-        ekf, p_W = self.ekf, self.ekf.p_W
-        before = None if self._uses_clones else ekf.v_W
+        ekf, v_W, p_W = self.ekf, self.ekf.v_W, self.ekf.p_W
         self.segment = segment_of(epoch, ekf.R_WB, ekf.b_g, ekf.b_a, self._config)
         ekf.propagate(self.segment)
-        if before is not None:
-            self._velocity_steps.append(ekf.v_W - before)
+        if not self._uses_clones:
+            self._motion.add(epoch.stop - epoch.start, v_W, p_W, ekf.v_W, ekf.p_W)
         if epoch.gap:
             ekf.loosen_yaw(p_W, min(GAP_TURN * (epoch.stop - epoch.start), UNKNOWN_YAW))
             self._world.lose_yaw(ekf)
@@ -292,9 +289,7 @@ class FilterRecipe:
         if result.accepted:
             self.accepted.append(fix)
         if change is not None:
-            turned = [change.R @ step for step in self._velocity_steps]
-            self._velocity_steps.clear()
-            self._velocity_steps.extend(turned)
+            self._motion.turn(change.R)
 
     def _hold_still(self) -> Held | None:
         ekf, noise = self.ekf, self._config.noise
@@ -355,16 +350,16 @@ class FilterRecipe:
         R_WN = yaw_between(self.ekf.R_WB, epoch.R_NB)
         mean_W = R_WN @ displacement_N / WINDOW_SECONDS
         covariance = R_WN @ covariance_N @ R_WN.T / WINDOW_SECONDS**2
+        # White noise of the force, weighted as the gain weights it.
+        white = self._config.noise.accel_noise**2 * WINDOW_SECONDS / 3.0
         return self.ekf.update_mean_velocity(
-            mean_W + self._velocity_gain(), covariance, self._gates[3], gate_mode
+            mean_W,
+            covariance + white * np.eye(3),
+            self._gates[3],
+            gate_mode,
+            self._motion.gain(),
+            WINDOW_SECONDS,
         )
-
-    def _velocity_gain(self) -> FloatArray:
-        """Current velocity minus its mean over the window, from the IMU alone (trapezoids)."""
-        gain, n = np.zeros(3), len(self._velocity_steps)
-        for age, step in enumerate(reversed(self._velocity_steps)):
-            gain += step * (n - age - 0.5) / n
-        return gain
 
     def _clone(self, time: float) -> None:
         if len(self._slots) == self.ekf.slots:
@@ -385,7 +380,7 @@ class FilterRecipe:
         """No displacement spans a gap: its clones are of no more use."""
         while self._slots:
             self.ekf.release(self._slots.popleft())
-        self._velocity_steps.clear()
+        self._motion.clear()
         self._gated_since = None
 
 

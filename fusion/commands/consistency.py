@@ -15,27 +15,21 @@ from stario.fusion.commands.common import JsonOption, print_json, progress_bar
 def consistency(
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="TOML or JSON file: noise and first sigmas are its own."),
+        typer.Option("--config", help="TOML or JSON file; else the defaults."),
     ] = None,
     yaw: Annotated[float, typer.Option(min=0.0, help="Sigma of the first yaw in deg.")] = 10.0,
     runs: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Length of each in s.")] = 300.0,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Length of each in s.")] = 300.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the first run.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Monte Carlo on simulated walks: NEES, NIS and yaw against what an honest filter shows."""
-    from stario.fusion.config import read_config
-    from stario.fusion.consistency import Trial, trial_of
+    from stario.fusion.config import NavigatorConfig, read_config
     from stario.fusion.consistency import consistency as monte_carlo
-    from stario.sequences.noise import ImuNoise
 
-    yaw_sigma = max(math.radians(yaw), 1e-6)
-    if config is None:
-        trial = Trial(noise=ImuNoise(), yaw_sigma=yaw_sigma)
-    else:
-        trial = trial_of(read_config(config), yaw_sigma)
+    checked = read_config(config) if config else NavigatorConfig()
     with progress_bar("consistency") as progress:
-        result = monte_carlo(trial, runs, seconds, seed, progress)
+        result = monte_carlo(checked, max(math.radians(yaw), 1e-6), runs, seconds, seed, progress)
     if as_json:
         print_json(asdict(result))
         return

@@ -4,11 +4,14 @@ The average NEES of N runs of an honest filter follows chi-square with 15 N degr
 divided by N.
 """
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.consistency import Consistency, Trial, analytic_walk, consistency, trial_of
+from stario.fusion.consistency import Consistency, analytic_walk, consistency
 from stario.fusion.lie import exp_so3
 from stario.fusion.preintegration import preintegrate
 from stario.sequences.errors import InputError
@@ -16,11 +19,12 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulate import PHONE_IMU
 
-TRIAL = Trial(noise=ImuNoise())
-PHONE = Trial(
+CONFIG = NavigatorConfig(noise=ImuNoise())
+PHONE = NavigatorConfig(
     noise=PHONE_IMU.noise,
-    gyro_bias_sigma=PHONE_IMU.gyro_turn_on,
-    accel_bias_sigma=PHONE_IMU.accel_turn_on,
+    filter=FilterConfig(
+        gyro_bias_sigma=PHONE_IMU.gyro_turn_on, accel_bias_sigma=PHONE_IMU.accel_turn_on
+    ),
 )
 
 
@@ -33,12 +37,12 @@ def assert_honest(result: Consistency) -> None:
 
 
 def test_nees_of_a_minute_is_within_its_bounds() -> None:
-    assert_honest(consistency(TRIAL, seconds=60.0))
+    assert_honest(consistency(CONFIG, seconds=60.0))
 
 
 @pytest.mark.slow
 def test_nees_of_five_minutes_is_within_its_bounds() -> None:
-    result = consistency(TRIAL, seconds=300.0)
+    result = consistency(CONFIG, seconds=300.0)
     assert 12.7 < result.nees < 17.5
     assert_honest(result)
 
@@ -65,23 +69,29 @@ def test_the_analytic_walk_is_its_own_dead_reckoning() -> None:
 
 
 def test_runs_come_from_the_seed() -> None:
-    first, again = (consistency(TRIAL, runs=2, seconds=5.0, seed=3) for _ in range(2))
+    first, again = (consistency(CONFIG, runs=2, seconds=5.0, seed=3) for _ in range(2))
     assert first == again
-    assert first != consistency(TRIAL, runs=2, seconds=5.0, seed=4)
+    assert first != consistency(CONFIG, runs=2, seconds=5.0, seed=4)
 
 
-def test_a_trial_takes_its_sizes_from_a_configuration() -> None:
-    config = NavigatorConfig(
-        ImuNoise(gyro_noise=5e-3), FilterConfig(tilt_sigma=0.2, gyro_bias_sigma=7e-3), gravity=9.81
-    )
-    trial = trial_of(config, 0.3)
-    assert trial.noise.gyro_noise == 5e-3
-    assert (trial.tilt_sigma, trial.gyro_bias_sigma, trial.gravity) == (0.2, 7e-3, 9.81)
-    np.testing.assert_allclose(trial.sigma[:3], [0.2, 0.2, 0.3])
-    assert any("expected 15" in line for line in consistency(trial, 1, 2.0).lines())
+@pytest.mark.parametrize(
+    "settings",
+    [{"update_rate": 1}, {"update_rate": 10, "covariance_scale": 1.0}, {"measurement": "velocity"}],
+)
+def test_every_way_of_measuring_knows_how_wrong_it_is(settings: dict[str, Any]) -> None:
+    config = replace(CONFIG, filter=replace(CONFIG.filter, **settings))
+    result = consistency(config, runs=10, seconds=30.0)
+    # Chi-square with 150 degrees of freedom, over ten runs: 0.999 of it lies below 20.9.
+    assert 10.0 < result.nees_end < 20.9
+    assert 2.0 < result.nis < 3.6
 
 
-@pytest.mark.parametrize(("runs", "seconds"), [(0, 10.0), (1, 0.5), (1, np.nan)])
+def test_the_report_names_what_is_expected() -> None:
+    lines = consistency(CONFIG, runs=1, seconds=2.0).lines()
+    assert any("expected 15" in line for line in lines)
+
+
+@pytest.mark.parametrize(("runs", "seconds"), [(0, 10.0), (1, 1.5), (1, np.nan)])
 def test_nothing_to_run_is_refused(runs: int, seconds: float) -> None:
     with pytest.raises(InputError, match="at least 1 run"):
-        consistency(TRIAL, runs, seconds)
+        consistency(CONFIG, runs=runs, seconds=seconds)

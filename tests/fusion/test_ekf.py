@@ -102,17 +102,23 @@ def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None
 
 
 def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
-    v, step = np.array([1.0, -0.5, 0.2]), 1e-6
+    """The mean is the velocity now less what the force, and gravity, have added since."""
+    v, force, step = np.array([1.0, -0.5, 0.2]), np.array([0.4, -0.3, 5.1]), 1e-6
+    R_WB, seconds = exp_so3(np.array([0.5, -0.2, 1.0])), 0.8
+    fall = 0.5 * seconds * STANDARD_GRAVITY * YAW
 
     def measured(error: np.ndarray) -> np.ndarray:
-        R, shift, _ = exp_se23(np.concatenate([error, np.zeros(3)]))
-        return exp_so3(-error[2] * YAW) @ (R @ v + shift)
+        R, shift, _ = exp_se23(error[:9])
+        by_bias = -0.5 * seconds * R @ R_WB @ error[12:]
+        mean = R @ v + shift - (R @ force + by_bias - fall)
+        return exp_so3(-error[2] * YAW) @ mean
 
     numeric = np.stack(
-        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(6)], axis=1
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(15)], axis=1
     )
-    [(first, H)] = mean_velocity_jacobian(v)
-    assert first == 0
+    H = np.zeros((3, 15))
+    for first, block in mean_velocity_jacobian(v, force, R_WB, seconds):
+        H[:, first : first + block.shape[1]] += block
     np.testing.assert_allclose(H, numeric, atol=1e-6)
 
 
@@ -121,7 +127,9 @@ def test_measurements_do_not_see_yaw(driven: StateCloningEkf) -> None:
     yaw[2] = 1.0
     yaw[15 + 2 :: 6] = 1.0
     p_i, p_j = driven.clone_pose(0)[1], driven.p_W
-    for blocks in (displacement_jacobian(p_i, p_j, 0, None), mean_velocity_jacobian(driven.v_W)):
+    v, R, force = driven.v_W, driven.R_WB, np.array([0.4, -0.3, 5.1])
+    by_velocity = mean_velocity_jacobian(v, force, R, 1.0)
+    for blocks in (displacement_jacobian(p_i, p_j, 0, None), by_velocity):
         turned = sum(H @ yaw[first : first + H.shape[1]] for first, H in blocks)
         np.testing.assert_array_equal(turned, 0.0)
 
