@@ -10,13 +10,14 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.many import distinct_name
 from stario.fusion.navigator import Navigator
 from stario.fusion.tracks import network_track, network_track_true_attitude
 from stario.network.cost import table_cost
@@ -145,15 +146,18 @@ def compare_networks(
     """
     parameters = {model.name: table_cost(model.name).parameters for _, model in models}
     table, skipped = NetworkTable(convention, parameters), []
+    names: set[str] = set()
     work = partial(_tracks, models=models, config=config, read=read, convention=convention)
     for done, outcome in enumerate(each(work, paths, jobs), 1):
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
         else:
             entries, sample = outcome
-            table.entries.extend(entries)
+            name = distinct_name(sample.recording, names)
+            names.add(name)
+            table.entries.extend(replace(entry, recording=name) for entry in entries)
             if len(table.samples) < samples:
-                table.samples.append(sample)
+                table.samples.append(replace(sample, recording=name))
         progress(done / len(paths))
     return table, skipped
 

@@ -52,13 +52,19 @@ class Augmentation:
     accel_noise: float = 0.08
 
     def __post_init__(self) -> None:
-        slow, fast = self.speeds
-        if not 0.0 < slow <= fast <= 10.0:
+        if not _is_range(self.speeds):
             raise ConfigError("speeds", repr(self.speeds), "two factors, slow then fast, above 0")
         for item in fields(self)[1:]:
             value = getattr(self, item.name)
             if not (isinstance(value, int | float) and 0.0 <= value < 100.0):
                 raise ConfigError(item.name, repr(value), "a finite number >= 0")
+
+
+def _is_range(speeds: object) -> bool:
+    match speeds:
+        case (int() | float() as slow, int() | float() as fast):
+            return 0.0 < slow <= fast <= 10.0
+    return False
 
 
 def reach_of(augmentation: Augmentation, successive: int = 1) -> int:

@@ -20,6 +20,7 @@ from stario.sequences.files import atomic_write
 def write_checkpoint(
     path: Path,
     config: TrainingConfig,
+    material: str,
     step: int,
     history: list[dict[str, Any]],
     tensors: Mapping[str, Tensor],
@@ -29,12 +30,14 @@ def write_checkpoint(
     Args:
         path: of the file.
         config: the run's recipe.
+        material: what tells the recordings it learns from and the weights it began with.
         step: steps done.
         history: reports of the epochs so far, as plain values.
         tensors: by name.
     """
     metadata = {
         "config": json.dumps(asdict(config)),
+        "material": material,
         "step": str(step),
         "history": json.dumps(history),
     }
@@ -44,12 +47,12 @@ def write_checkpoint(
 
 
 def read_checkpoint(
-    path: Path, config: TrainingConfig
+    path: Path, config: TrainingConfig, material: str
 ) -> tuple[int, list[dict[str, Any]], dict[str, Tensor]]:
-    """The steps done, the history and the tensors of a run with this recipe.
+    """The steps done, the history and the tensors of a run with this recipe and material.
 
     Raises:
-        ConfigError: the file was written by another recipe.
+        ConfigError: the file was written by another recipe, or by one that learned from others.
         ReadError: it cannot be read.
     """
     try:
@@ -61,13 +64,21 @@ def read_checkpoint(
     if not metadata or "config" not in metadata:
         raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of this command")
     _check_same(path, json.loads(metadata["config"]), config)
+    # Checkpoints older than this do not tell.
+    if metadata.get("material", material) != material:
+        raise ConfigError(
+            str(path),
+            "a run on other recordings, or from other first weights",
+            "those of this run",
+            "resume with the same ones or train into another folder (--out)",
+        )
     return int(metadata["step"]), json.loads(metadata["history"]), tensors
 
 
 def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
     expected = json.loads(json.dumps(asdict(config)))
-    # Checkpoints older than this setting are of runs without it.
-    found = {"successive": 1, **found}
+    # Checkpoints older than these settings are of runs without them.
+    found = {"successive": 1, "attitude": "true", **found}
     for name in expected:
         if found.get(name) != expected[name]:
             raise ConfigError(

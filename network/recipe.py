@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, fields
 import torch
 from torch import Tensor
 
+from stario.network.architectures import ARCHITECTURES
 from stario.network.augment import Augmentation
 from stario.sequences.errors import ConfigError
 from stario.sequences.windows import Attitude
@@ -98,7 +99,13 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and low <= value <= high):
                 raise ConfigError(name, repr(value), f"a number from {low} to {high}")
-        if self.dropout is not None and not 0.0 <= self.dropout < 1.0:
+        if self.architecture not in ARCHITECTURES:
+            known = f"one of {', '.join(ARCHITECTURES)}"
+            raise ConfigError("architecture", repr(self.architecture), known)
+        if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
+            raise ConfigError("seed", repr(self.seed), "a count from 0 to below 2^31")
+        dropout = 0.0 if self.dropout is None else self.dropout
+        if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
             raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
         if self.precision not in ("float32", "bfloat16"):
             raise ConfigError("precision", repr(self.precision), "float32 or bfloat16")
@@ -156,6 +163,6 @@ def training_config(values: dict[str, object]) -> TrainingConfig:
     for name in augmentation:
         if name not in allowed:
             raise ConfigError(f"augmentation.{name}", "unknown key", f"one of {sorted(allowed)}")
-    if "speeds" in augmentation:
+    if isinstance(augmentation.get("speeds"), list):
         augmentation = {**augmentation, "speeds": tuple(augmentation["speeds"])}
     return TrainingConfig(augmentation=Augmentation(**augmentation), **values)  # type: ignore[arg-type]

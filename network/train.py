@@ -5,6 +5,7 @@ What is evaluated and saved is the running average of the weights.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import math
@@ -76,17 +77,20 @@ def train(
     Raises:
         InputError: no stretch to learn from or to validate on, or the loss of a step is not
             finite. The folder then holds the last epoch's checkpoint, as it was.
-        ConfigError: the checkpoint belongs to another recipe, or the batch cannot be shared out to
-            the processes that the launcher started.
+        ConfigError: the checkpoint belongs to another recipe or other recordings, or the batch
+            cannot be shared out to the processes that the launcher started.
     """
     if not streams or not validation:
         raise InputError("streams", "none", "stretches of at least 2 s with truth")
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
-        run = _Run(config, sampler, folder, these)
+        material = _material([streams, validation], weights, start_from)
+        run = _Run(config, sampler, material, folder, these)
         if start_from is not None:
             run.start_from(start_from)
         run.resume()
+        if run.step >= config.steps:
+            log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
         held_out = ValidationSet(validation, run.device)
         while run.step < config.steps and run.epochs_since_best() < config.patience:
             report = run.report(run.epoch(on_step), held_out)
@@ -101,11 +105,16 @@ class _Run:
     """State of a training run: network, optimiser, averaged weights, history."""
 
     def __init__(
-        self, config: TrainingConfig, sampler: WindowSampler, folder: Path, workers: Workers
+        self,
+        config: TrainingConfig,
+        sampler: WindowSampler,
+        material: str,
+        folder: Path,
+        workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.sampler, self.folder = config, sampler, folder
-        self.workers, self.device = workers, workers.device
+        self.workers, self.device, self._material = workers, workers.device, material
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint = folder / "checkpoint.safetensors"
         if config.dropout is not None:
@@ -238,18 +247,18 @@ class _Run:
         tensors["random.sampler"] = self.sampler.generator.get_state()
         tensors["random.torch"] = torch.get_rng_state()
         history = [asdict(r) for r in self.history]
-        write_checkpoint(self._checkpoint, self.config, self.step, history, tensors)
+        write_checkpoint(self._checkpoint, self.config, self._material, self.step, history, tensors)
 
     def resume(self) -> None:
         """Continue from the folder's checkpoint, if there is one.
 
         Raises:
-            ConfigError: it was written by another recipe.
+            ConfigError: it was written by another recipe, or learned from other recordings.
             ReadError: it cannot be read.
         """
         if not self._checkpoint.exists():
             return
-        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config)
+        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
         self.history = [EpochReport(**report) for report in history]
         self._restore(tensors)
         log.info("resumed %s at step %d", self._checkpoint, self.step)
@@ -303,6 +312,20 @@ def _sampler(
             raise InputError("streams", "none long enough", f"one of {reach} samples at 200 Hz")
         streams, weights = [s for s, _ in pairs], [w for _, w in pairs]
     return WindowSampler(streams, weights, config.augmentation, config.seed, config.successive)
+
+
+def _material(
+    streams: Sequence[Sequence[WorldStream]],
+    weights: Sequence[float],
+    start_from: DisplacementModel | None,
+) -> str:
+    """Digest of what a run learns from, is validated on and begins with."""
+    told = [
+        [[(stream.name, len(stream)) for stream in part] for part in streams],
+        [f"{weight:.6g}" for weight in weights],
+        start_from.card.sha256 if start_from else "",
+    ]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
 def _or_infinite(error: float) -> float:

@@ -43,6 +43,8 @@ def backends(
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
     from stario.fusion.backends import score_recording, score_table, score_walk, summary
+    from stario.sequences.batch import Skipped
+    from stario.sequences.errors import StarioError
     from stario.sequences.splits import split_paths
 
     scores: list[Score] = []
@@ -52,7 +54,10 @@ def backends(
         settings, network = estimating.settings(), estimating.network()
         with progress_bar("backends", len(files)) as progress:
             for k, file in enumerate(files, 1):
-                scores.append(score_recording(network, reading.read(file), settings))
+                try:
+                    scores.append(score_recording(network, reading.read(file), settings))
+                except StarioError as error:
+                    skipped.append(Skipped(str(file), str(error)))
                 progress(k / len(files))
     else:
         with progress_bar("backends", walks) as progress:

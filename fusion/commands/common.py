@@ -194,8 +194,14 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
         yield advance
 
 
+_WHOLE = 0.98
+"""A track of which the truth covers less is said to be compared in part."""
+
+
 def track_table(metrics: dict[str, dict[str, float | None]]) -> str:
-    """A row of figures for each track."""
+    """A row of figures for each track, and what they mean where there is truth."""
+    from stario.fusion.compare import METRIC_WORDS
+
     columns = {
         "ate_m": "ATE [m]",
         "rte_m": "RTE [m]",
@@ -210,6 +216,11 @@ def track_table(metrics: dict[str, dict[str, float | None]]) -> str:
     for name, figures in metrics.items():
         cells = [figures.get(key) for key in columns]
         lines.append(f"{name:<22}" + "".join(f"{_cell(value):>12}" for value in cells))
+    covered = [c for figures in metrics.values() if (c := figures["coverage"]) is not None]
+    if covered:
+        lines += [f"{key}: {METRIC_WORDS[key]}." for key in ("ate_m", "rte_m", "alignment")]
+    if covered and min(covered) < _WHOLE:
+        lines.append(f"The truth covers {min(covered):.0%} of the track: figures are of that part.")
     return "\n".join(lines)
 
 

@@ -47,8 +47,9 @@ def evaluate(
         Path, typer.Option(help="Folder of training runs, where named networks are found.")
     ] = Path("runs"),
     convention: Annotated[
-        str, typer.Option(help="How --models averages position errors: rms, ronin, mean.")
-    ] = "rms",
+        str | None,
+        typer.Option(help="How --models averages position errors: rms (default), ronin, mean."),
+    ] = None,
     jobs: JobsOption = 1,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -58,16 +59,20 @@ def evaluate(
     from stario.fusion.many import compare_recordings
     from stario.fusion.results import write_recording, write_summary
     from stario.sequences.batch import Skipped
+    from stario.sequences.errors import InputError
     from stario.sequences.splits import split_paths
 
     files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
     if models is not None:
-        named = [name.strip() for name in models.split(",")]
-        skipped += _networks(
-            named, runs, files, estimating.settings(), reading, convention, jobs, out, as_json
-        )
+        named, settings = [name.strip() for name in models.split(",")], estimating.settings()
+        averaged = convention or "rms"
+        skipped += _networks(named, runs, files, settings, reading, averaged, jobs, out, as_json)
         leave_with_skipped(skipped)
         return
+    if convention is not None:
+        raise InputError(
+            "--convention", f"{convention} without --models", "rms", "name networks by --models"
+        )
     settings, network = estimating.settings(), estimating.network_for(jobs)
     recordings = []
     with progress_bar("evaluate", 100 * len(files)) as progress:

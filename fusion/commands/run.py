@@ -52,21 +52,25 @@ def run(
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     names: set[str] = set()
+    records: list[dict[str, object]] = []
     for file in files:
         try:
             sequence = reading.read(file)
             name = distinct_name(sequence.name, names)
             names.add(name)
             folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-            _run(navigator, sequence, known, folder, as_json)
+            records.append(_run(navigator, sequence, known, folder, told=not as_json))
         except StarioError as error:
             skipped.append(Skipped(str(file), str(error)))
+    if as_json and records:
+        print_json(records[0] if len(files) == 1 else records)
     leave_with_skipped(skipped)
 
 
 def _run(
-    navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, as_json: bool
-) -> None:
+    navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, told: bool
+) -> dict[str, object]:
+    """Write one recording's track, tell of it on stdout, return its record for programs."""
     from stario.fusion.compare import measure
     from stario.fusion.results import write_run
     from stario.sequences.metrics import align
@@ -79,9 +83,13 @@ def _run(
     written = write_run(
         folder, sequence.name, track, truth, aligned, metrics, navigator.config, backend
     )
-    if as_json:
-        print_json({"recording": sequence.name, backend: metrics, "folder": str(folder)})
-        return
+    record: dict[str, object] = {
+        "recording": sequence.name,
+        backend: metrics,
+        "folder": str(folder),
+    }
+    if not told:
+        return record
     way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     typer.echo(f"{way} travelled by the estimate")
     if truth is not None:
@@ -89,3 +97,4 @@ def _run(
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")
+    return record

@@ -85,6 +85,7 @@ def train(
     The same recipe for every network. In several processes, on GPUs or CPUs:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
+    from stario.fusion.results import make_folder
     from stario.network.data import gather
     from stario.network.model import load_model
     from stario.network.parallel import leads
@@ -98,6 +99,8 @@ def train(
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(paths or [], validation or [], data, streams_of)
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
+    out = out or Path("runs") / recipe.architecture
+    make_folder(out)
     if recorded_only:
         walks, generated = None, 0
     material = gather(
@@ -105,6 +108,13 @@ def train(
         _captured(walks, recipe, folder) if walks else [],
         _generated(generated, recipe.seed, recipe.attitude, folder),
     )
+    if recorded and not held_out:
+        raise InputError(
+            "recordings",
+            "none whose last fifth has an unbroken stretch of 2 s",
+            "some to choose and calibrate by",
+            "name them: --validation",
+        )
     held_out = held_out or _generated(10, recipe.seed + 1, recipe.attitude, folder)
     if leads():
         for words in material.words:
@@ -115,7 +125,7 @@ def train(
             material.streams,
             material.weights,
             held_out,
-            out or Path("runs") / recipe.architecture,
+            out,
             on_step=lambda step, error: progress(step / recipe.steps),
             on_epoch=lambda report: typer.echo(
                 f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "

@@ -28,6 +28,19 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
     assert done.err == ""
     for name in ("walk: 12.0 s", "inertial", "network", "network_true_attitude", "ekf"):
         assert name in done.out
+    assert "root mean square of the position error's norm" in done.out
+    assert "covers" not in done.out
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
+    walk = read_own_csv(recording)
+    assert walk.truth is not None
+    write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
+    done = stario("run", "part.csv", "--out", "out")
+    assert "The truth covers 50% of the track" in done.out
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["ekf"]["coverage"] == pytest.approx(0.5, abs=0.02)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -180,3 +193,18 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     content = json.loads(done.out)
     assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
     assert content["scores"][0]["name"] == "walk 0"
+
+
+def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Path) -> None:
+    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    done = stario("backends", "blind.csv", recording, "--json")
+    assert done.code == 1
+    assert "skipped: blind.csv" in done.err
+    assert [score["name"] for score in json.loads(done.out)["scores"]] == ["walk"]
+
+
+def test_recordings_too_short_to_hold_any_out_are_not_calibrated_by_simulation(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    write_csv(tmp_path / "short.csv", read_own_csv(recording).slice(0.0, 9.0))
+    stario("train", "short.csv", "--generated", 1).assert_one_line_error("--validation")

@@ -158,8 +158,9 @@ def test_run_takes_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -
     (tmp_path / "all").mkdir()
     for name in ("a", "b"):
         (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
-    done = stario("run", "all", "--out", "out")
+    done = stario("run", "all", "--out", "out", "--json")
     assert done.code == 0
+    assert [record["recording"] for record in json.loads(done.out)] == ["a", "b"]
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"a", "b"}
     (tmp_path / "list.txt").write_text("all/b.csv\nall/c.csv\n")
     done = stario("run", "list.txt", "--out", "alone")
@@ -326,6 +327,8 @@ def test_a_recording_cut_within_a_line_is_named(stario, recording: Path, tmp_pat
         (["simulate", "a.csv", "--rate", "0"], ["rate"]),
         (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
+        (["train", "--out", "RECORDING"], ["folder"]),
+        (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(

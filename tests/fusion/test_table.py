@@ -71,6 +71,14 @@ def test_every_network_has_every_track_of_every_recording(table) -> None:
         assert table.values("StarIO", protocol, "ate_m", weights="a").shape == (2,)
 
 
+def test_recordings_of_the_same_name_are_told_apart(read) -> None:
+    twice, _ = compare_networks(
+        [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
+    )
+    assert {entry.recording for entry in twice.entries} == {"walk-1", "walk-1-2"}
+    assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
+
+
 def test_mean_and_spread_are_over_weights_of_means_over_recordings(table) -> None:
     a, b = (table.values("StarIO", "network", "ate_m", weights=w).mean() for w in "ab")
     mean, spread = table.mean_and_spread("StarIO", "network", "ate_m")

@@ -188,6 +188,26 @@ def test_a_finished_run_is_not_trained_on(
     assert path.read_bytes() == finished[0].read_bytes()
 
 
+def test_a_finished_run_says_that_nothing_is_trained(
+    finished: tuple[Path, list[EpochReport]], caplog: pytest.LogCaptureFixture
+) -> None:
+    run(finished[0].parent, trained_on=["swings"])
+    assert "all 4 epochs are done" in caplog.text
+
+
+def test_a_checkpoint_of_other_recordings_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    folder = finished[0].parent
+    more = [*STREAMS, swaying("e", 0.1)]
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, more, [1.0, 1.0, 1.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, STREAMS, [1.0, 2.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="first weights"):
+        run(folder, start_from=load_model(finished[0]))
+
+
 def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
     log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
     assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]
@@ -293,6 +313,13 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
         ({"epochs": 0}, "epochs"),
         ({"precision": "half"}, "precision"),
         ({"device": "tpu"}, "device"),
+        ({"attitude": "guessed"}, "attitude"),
+        ({"architecture": "Star"}, "architecture"),
+        ({"seed": -1}, "seed"),
+        ({"dropout": "no"}, "dropout"),
+        ({"augmentation": {"speeds": 3}}, "speeds"),
+        ({"augmentation": {"speeds": [1]}}, "speeds"),
+        ({"augmentation": {"speeds": ["slow", "fast"]}}, "speeds"),
     ],
 )
 def test_a_recipe_that_does_not_fit_is_refused(values: dict[str, object], field: str) -> None:
