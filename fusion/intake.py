@@ -5,7 +5,8 @@ the IMU interpolated exactly there (so that nothing is integrated twice or left 
 carries its samples; at the times of a network update also the window that ends there, once a
 second of unbroken samples is there.
 Samples that jump ahead in time wait until others confirm them, so that one wild timestamp does not
-make all that follow look late.
+make all that follow look late (`sequences.time_order`). Behind a gap longer than `LONG_GAP`
+nothing of attitude and speed is left: it begins anew there.
 
 Nothing here depends on the filter: batch runs may therefore hand all windows to the network at once
 and still give the streamed track.
@@ -27,18 +28,13 @@ from stario.fusion.gyro_unit import GyroUnitWatch
 from stario.fusion.suspects import Flags, Screen
 from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import (
     MAX_IMU_GAP,
     WINDOW_RATE,
     WINDOW_SECONDS,
     resample,
 )
-
-LONG_GAP = 10.0
-"""Behind a gap longer than this [s] nothing of attitude and speed is left: it begins anew there."""
-
-CONFIRMED, CONFIRMED_FAR = 2, 20
-"""Samples that confirm a jump ahead in time, and one by more than `LONG_GAP`, with none before."""
 
 _TAIL = 4
 """Samples kept of the epoch before: half a step of the window's grid at the fastest rate."""

@@ -20,14 +20,16 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth_fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS
-from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples
+from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
 
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and something around it [s]."""
 
+_SHORTEST_S = 0.9
 _WINDOW_S = 4.0
 _WINDOWS = 12
-"""Stretches that are looked at, spread over the recording: the cost does not grow with it."""
+"""Length, least and usual [s], and number of the stretches that are looked at, spread over the
+recording: the cost does not grow with it."""
 
 _FAST_RAD_S = 15.0
 """Nobody turns a device faster for a twentieth of the time; the fastest recorded is 2.7 rad/s,
@@ -72,12 +74,13 @@ def check_units(sequence: ImuSequence) -> None:
             f"{sequence.name}: duration", f"{time[-1] - time[0]:.2f} s", f"at least {MIN_SECONDS} s"
         )
     pieces = _pieces(time)
-    force = float(np.median(np.linalg.norm(accel, axis=1)))
-    average = average_force(time, gyro, accel, pieces)
-    in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
-    check_gyro(sequence.name, gyro, force, average, in_degrees)
-    _check_force(sequence, force, average)
-    _check_direction(sequence)
+    if pieces:  # else the gaps leave nothing to average over
+        force = float(np.median(np.linalg.norm(accel, axis=1)))
+        average = average_force(time, gyro, accel, pieces)
+        in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
+        check_gyro(sequence.name, gyro, force, average, in_degrees)
+        _check_force(sequence, force, average)
+    _check_direction(sequence, time, accel)
 
 
 def _check_content(sequence: ImuSequence) -> None:
@@ -168,12 +171,11 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
         )
 
 
-def _check_direction(sequence: ImuSequence) -> None:
-    """The true attitude must turn the average force upright."""
+def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray) -> None:
+    """The true attitude must turn the average force (N, 3) at `time` (N,) upright."""
     truth = sequence.truth
     if truth is None or truth.valid.sum() < 2:
         return
-    time, _, accel = clean_samples(sequence)
     step = -(-len(time) // _SAMPLES)
     time, accel = time[::step], accel[::step]
     pose = truth.at(time)
@@ -208,11 +210,19 @@ def _axes(sequence: ImuSequence) -> str | None:
 
 
 def _pieces(time: FloatArray) -> list[slice]:
-    """Up to 12 stretches of 4 s, or the whole of a shorter recording."""
-    length = min(len(time), round(_WINDOW_S / float(np.median(np.diff(time)))))
-    count = min(_WINDOWS, len(time) // length)
-    starts = np.linspace(0, len(time) - length, count).astype(int)
-    return [slice(start, start + length) for start in starts]
+    """Up to 12 stretches of up to 4 s, none shorter than one and none across a gap.
+
+    Across a gap the gyroscope has not seen the turning, and nothing can be brought to one frame.
+    """
+    length = round(_WINDOW_S / float(np.median(np.diff(time))))
+    pieces = []
+    for start, stop in unbroken(time):
+        size = min(length, stop - start)
+        for first in np.linspace(start, stop - size, (stop - start) // size).astype(int):
+            if time[first + size - 1] - time[first] >= _SHORTEST_S:
+                pieces.append(slice(first, first + size))
+    chosen = np.linspace(0, len(pieces) - 1, min(_WINDOWS, len(pieces))).astype(int)
+    return [pieces[k] for k in chosen]
 
 
 def average_force(

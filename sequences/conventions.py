@@ -37,7 +37,8 @@ def with_conventions(
         gravity: one of `GRAVITY`; "removed" is put back by `with_gravity`.
 
     Raises:
-        InputError: an argument is unknown, or gravity cannot be put back.
+        InputError: an argument is unknown, a unit is given for numbers that were converted from
+            the one their file names, or gravity cannot be put back.
     """
     if gravity not in GRAVITY:
         raise InputError("gravity", repr(gravity), f"one of {', '.join(GRAVITY)}")

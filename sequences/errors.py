@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class StarioError(Exception):
     """Base of every error the library raises on purpose; its text is one line for a user."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An exception is unpickled by calling its class with its text: not what these take.
+        return _with_text, (type(self), *self.args), vars(self)
+
+
+def _with_text(kind: type[StarioError], *args: object) -> StarioError:
+    """An error as pickle begins it; the fields are put back by pickle itself."""
+    return kind.__new__(kind, *args)
 
 
 class InputError(StarioError, ValueError):

@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import FloatArray, Trajectory
 
 _TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-_NORM_TOLERANCE = 1e-2
 
 
 @contextmanager
@@ -36,27 +36,30 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
         mode: "w" for text (UTF-8, Unix line ends), "wb" for bytes.
 
     Raises:
-        InputError: another mode, the folder does not exist, or `path` is a folder.
+        InputError: another mode, the folder does not exist, `path` is a folder, or the system
+            refuses to write there.
     """
     path = Path(path)
     if mode not in ("w", "wb"):
         raise InputError("mode", repr(mode), "'w' or 'wb'")
-    if not path.parent.is_dir():
-        raise InputError("path", str(path), "a file in an existing folder", "create the folder")
-    if path.is_dir():
-        raise InputError("path", f"the folder {path}", "a file")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     text: dict[str, str] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
-    try:
-        # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.
-        with temporary.open(mode.replace("w", "x"), **text) as file:  # type: ignore[call-overload]
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with _refusals_told(path):
+        if not path.parent.is_dir():
+            raise InputError("path", str(path), "a file in an existing folder", "create the folder")
+        if path.is_dir():
+            raise InputError("path", f"the folder {path}", "a file")
+        temporary = _beside(path)
+        try:
+            # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.
+            exclusive = mode.replace("w", "x")
+            with temporary.open(exclusive, **text) as file:  # type: ignore[call-overload]
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -70,23 +73,41 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
         path: the folder to make; nothing but an empty folder may be there.
 
     Raises:
-        InputError: something is there already, or the folder above does not exist.
+        InputError: something is there already, the folder above does not exist, or the system
+            refuses to write there.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError("path", str(path), "a folder in an existing folder", "create the folder")
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError("path", f"{path}, which exists", "a new folder")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    with _refusals_told(path):
+        if not path.parent.is_dir():
+            expected = "a folder in an existing folder"
+            raise InputError("path", str(path), expected, "create the folder")
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise InputError("path", f"{path}, which exists", "a new folder")
+        temporary = _beside(path)
+        try:
+            temporary.mkdir()
+            yield temporary
+            if path.exists():
+                path.rmdir()
+            temporary.rename(path)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+@contextmanager
+def _refusals_told(path: Path) -> Iterator[None]:
+    """What the system refuses about a path, as an error that says what to do."""
     try:
-        temporary.mkdir()
-        yield temporary
-        if path.exists():
-            path.rmdir()
-        temporary.rename(path)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        yield
+    except OSError as error:
+        found = f"{path}: {error.strerror or error}"
+        fix = "choose another place, mend its permissions or make room"
+        raise InputError("path", found, "a place that can be written to", fix) from error
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -195,7 +216,7 @@ def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:
         found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
         raise ReadError(path, f"line {numbers[k + 1]}, t", found, "strictly increasing seconds")
     norm = np.linalg.norm(rows[:, 4:], axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > _NORM_TOLERANCE)
+    bad = np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)
     if len(bad):
         k = int(bad[0])
         raise ReadError(

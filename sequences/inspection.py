@@ -9,12 +9,15 @@ import numpy as np
 
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import MAX_TRUTH_GAP, STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.sequence import (
+    GAP_STEPS,
+    STANDARD_GRAVITY,
+    ImuSequence,
+    Trajectory,
+    is_gap,
+)
 from stario.sequences.still import Rest, find_rest
 from stario.sequences.truth_fit import TruthFit, fit_truth
-
-_GAP_STEPS = 1.8
-"""A step of more usual ones than this has lost a sample."""
 
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)
@@ -250,8 +253,8 @@ def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
     time = sequence.time[np.isfinite(sequence.time)]
     steps = np.diff(time)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
-    gaps = np.flatnonzero(steps > _GAP_STEPS * usual)
-    forward = steps[(steps > 0) & (steps <= _GAP_STEPS * usual)]
+    gaps = np.flatnonzero(steps > GAP_STEPS * usual)
+    forward = steps[(steps > 0) & (steps <= GAP_STEPS * usual)]
     return Timing(
         samples=len(sequence),
         duration_s=sequence.duration,
@@ -272,7 +275,7 @@ def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
     return Coverage(
         share=float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
         rate_hz=float(1.0 / np.median(steps)) if len(steps) else 0.0,
-        gaps=int((steps > MAX_TRUTH_GAP).sum()),
+        gaps=int(is_gap(steps).sum()),
         longest_gap_s=float(steps.max(initial=0.0)),
         path_m=truth.path_length(),
     )

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z, yaw_of
-from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.sequence import FloatArray, Trajectory, too_slow
 
 Alignment = Literal["none", "first", "yaw"]
 Convention = Literal["rms", "ronin", "mean"]
@@ -108,6 +108,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
             "estimate",
             f"no overlap: {_span(estimate)} against truth {_span(truth)}",
             "a pose at a time when the truth is known",
+            too_slow(truth),
         )
     ours, theirs = _select(estimate, common), _select(at_estimate, common)
     return PoseErrors(

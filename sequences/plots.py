@@ -25,6 +25,7 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     Trajectory,
+    second_ticks,
 )
 
 if TYPE_CHECKING:
@@ -308,7 +309,7 @@ def _broken(
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     """Speed [m/s] along 1 s chords, as the length of the way is measured."""
     step = 1.0
-    ticks = np.arange(truth.time[0], truth.time[-1], step)
+    ticks = second_ticks(truth.time)
     if len(ticks) < 2 or truth.valid.sum() < 2:
         return np.empty(0), np.empty(0)
     at = truth.at(ticks)

@@ -7,6 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import FloatArray
 
+NORM_TOLERANCE = 1e-2
+"""A quaternion whose norm is off 1 by more is none: files round, but not that coarsely."""
+
 
 def yaw_of(attitude_WB: Rotation) -> FloatArray:
     """Yaw [rad] of the heading-preserving twist about world z (singular only upside down).

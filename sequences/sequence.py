@@ -27,6 +27,15 @@ STANDARD_GRAVITY = 9.80665
 MAX_TRUTH_GAP = 0.1
 """Longest distance [s] between two valid truth samples that is interpolated across."""
 
+MAX_IMU_GAP = 0.1
+"""Longest distance [s] between IMU samples that is bridged by interpolation."""
+
+GAP_STEPS = 1.8
+"""A step of more usual ones than this has lost a sample."""
+
+_ROUNDING_S = 1e-6
+"""What rounding may add to a step [s]: 0.3 - 0.2 > 0.1, and more for seconds since 1970."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -118,9 +127,9 @@ class Trajectory:
         if len(t) < 2:
             raise InputError("trajectory", f"{len(t)} valid samples", "at least 2")
         right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
-        tolerance = 1e-9 * max(1.0, abs(t[-1]))
+        tolerance = max(1e-9, 4.0 * float(np.spacing(np.abs(t[[0, -1]]).max())))
         inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
-        bracketed = t[right] - t[right - 1] <= max_gap
+        bracketed = ~is_gap(t[right] - t[right - 1], max_gap)
         exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
         return np.asarray(inside & (bracketed | exact))
 
@@ -144,7 +153,7 @@ class Trajectory:
         if len(known) < 2:
             return 0.0
         t = self.time[known]
-        ticks = np.append(np.arange(t[0], t[-1], 1.0), t[-1])
+        ticks = np.append(second_ticks(t), t[-1])
         chords = np.diff(_lerp(ticks, t, self.position_W[known]), axis=0)
         return float(np.linalg.norm(chords, axis=1).sum())
 
@@ -169,6 +178,8 @@ class ImuSequence:
         gyro: (N, 3) angular rate of B against the inertial frame, in B [rad/s].
         accel: (N, 3) specific force in B [m/s^2]; at rest it points up with about 9.81.
         truth: the true trajectory, or None.
+        converted: which of "gyro" and "accel" the reader has converted from a unit that the file
+            names, so that nobody converts them once more.
 
     Raises:
         InputError: the arrays' shapes do not agree or there is no sample.
@@ -179,6 +190,7 @@ class ImuSequence:
     gyro: FloatArray
     accel: FloatArray
     truth: Trajectory | None = None
+    converted: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
@@ -219,6 +231,30 @@ class ImuSequence:
         return replace(
             self, time=self.time[keep], gyro=self.gyro[keep], accel=self.accel[keep], truth=truth
         )
+
+
+def is_gap(steps: FloatArray, longest: float = MAX_TRUTH_GAP) -> BoolArray:
+    """Whether steps (N,) between neighbours are longer than `longest` [s], rounding aside."""
+    return np.asarray(steps > longest + _ROUNDING_S)
+
+
+def too_slow(truth: Trajectory) -> str:
+    """What is to be said where most of a truth's steps count as gaps; empty where they do not."""
+    step = float(np.median(np.diff(truth.time[truth.valid]))) if truth.valid.sum() > 1 else 0.0
+    if not is_gap(np.array(step)):
+        return ""
+    return f"the truth is at {1.0 / step:.3g} Hz, at least {1.0 / MAX_TRUTH_GAP:.0f} Hz are needed"
+
+
+def second_ticks(time: FloatArray) -> FloatArray:
+    """Every second (M,) from the first of increasing times (N,) to before the last [s].
+
+    Those within a gap are left out: the way between is straight, and a clock that jumps by decades
+    must not cost memory.
+    """
+    seconds = np.floor(time - time[0])
+    ticks = time[0] + np.union1d(seconds, seconds + 1.0)
+    return np.asarray(ticks[ticks < time[-1]])
 
 
 def _lerp(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:

@@ -19,11 +19,13 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import (
+    GAP_STEPS,
     MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     FloatArray,
     ImuSequence,
     Trajectory,
+    is_gap,
 )
 
 _MIN_POSES = 6
@@ -137,8 +139,8 @@ def simulate(
     """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
 
     Args:
-        trajectory: poses at any rate that shows the motion, at least 6. Samples marked not valid
-            are bridged by the spline.
+        trajectory: poses at any even rate that shows the motion, at least 6. Poses that are
+            missing or marked not valid are bridged by the spline.
         rate: of the IMU [Hz].
         errors: of the sensors.
         seed: of every random draw; the same seed gives the same recording.
@@ -146,8 +148,8 @@ def simulate(
         name: of the sequence.
 
     Raises:
-        InputError: too few poses, a stretch of poses that are not valid longer than 0.1 s, or a
-            rate or gravity out of range.
+        InputError: too few poses, a gap between valid ones longer than 0.1 s and than their usual
+            step, or a rate or gravity out of range.
     """
     _check(trajectory, rate, gravity)
     truth, gyro, acceleration_W = _sampled(trajectory, rate)
@@ -174,11 +176,14 @@ def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:
     known = np.flatnonzero(trajectory.valid)
     if len(known) < _MIN_POSES:
         raise InputError("trajectory", f"{len(known)} valid poses", f"at least {_MIN_POSES}")
-    bridged = (np.diff(known) > 1) & (np.diff(trajectory.time[known]) > MAX_TRUTH_GAP)
+    steps = np.diff(trajectory.time[known])
+    usual = float(np.median(np.diff(trajectory.time)))
+    bridged = is_gap(steps, max(MAX_TRUTH_GAP, GAP_STEPS * usual))
     if bridged.any():
-        start = trajectory.time[known[int(np.argmax(bridged))]]
+        k = int(np.argmax(bridged))
         raise InputError(
-            "trajectory", f"no valid pose after {start:.3f} s for more than {MAX_TRUTH_GAP} s",
+            "trajectory",
+            f"no valid pose for {steps[k]:.3f} s after {trajectory.time[known[k]]:.3f} s",
             "a track without gaps", "simulate its pieces one by one",
         )  # fmt: skip
 

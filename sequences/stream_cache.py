@@ -31,7 +31,8 @@ from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
 from stario.sequences.readers import FORMATS
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.readers.oxiod import capture_file
+from stario.sequences.sequence import ImuSequence, too_slow
 from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
@@ -105,7 +106,8 @@ def recording_files(path: Path) -> list[Path]:
         return [path]
     number = "".join(filter(str.isdigit, path.stem))
     siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
-    return sorted(p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number)
+    alike = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
+    return sorted(alike | set(filter(None, [capture_file(path)])))
 
 
 @cache
@@ -138,8 +140,9 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[WorldStream]:
     streams = world_streams(sequence, attitude=attitude)
     if not streams:
         raise InputError(
-            f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from"
-        )
+            f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from",
+            "" if sequence.truth is None else too_slow(sequence.truth),
+        )  # fmt: skip
     return streams
 
 
@@ -180,7 +183,7 @@ def _written(file: Path, streams: list[WorldStream]) -> bool:
         _sweep(file)
         with atomic_write(file, "wb") as target:
             target.write(content)
-    except OSError as error:
+    except (OSError, InputError) as error:
         log.warning("%s: windows are not kept for the next run: %s", file.parent, error)
         return False
     return True

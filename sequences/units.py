@@ -25,7 +25,15 @@ _SPELLINGS = {
     "sec": "s",
     "second": "s",
     "seconds": "s",
+    "msec": "ms",
+    "millisecond": "ms",
+    "milliseconds": "ms",
     "usec": "us",
+    "microsecond": "us",
+    "microseconds": "us",
+    "nsec": "ns",
+    "nanosecond": "ns",
+    "nanoseconds": "ns",
     "µs": "us",
     "μs": "us",
     "rads-1": "rad/s",
@@ -59,15 +67,22 @@ def with_units(
         accel_unit: one of `ACCEL_UNITS`; a leading minus turns gravity into specific force.
 
     Raises:
-        InputError: a unit is unknown.
+        InputError: a unit is unknown, or given for numbers that were converted from the unit that
+            their file names.
     """
-    gyro, accel = unit_named(gyro_unit), unit_named(accel_unit)
-    if gyro not in GYRO_UNITS:
-        raise InputError("gyro_unit", repr(gyro_unit), f"one of {', '.join(GYRO_UNITS)}")
-    if accel not in ACCEL_UNITS:
-        raise InputError("accel_unit", repr(accel_unit), f"one of {', '.join(ACCEL_UNITS)}")
     return replace(
         sequence,
-        gyro=sequence.gyro * GYRO_UNITS[gyro],
-        accel=sequence.accel * ACCEL_UNITS[accel],
+        gyro=sequence.gyro * _factor(sequence, "gyro", gyro_unit, GYRO_UNITS),
+        accel=sequence.accel * _factor(sequence, "accel", accel_unit, ACCEL_UNITS),
     )
+
+
+def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, float]) -> float:
+    field, name = f"{sensor}_unit", unit_named(unit)
+    if name not in known:
+        raise InputError(field, repr(unit), f"one of {', '.join(known)}")
+    if known[name] != 1.0 and sensor in sequence.converted:
+        found = f"{unit!r} for {sequence.name}, whose file names its unit"
+        expected = f"{next(iter(known))}, to which it is converted already"
+        raise InputError(field, found, expected, "leave the option out or mend the file's header")
+    return known[name]

@@ -8,6 +8,7 @@ levelled by the IMU as in use, with the heading of the truth; or true, the paper
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -20,7 +21,11 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError
 from stario.sequences.levelling import levelled_attitudes
 from stario.sequences.rotations import about_z, yaw_of
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import MAX_IMU_GAP as MAX_IMU_GAP
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import advancing
+
+log = logging.getLogger(__name__)
 
 WINDOW_RATE = 200.0
 """Samples per second of a window [Hz]."""
@@ -30,9 +35,6 @@ WINDOW_SAMPLES = 200
 
 WINDOW_SECONDS = WINDOW_SAMPLES / WINDOW_RATE
 """Length of a window [s]."""
-
-MAX_IMU_GAP = 0.1
-"""Longest distance [s] between IMU samples that is bridged by interpolation."""
 
 Attitude = Literal["levelled", "true"]
 """By which training windows are turned into the world; see `world_streams`."""
@@ -118,7 +120,8 @@ def imu_in_world(
 
     Returns:
         Grid times (M,) [s], gyroscope and specific force in W (M, 6) float32, and (M,) where
-        neither IMU nor truth has a gap.
+        neither IMU nor truth has a gap. The grid is even but for long gaps of the IMU, of which
+        whole seconds are left out: a clock that jumps by decades must not cost memory.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -127,10 +130,13 @@ def imu_in_world(
     attitude_WB = truth.at(time).attitude_WB
     if attitude == "levelled":
         attitude_WB = _levelled(time, gyro, accel, attitude_WB, truth.covers(time))
-    grid = np.arange(time[0], time[-1], 1.0 / WINDOW_RATE)
+    left_out = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
+    even_time = time - left_out
+    even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
+    grid = even + left_out[np.searchsorted(even_time, even, side="right") - 1]
     imu_W = np.concatenate([attitude_WB.apply(gyro), attitude_WB.apply(accel)], axis=1)
-    usable = truth.covers(grid) & ~_spans_gap(time, grid)
-    return grid, resample(time, imu_W, grid).astype(np.float32), usable
+    usable = truth.covers(grid) & ~_spans_gap(even_time, even)
+    return grid, resample(even_time, imu_W, even).astype(np.float32), usable
 
 
 def _levelled(
@@ -141,15 +147,16 @@ def _levelled(
     Within a window the heading is the gyroscope's, as in use: the turn is averaged over a second.
     """
     R_NB = np.empty((len(time), 3, 3))
-    breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
-    for start, stop in pairwise([0, *breaks.tolist(), len(time)]):
+    parts = unbroken(time)
+    for start, stop in parts:
         part = slice(start, stop)
         R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
     levelled_NB = Rotation.from_matrix(R_NB)
     turn = yaw_of(true_WB * levelled_NB.inv())
     second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
-    edges = np.union1d(breaks, np.flatnonzero(np.diff(known.astype(np.int8))) + 1)
-    for start, stop in pairwise([0, *edges.tolist(), len(time)]):
+    changes = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
+    edges = np.union1d([start for start, _ in parts], changes)
+    for start, stop in pairwise([*edges.tolist(), len(time)]):
         part = slice(start, stop)
         turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
     return about_z(turn) * levelled_NB
@@ -158,14 +165,19 @@ def _levelled(
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Time, gyroscope and accelerometer with bad, repeated and out-of-order samples dropped.
 
+    The few that jump ahead of those behind them are dropped as well, and their number is logged.
+
     Raises:
         InputError: what is left has fewer than two samples or a rate that is not accepted.
     """
     finite = np.isfinite(sequence.time) & np.isfinite(sequence.gyro).all(axis=1)
     finite &= np.isfinite(sequence.accel).all(axis=1)
     index = np.flatnonzero(finite)
-    newest = np.maximum.accumulate(sequence.time[index])
-    index = index[np.concatenate([[True], newest[1:] > newest[:-1]])] if len(index) else index
+    counts = advancing(sequence.time[index])
+    ahead = _ahead(sequence.time[index], counts)
+    if ahead:
+        log.warning("%s: samples ahead of their time left out: %d", sequence.name, ahead)
+    index = index[counts]
     if len(index) < 2:
         raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
     time = sequence.time[index]
@@ -178,6 +190,18 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
             "is the time column in seconds?",
         )
     return time, sequence.gyro[index], sequence.accel[index]
+
+
+def _ahead(time: FloatArray, counts: BoolArray) -> int:
+    """How many of the samples that do not count are later than all before that do."""
+    newest = np.maximum.accumulate(np.where(counts, time, -np.inf))
+    return int((time > newest).sum())
+
+
+def unbroken(time: FloatArray) -> list[tuple[int, int]]:
+    """Stretches [start, stop) of increasing times (N,) [s] without a gap of the IMU."""
+    breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
+    return list(pairwise([0, *breaks.tolist(), len(time)]))
 
 
 def windows_of(stream: WorldStream, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -207,7 +231,7 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
 
 def _spans_gap(time: FloatArray, grid: FloatArray) -> BoolArray:
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    return np.asarray(time[right] - time[right - 1] > max(MAX_IMU_GAP, MAX_TRUTH_GAP))
+    return np.asarray(time[right] - time[right - 1] > MAX_IMU_GAP)
 
 
 def _interpolate(grid: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
-
-_NORM_TOLERANCE = 1e-2
+from stario.sequences.rotations import NORM_TOLERANCE
+from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.time_order import advancing
 
 
 def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
@@ -52,7 +52,7 @@ def rotations(
         ReadError: a component is not finite or a norm is off 1 by more than a percent.
     """
     norm = np.linalg.norm(checked(path, field, quat, first_row), axis=1)
-    bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
+    bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
         k = int(np.argmax(bad))
         where = f"row {k + first_row}, {field}"
@@ -62,32 +62,19 @@ def rotations(
     return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
 
 
-def same_length(path: Path, expected: int, **arrays: FloatArray) -> None:
-    """Refuse arrays that do not have as many rows as there are times.
-
-    Raises:
-        ReadError: names the array.
-    """
-    for name, values in arrays.items():
-        if len(values) != expected:
-            raise ReadError(path, name, f"{len(values)} rows", f"{expected} as time")
-
-
 def trajectory(
     time: FloatArray,
     position_W: FloatArray,
     attitude_WB: Rotation,
     velocity_W: FloatArray | None = None,
-    valid: BoolArray | None = None,
 ) -> Trajectory:
-    """A track of the poses whose time is later than all before: files repeat rows."""
-    keep = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0
+    """A track of the poses whose times advance: files repeat rows."""
+    keep = advancing(time)
     return Trajectory(
         time=time[keep],
         position_W=position_W[keep],
         attitude_WB=attitude_WB[keep],
         velocity_W=None if velocity_W is None else velocity_W[keep],
-        valid=np.ones(int(keep.sum()), dtype=np.bool_) if valid is None else valid[keep],
     )
 
 

@@ -10,9 +10,11 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
 from stario.sequences.units import TIME_UNITS
+from stario.sequences.windows import MAX_RATE
 
-_RATES = (10.0, 1000.0)
-"""Samples a second that sensors and captures make; the units are further apart than these."""
+_RATES = (9.0, 1.05 * MAX_RATE)
+"""Samples a second that sensors and captures make, with some slack for rounding; the units are
+further apart than these."""
 
 
 def on_one_clock(
@@ -68,11 +70,13 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     """
     if unit in TIME_UNITS:
         return TIME_UNITS[unit]
+    if unit:
+        raise ReadError(file, "time", f"unit {unit!r}", ", ".join(TIME_UNITS))
     steps = np.diff(time)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
     for per_second in TIME_UNITS.values():
         if step and _RATES[0] <= per_second / step <= _RATES[1]:
             return per_second
-    found = f"a step of {step:.4g}" + (f" {unit}" if unit else "")
-    raise ReadError(file, "time", found, "10 to 1000 samples a second in s, ms, us or ns")
+    expected = f"10 to {MAX_RATE:.0f} samples a second in {', '.join(TIME_UNITS)}"
+    raise ReadError(file, "time", f"a step of {step:.4g}", expected)

@@ -39,6 +39,9 @@ _ALIASES = dict.fromkeys(("t", "time", "times", "timestamp"), "t") | {
     for joint in ("", "_")
     for axis in ("xyzw" if letter == "q" else "xyz")
 }
+_LIKE_TRUTH = re.compile(
+    r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
+)
 _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]\)]*)[\]\)])?\W*$")
 
 
@@ -51,16 +54,43 @@ class Column:
     unit: str
 
 
-def read_header(path: Path, lines: list[str]) -> tuple[int, dict[str, Column]]:
-    """How many lines end with the header, and its columns by their canonical name."""
-    for start, line in enumerate(lines, 1):
-        if not line.strip() or (line.lstrip().startswith("#") and not names_columns(line)):
-            continue
-        if not names_columns(line):
-            found = repr(line.strip()[:60])
-            raise ReadError(path, f"line {start}, header", found, HEADER, "put it above the rows")
-        return start, _columns(path, start, line)
-    raise ReadError(path, "header", "only comments", HEADER)
+@dataclass(frozen=True)
+class Header:
+    """How many lines end with it, what separates cells, and columns by their canonical name."""
+
+    lines: int
+    separator: str
+    columns: dict[str, Column]
+
+
+def read_header(path: Path, lines: list[str]) -> Header:
+    """The header of a file's lines.
+
+    Raises:
+        ReadError: there is none, or its columns or their units do not fit.
+    """
+    index = _header_index(lines)
+    if index is None:
+        raise ReadError(path, "header", "only comments", HEADER)
+    line, number = lines[index], index + 1
+    if not _names_columns(line):
+        found = repr(line.strip()[:60])
+        raise ReadError(path, f"line {number}, header", found, HEADER, "put it above the rows")
+    return Header(number, _separator(line), _columns(path, number, line))
+
+
+def _header_index(lines: list[str]) -> int | None:
+    """Where the header stands: the first line that is no comment, or one that names columns."""
+    for index, line in enumerate(lines):
+        if line.strip() and (not line.lstrip().startswith("#") or _names_columns(line)):
+            return index
+    return None
+
+
+def is_header(lines: list[str]) -> bool:
+    """Whether a file's lines begin with a header that names columns of this format."""
+    index = _header_index(lines)
+    return index is not None and _names_columns(lines[index])
 
 
 def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
@@ -88,6 +118,12 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
         _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
+        alike = [title for title in ignored if _LIKE_TRUTH.match(title)]
+        if alike and not truth:
+            _log.warning(
+                "%s: no truth is read from %s: it takes %s",
+                path, ", ".join(alike), TRUTH_HEADER,
+            )  # fmt: skip
     for name in truth:
         unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
     return columns
@@ -102,14 +138,18 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Fact
     return known[unit]
 
 
-def names_columns(line: str) -> bool:
+def _names_columns(line: str) -> bool:
     """Whether a line names any column of the IMU that this format knows."""
     names = {_ALIASES.get(_cell(text)[0].lower(), "") for text in _titles(line)}
     return bool(names & set(IMU))
 
 
 def _titles(line: str) -> list[str]:
-    return line.lstrip().lstrip("#").split(",")
+    return line.lstrip(" #").split(_separator(line))
+
+
+def _separator(header: str) -> str:
+    return max(",;\t", key=header.count)
 
 
 def _cell(text: str) -> tuple[str, str]:

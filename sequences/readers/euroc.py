@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import read_lines, read_table, seconds
+from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.time_order import advancing
 
 _log = logging.getLogger(__name__)
 
@@ -81,10 +83,10 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     columns = 11 if _holds_velocity(path) else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
-    keep = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0])
+    keep = advancing(time)
     table, time = table[keep], time[keep]
     norm = np.linalg.norm(table[:, 4:8], axis=1)
-    valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if not valid.all():
         _log.warning("%s: %d of %d poses are none, left out", path, (~valid).sum(), len(valid))
     quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])

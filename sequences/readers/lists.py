@@ -11,21 +11,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_line, numbers_in, read_lines
+from stario.sequences.readers.text import first_line, first_lines, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
+_LOOKED_AT = 20
 _OXIOD_FORMS = ("syn", "raw")
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file may be a list: text by its suffix whose first line is no row of numbers.
+    """Whether a file may be a list: text by its suffix, none of whose first lines is a row.
 
-    A single number may be a name: TLIO's are.
+    A row is one of numbers. A single number may be a name: TLIO's are.
     """
     if path.suffix.lower() not in _SUFFIXES or first_line(path, comments=True) is None:
         return False
-    line = first_line(path) or ""
-    return len(numbers_in(line)) < 2 and len(numbers_in(line, None)) < 2
+    lines = first_lines(path, _LOOKED_AT)
+    return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
 
 
 def list_entries(path: Path) -> Iterator[Path | ReadError]:

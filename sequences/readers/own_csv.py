@@ -1,6 +1,7 @@
 """A CSV of one's own: `t,gx,gy,gz,ax,ay,az` with units in the header, truth columns optional.
 
-The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order:
+The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order and
+separated by commas, semicolons or tabs as the rows below it; comments (`#`) may stand above it:
 
 - `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
   IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
@@ -16,6 +17,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -31,18 +33,21 @@ from stario.sequences.readers.columns import (
     TRUTH,
     TRUTH_HEADER,
     Column,
-    names_columns,
+    Header,
+    is_header,
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.text import first_line, read_lines, read_quickly
+from stario.sequences.readers.text import first_lines, read_lines, read_quickly
+from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import advancing
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
-_BLANK = re.compile(r"(?<=,)\s*(?=,|$)|^\s*(?=,)", flags=re.MULTILINE)
-_NORM_TOLERANCE = 1e-2
+_HEAD_LINES = 200
+"""Among which the header must stand for a file to be recognised."""
 
 
 def read_own_csv(path: Path) -> ImuSequence:
@@ -52,15 +57,25 @@ def read_own_csv(path: Path) -> ImuSequence:
         ReadError: header, unit, row or number does not fit; it names line and column.
     """
     lines = read_lines(path)
-    start, columns = read_header(path, lines)
-    rows = _rows_quickly(path, start, columns) or _rows_carefully(path, lines, start, columns)
+    header = read_header(path, lines)
+    columns = header.columns
+    rows = _rows_quickly(path, header) or _rows_carefully(path, lines, header)
     is_imu, table = rows.is_imu, rows.table
+    factors = {
+        sensor: np.array([unit_factor(path, columns[sensor[0] + axis], known) for axis in "xyz"])
+        for sensor, known in (("gyro", GYRO_UNITS), ("accel", ACCEL_UNITS))
+    }
+    gyro, accel = (
+        np.stack([table[sensor[0] + axis] for axis in "xyz"], axis=1) * factors[sensor]
+        for sensor in factors
+    )
     return ImuSequence(
         name=path.stem,
         time=rows.time[is_imu],
-        gyro=_triple(path, table, columns, "g", GYRO_UNITS)[is_imu],
-        accel=_triple(path, table, columns, "a", ACCEL_UNITS)[is_imu],
+        gyro=gyro[is_imu],
+        accel=accel[is_imu],
         truth=_truth(path, rows) if "px" in table else None,
+        converted=frozenset(sensor for sensor in factors if (factors[sensor] != 1.0).any()),
     )
 
 
@@ -74,10 +89,12 @@ class _Rows:
     line_numbers: Sequence[int]
 
 
-def _rows_quickly(path: Path, start: int, columns: dict[str, Column]) -> _Rows | None:
+def _rows_quickly(path: Path, header: Header) -> _Rows | None:
     """The rows of a large file in which every row is whole, else None."""
+    columns = header.columns
     names = ["t", *(name for name in (*IMU, *TRUTH) if name in columns)]
-    quick = read_quickly(path, start, ",", [columns[name].index for name in names])
+    used = [columns[name].index for name in names]
+    quick = read_quickly(path, header.lines, header.separator, used)
     if quick is None:
         return None
     stamps = quick.numbers(columns["t"].index)
@@ -97,18 +114,19 @@ def _rows_quickly(path: Path, start: int, columns: dict[str, Column]) -> _Rows |
     )
 
 
-def _rows_carefully(path: Path, lines: list[str], start: int, columns: dict[str, Column]) -> _Rows:
-    numbered = [(k, line) for k, line in enumerate(lines[start:], start + 1) if _is_row(line)]
+def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
+    first, columns = header.lines + 1, header.columns
+    numbered = [(k, line) for k, line in enumerate(lines[first - 1 :], first) if _is_row(line)]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
     used = [name for name in (*IMU, *TRUTH) if name in columns]
-    values = _numbers(path, numbered, [columns[name] for name in used])
-    is_imu = _imu_rows(numbered, columns, values[:, : len(IMU)])
+    values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
+    is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
     return _Rows(
         table={name: values[:, k] for k, name in enumerate(used)},
-        time=_seconds(path, numbered, columns["t"], int(np.argmax(is_imu))),
+        time=_seconds(path, numbered, header, int(np.argmax(is_imu))),
         is_imu=is_imu,
         line_numbers=[number for number, _ in numbered],
     )
@@ -116,8 +134,7 @@ def _rows_carefully(path: Path, lines: list[str], start: int, columns: dict[str,
 
 def is_own_csv(path: Path) -> bool:
     """Whether a file starts with a header that names columns of this format."""
-    line = first_line(path, comments=True)
-    return line is not None and names_columns(line)
+    return is_header(first_lines(path, _HEAD_LINES, comments=True))
 
 
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
@@ -173,40 +190,36 @@ def _is_row(line: str) -> bool:
     return bool(text) and not text.startswith("#")
 
 
-def _triple(
-    path: Path,
-    table: dict[str, FloatArray],
-    columns: dict[str, Column],
-    letter: str,
-    known: dict[str, float],
+def _numbers(
+    path: Path, numbered: list[tuple[int, str]], separator: str, columns: list[Column]
 ) -> FloatArray:
-    scaled = [
-        table[letter + axis] * unit_factor(path, columns[letter + axis], known) for axis in "xyz"
-    ]
-    return np.stack(scaled, axis=1)
-
-
-def _numbers(path: Path, numbered: list[tuple[int, str]], columns: list[Column]) -> FloatArray:
     """The columns asked for as (N, K), blank cells as NaN."""
     text = "\n".join(line for _, line in numbered)
-    if ",," in text or ",\n" in text or text[0] == "," or text[-1] == "," or ", " in text:
-        text = _BLANK.sub("nan", text)
-    try:
-        return np.loadtxt(
-            text.split("\n"), delimiter=",", ndmin=2, usecols=[column.index for column in columns]
-        )
-    except (ValueError, IndexError):
-        return np.array([_row(path, number, line, columns) for number, line in numbered])
+    used = [column.index for column in columns]
+    with suppress(ValueError, IndexError):
+        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
+    text = _blank(separator).sub("nan", text)
+    with suppress(ValueError, IndexError):
+        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
+    return np.array([_row(path, number, line, separator, columns) for number, line in numbered])
 
 
-def _row(path: Path, number: int, line: str, columns: list[Column]) -> list[float]:
+def _blank(separator: str) -> re.Pattern[str]:
+    """Cells with nothing but blanks in them, of one line: its end is no blank."""
+    blanks = rf"[^\S\n{separator}]*"
+    return re.compile(
+        rf"(?<={separator}){blanks}(?={separator}|$)|^{blanks}(?={separator})", flags=re.MULTILINE
+    )
+
+
+def _row(path: Path, number: int, line: str, separator: str, columns: list[Column]) -> list[float]:
     """One row the slow way, for the error that names its line and column."""
-    cells = line.split(",")
+    cells = line.split(separator)
     needed = 1 + max(column.index for column in columns)
     if len(cells) < needed:
-        raise ReadError(
-            path, f"line {number}", f"{len(cells)} values", f"{needed}", "is the file cut short?"
-        )
+        alone = f"separate them by {separator!r} as in the header"
+        fix = alone if len(cells) == 1 else "is the file cut short?"
+        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
     row = []
     for column in columns:
         cell = cells[column.index].strip()
@@ -214,30 +227,30 @@ def _row(path: Path, number: int, line: str, columns: list[Column]) -> list[floa
             row.append(float(cell) if cell else float("nan"))
         except ValueError:
             where = f"line {number}, {column.title}"
-            raise ReadError(path, where, repr(cell), "a number") from None
+            fix = "write a decimal point" if "," in cell else ""
+            raise ReadError(path, where, repr(cell), "a number", fix) from None
     return row
 
 
-def _imu_rows(
-    numbered: list[tuple[int, str]], columns: dict[str, Column], values: FloatArray
-) -> BoolArray:
+def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArray) -> BoolArray:
     """Rows that are IMU samples: not those with truth alone, whose IMU cells are all blank."""
     is_imu = np.ones(len(values), dtype=np.bool_)
-    indices = [columns[name].index for name in IMU]
+    indices = [header.columns[name].index for name in IMU]
     for k in np.flatnonzero(np.isnan(values).all(axis=1)):
-        cells = numbered[k][1].split(",")
+        cells = numbered[k][1].split(header.separator)
         is_imu[k] = any(cells[index].strip() for index in indices)
     return is_imu
 
 
 def _seconds(
-    path: Path, numbered: list[tuple[int, str]], column: Column, origin: int
+    path: Path, numbered: list[tuple[int, str]], header: Header, origin: int
 ) -> FloatArray:
     """Seconds since the row `origin`, from the digits as they are written."""
+    column = header.columns["t"]
     per_second = unit_factor(path, column, TIME_UNITS)
     stamps = []
     for number, line in numbered:
-        cell = line.split(",", column.index + 1)[column.index].strip()
+        cell = line.split(header.separator, column.index + 1)[column.index].strip()
         try:
             stamps.append(Decimal(cell))
         except InvalidOperation:
@@ -252,13 +265,12 @@ def _truth(path: Path, rows: _Rows) -> Trajectory | None:
     time = rows.time
     poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
-    newest = np.maximum.accumulate(time[kept])
-    kept = kept[np.append(True, newest[1:] > newest[:-1])] if len(kept) else kept
+    kept = kept[advancing(time[kept])]
     if not len(kept):
         _log.warning("%s: no row holds truth", path)
         return None
     norm = np.linalg.norm(poses[kept, 3:], axis=1)
-    bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
+    bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
         k = int(np.argmax(bad))
         where = f"line {rows.line_numbers[kept[k]]}, qx qy qz qw"

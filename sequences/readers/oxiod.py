@@ -39,6 +39,7 @@ from stario.sequences.readers.text import (
     read_table,
     seconds,
 )
+from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 
 RATE = 100.0
@@ -74,7 +75,7 @@ def read_oxiod(path: Path) -> ImuSequence:
         ReadError: a file is missing, cut short, or two of `syn` do not have as many rows.
     """
     phone = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
-    capture = _capture_file(path)
+    capture = capture_file(path)
     return ImuSequence(
         name=_name(path),
         time=phone.time,
@@ -131,7 +132,7 @@ def _stamps_ns(table: Table) -> IntArray:
     return table.stamps_ns(0, time_unit(table.path, table.values[:, 0]))
 
 
-def _capture_file(path: Path) -> Path | None:
+def capture_file(path: Path) -> Path | None:
     """The capture of the same number beside the IMU's file, or in a folder `tango` beside its."""
     if not path.name.startswith("imu"):
         return None
@@ -145,7 +146,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     table = read_table(path, columns=max(8, len(first_numbers(path))))
     position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
     norm = np.linalg.norm(quat_xyzw, axis=1)
-    valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) < 1e-2)
+    valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
     valid &= (position != 0.0).any(axis=1)  # written while nothing was seen
     quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
     attitude_WV = Rotation.from_quat(quat_xyzw)

@@ -52,6 +52,13 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
 
     Never raises: it serves to recognise formats.
     """
+    lines = head_lines(path)
+    kept = [x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#"))]
+    return kept[:count]
+
+
+def head_lines(path: Path) -> list[str]:
+    """Every line at the beginning of a text file, the last of them perhaps cut; never raises."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -60,9 +67,7 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
     if b"\0" in head:
         return []
     # The head may end within a character: what is replaced there is never looked at.
-    lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    kept = [x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#"))]
-    return kept[:count]
+    return head.decode("utf-8-sig", errors="replace").splitlines()
 
 
 def magic(path: Path, count: int = 16) -> bytes:

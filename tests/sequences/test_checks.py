@@ -146,6 +146,25 @@ def test_bad_samples_do_not_disturb_the_check(walk: ImuSequence) -> None:
     assert "--gyro-unit" in refused(in_degrees(dirty))
 
 
+@pytest.mark.parametrize(("period", "lost"), [(4.0, 1.0), (3.0, 0.5), (4.0, 0.3), (30.0, 20.0)])
+@pytest.mark.parametrize("carry", ["swinging", "rig", "pocket"])
+def test_gaps_are_not_taken_for_wrong_units(carry: str, period: float, lost: float) -> None:
+    """The device turns within them and nobody sees it; the stretches between tell the units."""
+    style = WalkStyle(carry=carry)
+    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
+    kept = walk.time % period > lost
+    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept])
+    check_units(holed)
+    assert "--gyro-unit deg/s" in refused(in_degrees(holed))
+
+
+def test_stretches_too_short_to_tell_are_not_asked() -> None:
+    style = WalkStyle(carry="pocket")
+    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2)
+    kept = walk.time % 0.9 > 0.6
+    check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
+
+
 def test_units_by_name(walk: ImuSequence) -> None:
     assert np.array_equal(with_units(walk).gyro, walk.gyro)
     assert np.allclose(with_units(in_degrees(walk), "deg/s").gyro, walk.gyro)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from dataclasses import dataclass
@@ -12,7 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.files import atomic_write, read_tum, write_json, write_npz, write_tum
+from stario.sequences.files import (
+    atomic_folder,
+    atomic_write,
+    read_tum,
+    write_json,
+    write_npz,
+    write_tum,
+)
 from stario.sequences.sequence import Trajectory
 
 
@@ -69,6 +77,22 @@ def test_missing_folder_and_other_modes_are_named(tmp_path):
         pass
     with pytest.raises(InputError, match="mode: found 'a'"), atomic_write(tmp_path / "f", "a"):
         pass
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("write", [atomic_write, atomic_folder])
+def test_what_the_system_refuses_names_path_reason_and_fix(tmp_path, write):
+    long = tmp_path / ("x" * 300)
+    told = rf"path: found .*{long.name}: File name too long, expected .*; choose another place"
+    with pytest.raises(InputError, match=told), write(long):
+        pass
+
+    def fill() -> None:
+        with write(tmp_path / "full"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(InputError, match="full: No space left on device"):
+        fill()
     assert names(tmp_path) == []
 
 

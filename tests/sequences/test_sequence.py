@@ -4,7 +4,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z, tilt_aligning, wrap_angle, yaw_of
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import (
+    FloatArray,
+    ImuSequence,
+    Trajectory,
+    second_ticks,
+    too_slow,
+)
 
 
 def screw(time: FloatArray) -> Trajectory:
@@ -71,6 +77,23 @@ def test_short_losses_are_bridged_by_valid_neighbours_alone() -> None:
     assert np.allclose(read.position_W, screw(GRID).position_W)
 
 
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_truth_at_the_slowest_rate_is_whole_whatever_rounding_does(start: float) -> None:
+    """0.3 - 0.2 > 0.1 in floating point."""
+    track = screw(start + np.round(np.arange(201) * 0.1, 1))
+    assert track.covers(start + np.linspace(0.05, 19.95, 400)).all()
+    assert not too_slow(track)
+    assert "at 5 Hz, at least 10 Hz are needed" in too_slow(screw(track.time[::2]))
+
+
+def test_gaps_are_not_bridged_at_times_since_1970() -> None:
+    """A second after 1970 has digits to spare: 1e-9 of it is 1.7 s."""
+    kept = np.delete(1.7e9 + GRID, np.arange(40, 55))
+    outside = 1.7e9 + np.array([-0.5, 0.9, 2.5])
+    assert not screw(kept).covers(outside).any()
+    assert screw(kept).covers(kept).all()
+
+
 def test_interpolation_needs_two_valid_samples() -> None:
     with pytest.raises(InputError, match="0 valid samples"):
         marked(screw(GRID), slice(None)).at(GRID)
@@ -92,6 +115,14 @@ def test_path_length_is_of_the_way_and_not_of_the_noise() -> None:
     noisy = circle + 0.01 * np.random.default_rng(0).standard_normal(circle.shape)
     assert Trajectory(time, noisy, rest).path_length() == pytest.approx(5.0, rel=0.03)
     assert marked(Trajectory(time, circle, rest), slice(1, None)).path_length() == 0.0
+
+
+def test_a_clock_that_jumps_by_decades_costs_no_memory() -> None:
+    time = np.concatenate([[0.0], 1.7e9 + np.arange(1001) / 100.0])
+    position = np.outer(np.append(0.0, np.arange(1001) / 100.0), [1.0, 0.0, 0.0])
+    track = Trajectory(time, position, Rotation.identity(len(time)))
+    assert track.path_length() == pytest.approx(10.0)
+    assert len(second_ticks(time)) < 20
 
 
 def test_a_trajectory_is_checked_at_the_edge() -> None:

@@ -184,6 +184,15 @@ def test_gaps_short_ones_are_bridged_long_ones_refused() -> None:
         simulate_imu(Trajectory(track.time, bad, track.attitude_WB, valid=valid))
 
 
+def test_poses_that_are_missing_are_a_gap_like_those_marked() -> None:
+    """What a spline makes of 5 s without poses is neither a walk nor a truth."""
+    track = waving()
+    kept = (track.time < 10.0) | (track.time > 15.0)
+    holed = Trajectory(track.time[kept], track.position_W[kept], track.attitude_WB[kept])
+    with pytest.raises(InputError, match=r"no valid pose for 5\.020 s after 9\.990 s"):
+        simulate_imu(holed)
+
+
 def test_what_cannot_be_simulated_is_refused() -> None:
     with pytest.raises(InputError, match="at least 6"):
         simulate_imu(standing(4.0))

@@ -182,13 +182,15 @@ def test_what_cannot_be_learned_from_is_skipped(tmp_path: Path) -> None:
         "blind": WALK.without_truth(),
         "degrees": replace(WALK, gyro=np.degrees(WALK.gyro)),
         "short": replace(WALK, truth=truth.slice(1.0, 2.5)),
+        "sparse": replace(WALK, truth=truth.at(truth.time[::20])),
     }
     for name, sequence in wrong.items():
         write_csv(tmp_path / f"{name}.csv", sequence)
     paths = [tmp_path / f"{name}.csv" for name in wrong]
     outcomes = list(recorded(paths, read_recording, {}, tmp_path / "cache"))
     reasons = [outcome.reason for outcome in outcomes if isinstance(outcome, Skipped)]
-    for reason, words in zip(reasons, ("truth", "--gyro-unit", "no unbroken stretch"), strict=True):
+    told = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz, at least 10 Hz are needed")
+    for reason, words in zip(reasons, told, strict=True):
         assert words in reason
 
 
@@ -220,6 +222,11 @@ def test_the_files_of_a_recording(tmp_path: Path) -> None:
     for name in ("imu1", "vi1", "imu2", "vi2"):
         (syn / f"{name}.csv").write_text(row + "\n")
     assert recording_files(syn / "imu2.csv") == [syn / "imu2.csv", syn / "vi2.csv"]
+    raw, tango = tmp_path / "floor1" / "raw", tmp_path / "floor1" / "tango"
+    for folder, name in ((raw, "imu1"), (tango, "tango1"), (tango, "tango2")):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.csv").write_text(row + "\n")
+    assert recording_files(raw / "imu1.csv") == [raw / "imu1.csv", tango / "tango1.csv"]
     for name in ("a", "b"):
         write_csv(tmp_path / f"{name}.csv", WALK)
     assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]

@@ -14,6 +14,7 @@ from stario.sequences.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     Attitude,
     clean_samples,
+    imu_in_world,
     resample,
     windows_of,
     world_streams,
@@ -205,6 +206,47 @@ def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
     (true,) = world_streams(walk, attitude="true")
     assert np.isfinite(stream.imu_W).all()
     assert np.abs(stream.position_W - true.position_W).max() < 1e-4
+
+
+def test_a_wild_time_costs_its_own_sample_alone(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    time = walk.time.copy()
+    time[100] += 1e6
+    wild = replace(walk, time=time)
+    assert np.array_equal(clean_samples(wild)[0], np.delete(walk.time, 100))
+    assert "samples ahead of their time left out: 1" in caplog.text
+    (stream,), (whole,) = world_streams(wild), world_streams(walk)
+    assert len(stream) == len(whole)
+
+
+@pytest.mark.parametrize("attitude", ["true", "levelled"])
+def test_a_first_time_of_zero_before_seconds_since_1970_costs_no_memory(
+    walk: ImuSequence, attitude: Attitude
+) -> None:
+    """A grid over all the time between would not fit into any memory."""
+    start = 1.7e9 - 0.01
+    truth = truth_of(walk)
+    late = replace(walk, time=start + walk.time, truth=replace(truth, time=start + truth.time))
+    late.time[0] = 0.0
+    grid, imu_W, usable = imu_in_world(late, truth_of(late), attitude)
+    assert len(grid) == len(imu_W) == len(usable) < len(walk) + 500
+    assert (np.diff(grid) > 0.0).all()
+    (stream,), (whole,) = world_streams(late, attitude=attitude), world_streams(walk)
+    assert len(stream) == pytest.approx(len(whole), abs=5)
+
+
+def test_behind_a_long_gap_the_grid_goes_on_evenly(walk: ImuSequence) -> None:
+    """Index arithmetic meets the same times as on the whole grid: whole seconds are left out."""
+    kept = (walk.time < 4.0) | (walk.time > 12.345)
+    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    grid, _, usable = imu_in_world(holed, truth_of(walk), "true")
+    index = (grid - grid[0]) * 200.0
+    assert np.abs(index - np.round(index)).max() < 1e-6
+    left_out = np.round(index) - np.arange(len(grid))
+    assert set(left_out) == {0.0, 7 * 200.0}
+    assert not usable[(grid > 4.01) & (grid < 12.345)].any()
+    assert usable[grid > 12.36].all()
 
 
 def test_what_gives_no_windows_is_refused(walk: ImuSequence) -> None:

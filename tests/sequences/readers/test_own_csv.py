@@ -6,11 +6,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.own_csv import read_own_csv
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulate import simulate_imu
+from stario.sequences.units import with_units
 from stario.sequences.walks import WalkStyle, generate_walk
 
 ROW = "0.1,0.2,0.3,1.0,2.0,9.0"
@@ -179,7 +180,11 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found wx beside gx"),
         ([HEADER + ",px,py,pz,qx", *GOOD[1:]], "found no qy, qz, qw"),
         ([HEADER + ",px [mm],py,pz,qx,qy,qz,qw", *GOOD[1:]], "px: found unit 'mm', expected m"),
-        ([HEADER.replace(",", ";"), *GOOD[1:]], "header: found 't [s];gx"),
+        ([HEADER.replace(",", ";"), *GOOD[1:]], "line 2: found 1 values, expected 7; separate"),
+        (
+            [HEADER.replace(",", ";"), f"0;{ROW.replace(',', ';')}", "1;0,1;0;0;1;2;9"],
+            "line 3, gx: found '0,1', expected a number; write a decimal point",
+        ),
         ([*GOOD[:3], "0.02,0.1,0.2"], "line 4: found 3 values, expected 7; is the file cut short?"),
         ([*GOOD[:3], "0.02,0.1,0.2,x,1,2,9"], "line 4, gz: found 'x', expected a number"),
         ([*GOOD[:3], "noon,0.1,0.2,0.3,1,2,9"], "line 4, t: found 'noon', expected a time"),
@@ -207,3 +212,59 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, walk: ImuSequence
         write_csv(tmp_path / "missing" / "walk.csv", walk)
     write_csv(tmp_path / "walk.csv", walk)
     assert [path.name for path in tmp_path.iterdir()] == ["walk.csv"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt"])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators_and_comments_above_the_header_are_recognised(
+    tmp_path: Path, separator: str, suffix: str
+) -> None:
+    lines = [line.replace(",", separator) for line in (*GOOD, f"0.03,{ROW[:-3]}")]
+    lines[-1] += separator  # az is blank
+    path = written(tmp_path / f"walk{suffix}", "# left hand", "", "# again", *lines)
+    assert find_recordings(path) == [path]
+    read = read_recording(path)
+    assert read.time.tolist() == [0.0, 0.01, 0.02, 0.03]
+    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
+    assert np.isnan(read.accel[3, 2])
+    assert np.allclose(read.accel[:3], [1.0, 2.0, 9.0])
+
+
+def test_rows_that_begin_and_end_with_blank_cells_stay_apart(tmp_path: Path) -> None:
+    header = f"{TRUTH_HEADER},{HEADER},note"
+    truths = ["1,2,3,0,0,0,1", ",,,,,,", " , , ,,,,", "4,5,6,0,0,0,1"]
+    rows = [f"{truth},{0.01 * k:.2f},{ROW}," for k, truth in enumerate(truths)]
+    read = read_own_csv(written(tmp_path / "both.csv", header, *rows))
+    assert np.allclose(read.time, [0.0, 0.01, 0.02, 0.03])
+    assert np.allclose(read.accel, [1.0, 2.0, 9.0])
+    assert read.truth is not None
+    assert read.truth.time.tolist() == [0.0, 0.03]
+
+
+def test_a_wild_time_does_not_cost_the_truth_behind_it(tmp_path: Path) -> None:
+    rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
+    truth = read_own_csv(written(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)).truth
+    assert truth is not None
+    assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
+@pytest.mark.parametrize("names", ["x,y,z,qx,qy,qz,qw", "qx,qy,qz,qw", "pos_x_m,pos_y_m,pos_z_m"])
+def test_columns_like_truth_that_are_not_read_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: str
+) -> None:
+    count = names.count(",") + 1
+    path = written(tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1))
+    assert read_own_csv(path).truth is None
+    (record,) = (r for r in caplog.records if r.levelno == logging.WARNING)
+    assert f"no truth is read from {names.replace(',', ', ')}: " in record.getMessage()
+
+
+def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path) -> None:
+    header = "t,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
+    read = read_own_csv(written(tmp_path / "named.csv", header, *GOOD[1:]))
+    for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
+        with pytest.raises(InputError, match=r"for named, whose file names its unit, .*leave the"):
+            with_units(read, **options)
+    assert np.array_equal(with_units(read).gyro, read.gyro)
+    plain = read_own_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better
+    assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))

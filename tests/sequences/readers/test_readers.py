@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
 from stario.sequences.readers.euroc import read_euroc
+from stario.sequences.readers.lists import is_list
 from stario.sequences.readers.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulate import PERFECT_IMU, PHONE_IMU, simulate_imu
@@ -293,7 +294,7 @@ def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
         ("0.0,1,2,3,4,5,6\n", "0.0,1,2,3,4,5,6"),
         ("PK\x00\x01", "no line of text"),
         ("", "no line of text"),
-        ("seconds;wx;wy\n", "seconds;wx;wy"),
+        ("seconds;speed\n", "seconds;speed"),
     ):
         path.write_text(text)
         with pytest.raises(ReadError) as caught:
@@ -361,3 +362,14 @@ def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_de
 @needs_data
 def test_every_recording_is_found() -> None:
     assert len(find_recordings(DATA)) == 18
+
+
+def test_a_text_file_with_rows_of_numbers_is_no_list(tmp_path: Path) -> None:
+    """Whatever its header and separator are: each row would be a recording that is not there."""
+    path = tmp_path / "samples.txt"
+    for mark in ",;\t ":
+        rows = [mark.join(["0.0", "1", "2"]), mark.join(["0.1", "1", "2"])]
+        path.write_text("\n".join(["# logger", mark.join(["s", "x", "y"]), *rows]))
+        assert not is_list(path)
+    path.write_text("a000_1\n145820422949970\n")
+    assert is_list(path)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.bag import read_bag
+from stario.sequences.units import with_units
 
 
 def angle(a: Rotation, b: Rotation) -> float:
@@ -187,6 +188,87 @@ def test_loggers_of_several_habits(tmp_path, formats) -> None:
         assert np.abs(read.accel - accel).max() < 1e-6, name
         assert np.abs(read.time - t).max() < 1e-7, name
     assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(habits)]
+
+
+def sessions(folder, formats, *names: str) -> None:
+    """Files of samples; an accelerometer's where the name says so."""
+    walk = formats.walk(100.0, 3.0)
+    folder.mkdir()
+    for name in names:
+        values = walk.accel if "acc" in name.lower() else walk.gyro
+        (folder / name).write_text(rows(walk.time, values))
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("walk1_acc.csv", "walk1_gyr.csv", "walk2_acc.csv", "walk2_gyr.csv"),
+        ("acc_1.csv", "acc_2.csv", "gyr_3.csv"),
+    ],
+)
+def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names) -> None:
+    sessions(tmp_path / "s", formats, *names)
+    told = ", ".join(names) + ", expected .*put each recording into a folder of its own"
+    with pytest.raises(ReadError, match=told):
+        read_recording(tmp_path / "s")
+
+
+def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path, formats) -> None:
+    sessions(tmp_path / "s", formats, "watch_acc.csv", "watch_gyr.csv")
+    expected = read_recording(tmp_path / "s")
+    (tmp_path / "s/phone_acc.csv").write_text(rows(expected.time, 2.0 * expected.accel))
+    assert np.array_equal(read_recording(tmp_path / "s").accel, expected.accel)
+
+
+def test_one_recordings_variants_are_no_other_recordings(tmp_path, formats) -> None:
+    """What loggers write beside the raw sensors; and names that differ by more than the sensor."""
+    names = ("Accelerometer.csv", "Gyroscope.csv")
+    beside = ("AccelerometerUncalibrated.csv", "GyroscopeUncalibrated.csv", "Gravity.csv")
+    sessions(tmp_path / "s", formats, *names, *beside)
+    sessions(tmp_path / "t", formats, "acc_12-00-01.csv", "gyr_12-00-02.csv")
+    assert alike(read_recording(tmp_path / "s"), read_recording(tmp_path / "t"))
+    uncalibrated = tmp_path / "s/AccelerometerUncalibrated.csv"
+    uncalibrated.write_text(rows(np.arange(9) / 100.0, np.ones((9, 3))))
+    assert len(read_recording(tmp_path / "s")) == len(read_recording(tmp_path / "t"))
+
+
+@pytest.mark.parametrize("above", ["", "\n", "Device: Pixel\n\n", "# a\n\n# b\n"])
+def test_whatever_stands_above_a_loggers_header(tmp_path, formats, above) -> None:
+    walk = formats.walk(100.0, 3.0)
+    head = f"{above}time,x,y,z\n"
+    phone_files(
+        tmp_path / "s", head + rows(walk.time, walk.accel), head + rows(walk.time, walk.gyro)
+    )
+    assert np.array_equal(read_recording(tmp_path / "s").gyro, walk.gyro)
+
+
+@pytest.mark.parametrize("rate", [50.0, 1000.0, 1125.0])
+@pytest.mark.parametrize("start", [0.0, 12345.678])
+def test_every_accepted_rate_tells_its_unit(tmp_path, formats, rate, start) -> None:
+    walk = formats.walk(rate, 2.0)
+    t = np.round(start + walk.time, 6)
+    phone_files(tmp_path / "s", rows(t, walk.accel), rows(t, walk.gyro))
+    assert read_recording(tmp_path / "s").rate == pytest.approx(rate, rel=1e-3)
+
+
+def test_units_that_a_logger_names_are_believed_or_refused(tmp_path, formats) -> None:
+    walk = formats.walk(100.0, 3.0)
+
+    def read(time: str, gyro: str):
+        texts = [
+            f"time [{time}],x [{unit}],y,z\n" + rows(1e3 * walk.time, values)
+            for unit, values in (("m/s^2", walk.accel), (gyro, np.degrees(walk.gyro)))
+        ]
+        phone_files(tmp_path / "s", *texts)
+        return read_recording(tmp_path / "s")
+
+    named = read("milliseconds", "deg/s")
+    assert np.allclose(named.time, walk.time)
+    with pytest.raises(InputError, match="whose file names its unit"):
+        with_units(named, gyro_unit="deg/s")
+    with_units(named, accel_unit="-m/s^2")
+    with pytest.raises(ReadError, match="time: found unit 'ticks', expected s, ms, us, ns"):
+        read("ticks", "deg/s")
 
 
 def test_files_that_hold_both_sensors_are_no_loggers(tmp_path, walks) -> None:

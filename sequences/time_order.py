@@ -1,0 +1,61 @@
+"""Which samples count where times repeat, run backward or jump ahead.
+
+The intake of streams (`fusion.intake`) decides by the same rules and numbers as samples come in;
+here all of a recording is there to look at.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from stario.sequences.sequence import MAX_IMU_GAP, BoolArray, FloatArray
+
+LONG_GAP = 10.0
+"""A jump ahead by more than this [s] is far, and needs more samples to be believed."""
+
+CONFIRMED, CONFIRMED_FAR = 2, 20
+"""Samples that confirm a jump ahead in time, and a far one or one with no sample before."""
+
+
+def advancing(time: FloatArray) -> BoolArray:
+    """Which of the times (N,) [s], all finite, move on: what counts is strictly increasing.
+
+    Those not later than all that count before are left out; so are the few that jump ahead of the
+    ones behind them, or a single wild time would make all that follow look late.
+    """
+    steps = np.diff(time)
+    breaks = np.flatnonzero((steps < 0.0) | (steps > MAX_IMU_GAP)) + 1
+    parts: list[tuple[int, int]] = []  # [start, stop) of what counts so far
+    for start, stop in pairwise([0, *breaks.tolist(), len(time)]):
+        if start == stop:
+            continue
+        del parts[_first_refuted(time, parts, time[start:stop]) :]
+        if parts:
+            newest = time[parts[-1][1] - 1]
+            start += int(np.searchsorted(time[start:stop], newest, side="right"))
+        if start < stop:
+            parts.append((start, stop))
+    counts = np.zeros(len(time), dtype=np.bool_)
+    for start, stop in parts:
+        counts[start:stop] = np.diff(time[start:stop], prepend=-np.inf) > 0.0
+    return counts
+
+
+def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], behind: FloatArray) -> int:
+    """The first part that the times behind it, none decreasing, show to be from the future."""
+    first, samples = len(parts), 0
+    for k in reversed(range(len(parts))):
+        start, stop = parts[k]
+        samples += stop - start
+        if samples >= CONFIRMED_FAR:
+            break
+        before = time[parts[k - 1][1] - 1] if k else -np.inf
+        jump = time[start] - before
+        few = samples < (CONFIRMED_FAR if jump > LONG_GAP else CONFIRMED)
+        if few and jump > MAX_IMU_GAP:
+            later = behind[np.searchsorted(behind, before, side="right") :]
+            if len(later) and later[0] < time[start]:
+                first = k
+    return first
