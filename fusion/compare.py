@@ -33,7 +33,6 @@ METRICS = (
     "aye_rad",
     "nees",
     "nis",
-    "coverage",
     "seconds_network",
     "seconds_filter",
 )
@@ -120,8 +119,7 @@ def measure(track: Track, truth: Trajectory | None) -> Metrics:
     figures: Metrics = dict.fromkeys(METRICS)
     if truth is not None:
         result = evaluate_track(track.trajectory, truth)
-        known = ("ate_m", "rte_m", "pde", "aye_rad", "coverage")
-        figures |= {name: getattr(result, name) for name in known}
+        figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
         if track.trajectory.position_covariance_W is not None:
             figures["nees"] = position_nees(track.trajectory, truth).median
     figures["nis"] = track.nis

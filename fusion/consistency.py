@@ -36,8 +36,8 @@ YAW_SIGMA = math.radians(10.0)
 _POSITION_SIGMA = 0.01
 
 _DISPLACEMENT_SIGMA = 0.1
-"""Per axis [m], as of a good network. Far better ones meet the unknown first speed and tilt before
-they are small enough to be linear: with 0.03 m the NEES of the first minute is 19 instead of 16."""
+"""Per axis [m], as of a good network. Far better ones show that an unknown first speed meets an
+unknown yaw beyond first order: with 0.03 m the NEES of the first minute is 19 instead of 16."""
 
 
 @dataclass(frozen=True)

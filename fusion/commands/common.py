@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stario.fusion.navigator import Progress
     from stario.network.model import DisplacementModel
     from stario.sequences.batch import Skipped
-    from stario.sequences.sequence import ImuSequence
+    from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 PathsArgument = Annotated[
     list[Path] | None, typer.Argument(help="Recordings, folders or lists of some.")
@@ -198,8 +198,16 @@ _WHOLE = 0.98
 """A track of which the truth covers less is said to be compared in part."""
 
 
-def track_table(metrics: dict[str, dict[str, float | None]]) -> str:
-    """A row of figures for each track, and what they mean where there is truth."""
+def track_table(
+    metrics: dict[str, dict[str, float | None]], time: FloatArray, truth: Trajectory | None
+) -> str:
+    """A row of figures for each track, and what they mean where there is truth.
+
+    Args:
+        metrics: by track.
+        time: (N,) of a track [s].
+        truth: None where there is none.
+    """
     from stario.fusion.compare import METRIC_WORDS
 
     columns = {
@@ -216,11 +224,12 @@ def track_table(metrics: dict[str, dict[str, float | None]]) -> str:
     for name, figures in metrics.items():
         cells = [figures.get(key) for key in columns]
         lines.append(f"{name:<22}" + "".join(f"{_cell(value):>12}" for value in cells))
-    covered = [c for figures in metrics.values() if (c := figures["coverage"]) is not None]
-    if covered:
-        lines += [f"{key}: {METRIC_WORDS[key]}." for key in ("ate_m", "rte_m", "alignment")]
-    if covered and min(covered) < _WHOLE:
-        lines.append(f"The truth covers {min(covered):.0%} of the track: figures are of that part.")
+    if truth is None:
+        return "\n".join(lines)
+    lines += [f"{key}: {METRIC_WORDS[key]}." for key in ("ate_m", "rte_m", "alignment")]
+    covered = float(truth.covers(time).mean())
+    if covered < _WHOLE:
+        lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")
     return "\n".join(lines)
 
 

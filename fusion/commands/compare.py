@@ -80,4 +80,5 @@ def _print_comparison(comparison: Comparison) -> None:
     path = comparison.path_m
     way = "no truth" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
-    typer.echo(track_table(comparison.metrics))
+    time = comparison.tracks["ekf"].time
+    typer.echo(track_table(comparison.metrics, time, sequence.truth))

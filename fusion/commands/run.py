@@ -93,7 +93,7 @@ def _run(
     way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     typer.echo(f"{way} travelled by the estimate")
     if truth is not None:
-        typer.echo(track_table({backend: metrics}))
+        typer.echo(track_table({backend: metrics}, track.time, truth))
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")
