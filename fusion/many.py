@@ -66,15 +66,16 @@ def compare_recordings(
         within(0.0)
         if isinstance(outcome, Comparison):
             name = distinct_name(outcome.sequence.name, names)
-            names.add(name)
             outcome = replace(outcome, sequence=replace(outcome.sequence, name=name))
         yield outcome
 
 
 def distinct_name(name: str, taken: set[str]) -> str:
-    """The name, or the first of name-2, name-3, ... that is not taken."""
+    """The name, or the first of name-2, name-3, ... that is not taken; it is taken from now on."""
     names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
-    return next(name for name in names if name not in taken)
+    found = next(name for name in names if name not in taken)
+    taken.add(found)
+    return found
 
 
 def _compare(

@@ -154,7 +154,6 @@ def compare_networks(
         else:
             entries, sample = outcome
             name = distinct_name(sample.recording, names)
-            names.add(name)
             table.entries.extend(replace(entry, recording=name) for entry in entries)
             if len(table.samples) < samples:
                 table.samples.append(replace(sample, recording=name))

@@ -43,8 +43,7 @@ def backends(
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
     from stario.fusion.backends import score_recording, score_table, score_walk, summary
-    from stario.sequences.batch import Skipped
-    from stario.sequences.errors import StarioError
+    from stario.sequences.batch import Skipped, each
     from stario.sequences.splits import split_paths
 
     scores: list[Score] = []
@@ -53,11 +52,15 @@ def backends(
         files, skipped = recordings_at(paths or split_paths(data or Path(), split))
         settings, network = estimating.settings(), estimating.network()
         with progress_bar("backends", len(files)) as progress:
-            for k, file in enumerate(files, 1):
-                try:
-                    scores.append(score_recording(network, reading.read(file), settings))
-                except StarioError as error:
-                    skipped.append(Skipped(str(file), str(error)))
+
+            def scored(file: Path) -> Score:
+                return score_recording(network, reading.read(file), settings)
+
+            for k, outcome in enumerate(each(scored, files, jobs=1), 1):
+                if isinstance(outcome, Skipped):
+                    skipped.append(outcome)
+                else:
+                    scores.append(outcome)
                 progress(k / len(files))
     else:
         with progress_bar("backends", walks) as progress:

@@ -57,7 +57,6 @@ def run(
         try:
             sequence = reading.read(file)
             name = distinct_name(sequence.name, names)
-            names.add(name)
             folder = out if out and len(files) == 1 else (out or Path("runs")) / name
             records.append(_run(navigator, sequence, known, folder, told=not as_json))
         except StarioError as error:

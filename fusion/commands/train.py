@@ -214,7 +214,5 @@ def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldSt
 def _generated(count: int, seed: int, attitude: Attitude, folder: Path) -> list[WorldStream]:
     from stario.network.data import generated_streams, simulated_streams
 
-    def build() -> list[WorldStream]:
-        return generated_streams(count, 60.0, seed, attitude)
-
+    build = partial(generated_streams, count, 60.0, seed, attitude)
     return simulated_streams("generated", build, folder, count, seed, attitude)
