@@ -210,7 +210,7 @@ def _run(
         recipe.step(epoch, _seen(walk, epoch, config, rng))
         if count % config.filter.output_rate == 0:
             k = round(epoch.stop * RATE)
-            rows.append(_errors(recipe.ekf, walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(recipe.settled(), walk, k, b_g[k], b_a[k]))
     return np.array(rows), float(recipe.innovations().nis.mean())
 
 
@@ -231,7 +231,8 @@ def _first_errors(
         velocity_sigma=velocity,
         position_sigma=position,
     )
-    sigmas = f.gyro_bias_sigma, f.accel_bias_sigma
+    narrow = rng.uniform() < f.gyro_corrected and f.gyro_corrected_sigma < f.gyro_bias_sigma
+    sigmas = f.gyro_corrected_sigma if narrow else f.gyro_bias_sigma, f.accel_bias_sigma
     b_g, b_a = (np.tile(sigma * rng.normal(size=3), (len(walk.time), 1)) for sigma in sigmas)
     return prior, b_g, b_a
 

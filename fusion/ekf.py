@@ -20,6 +20,7 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.gyro_prior import GyroBelief
 from stario.fusion.jacobians import (
     CLONE,
     displacement_jacobian,
@@ -37,6 +38,9 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 _NO_GAIN = np.zeros(3)
+
+_GYRO = slice(9, 12)
+"""The gyroscope's bias in the error state."""
 
 _FAR = 1e3
 """Farther from the world's origin than this [m] positions are counted from a point nearby: in the
@@ -113,10 +117,27 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: the slot holds no clone.
         """
+        return self.settled_clone(slot, None)[2]
+
+    def settled_clone(
+        self, slot: int, belief: GyroBelief | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """R_WB (3, 3), p_W (3,) and `clone_covariance` of a clone with a belief about the bias.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
         self._check_slot(slot)
         first = CORE + CLONE * slot
-        P = self.P[first : first + CLONE, first : first + CLONE]
-        return in_plain_terms(P, self._X[1 + slot, :, 4])
+        rows, X = self.P[first : first + CLONE], self._X[1 + slot]
+        P = rows[:, first : first + CLONE]
+        if belief is not None:
+            dx, P = belief.settle(P, rows[:, _GYRO])
+            xi = np.zeros((1, 3, 3))
+            xi[0, ::2] = dx.reshape(2, 3)
+            X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), X[None])[0]
+        p_W = np.asarray(X[:, 4] + self._origin_W)
+        return np.array(X[:, :3]), p_W, in_plain_terms(P, X[:, 4])
 
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
@@ -184,6 +205,17 @@ class StateCloningEkf(ErrorStateEngine):
         self.P[:CORE, :CORE] = in_plain_terms(covariance, -np.array((arrays["v_W"], p)))
         self.x[:] = 0.0
         self._last_downdate = None
+
+    def settle(self, other: StateCloningEkf, belief: GyroBelief | None) -> None:
+        """Become another filter's current state with a belief about the gyroscope's bias."""
+        P = other.P[:CORE, :CORE]
+        self.time, self._origin_W = other.time, other._origin_W
+        self._X[0], self._b_g, self._b_a = other._X[0], other._b_g, other._b_a
+        self.x[:CORE] = 0.0
+        if belief is not None:
+            self.x[:CORE, 0], P = belief.settle(P, P[:, _GYRO])
+            self._inject()
+        self.P[:CORE, :CORE] = P
 
     # --- propagation and clones ------------------------------------------------------------------
 

@@ -40,6 +40,7 @@ def smooth(
     taken: Sequence[Taken],
     changes: Sequence[WorldChange],
     config: NavigatorConfig,
+    gyro_covariance: FloatArray | None = None,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
@@ -49,10 +50,12 @@ def smooth(
         taken: what the filter took in, epoch by epoch.
         changes: how fixes moved and turned the world since the start.
         config: noise, filter and graph settings.
+        gyro_covariance: (3, 3) to which the gyroscope's bias is taken for zero beside the prior
+            (`gyro_prior`), None for not at all.
 
     Returns:
-        The graph's states with their marginal covariances; the filter's own where the graph does
-        not determine one.
+        The graph's states with their marginal covariances; those given where the graph does not
+        determine one.
     """
     origin = filtered[0].p_W  # near the track: see `StateCloningEkf`
     local = [state.shifted(-origin) for state in filtered]
@@ -61,6 +64,8 @@ def smooth(
         near = [fix.shifted(-origin) for fix in fixes]
         builder.step(epoch, measurement, near, held, state, segment)
     builder.close(local[-1])
+    if gyro_covariance is not None:
+        builder.expect_gyro_bias(gyro_covariance)
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:

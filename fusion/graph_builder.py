@@ -60,6 +60,7 @@ class GraphBuilder:
         graph: the graph so far.
         segments: by keyframe, the epochs' segments from it to the next (or to now).
         count: epochs since the start or the last gap.
+        starts: the keyframes that nothing binds to the one before.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class GraphBuilder:
     ) -> None:
         self._config = config
         self.graph = KeyframeGraph(first, config.filter.gate)
+        self.starts = [0]
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
         self._overlap = overlap
@@ -150,6 +152,11 @@ class GraphBuilder:
         graph.add(self._fix_term(fix, before[-1]))
         return True
 
+    def expect_gyro_bias(self, covariance: FloatArray) -> None:
+        """Take in, wherever the graph begins, that the bias is zero to a covariance (3, 3)."""
+        for k in self.starts:
+            self.graph.add(GyroBias(k, np.zeros(3), covariance))
+
     def forget(self, time: float) -> None:
         """Marginalise the keyframes before the last one up to a time [s].
 
@@ -194,6 +201,7 @@ class GraphBuilder:
         """Behind a gap too long to be bridged: from the filter's new start."""
         self.count = 0
         k = self.graph.add_apart(state)
+        self.starts.append(k)
         self.segments[k] = []
         self._joints[0] = k
 

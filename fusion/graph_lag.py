@@ -45,17 +45,18 @@ class GraphRecipe:
         self._fallbacks = 0
         self._why = ""
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
+        self._settled = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)  # of the graph's positions: see `StateCloningEkf`
         self._builder: GraphBuilder
-        self._begin(self._filter.state(), 0)
+        self._begin(self._filter.filtered(), 0)
 
     def step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
     ) -> NavState:
         """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
-        state = self._filter.step(epoch, measurement, fixes)
-        if state.world != self._world or epoch.anew is not None:
-            self._begin(state, 0 if epoch.gap else self._builder.count + 1)
+        world = self._filter.step(epoch, measurement, fixes).world
+        if world != self._world or epoch.anew is not None:
+            self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
             return self.state(in_gap=epoch.gap)
         accepted = [fix.shifted(-self._origin_W) for fix in self._filter.accepted]
         if self._builder.step(epoch, measurement, accepted, self._filter.held):
@@ -68,7 +69,7 @@ class GraphRecipe:
         """Take in a fix at a time before now; False where it is more than a window late."""
         if not self._filter.late_fix(fix):
             return False
-        state = self._filter.state()
+        state = self._filter.filtered()
         if state.world != self._world:
             self._begin(state, self._builder.count)
         elif any(taken is fix for taken in self._filter.accepted) and self._builder.fix(
@@ -79,7 +80,10 @@ class GraphRecipe:
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
-        return self._ahead.state(in_gap, self._world).shifted(self._origin_W)
+        ahead = self._ahead
+        belief = self._filter.gyro_prior.believe(ahead.time, ahead.b_g, ahead.P[9:12, 9:12])
+        self._settled.settle(ahead, belief)
+        return self._settled.state(in_gap, self._world).shifted(self._origin_W)
 
     def innovations(self) -> Innovations:
         """Those of the filter alongside."""
@@ -131,7 +135,7 @@ class GraphRecipe:
         except IndeterminateError as error:
             self._fallbacks += 1
             self._why = str(error)
-            self._begin(self._filter.state(), builder.count)
+            self._begin(self._filter.filtered(), builder.count)
             return
         self._take(newest)
         for segment in builder.segments[graph.last]:

@@ -294,13 +294,15 @@ class Navigator:
         recipe = FilterRecipe(self.config, start, self.prior)
         queue = FixQueue(fixes)
         queue.start(start.time)
-        states, taken = [recipe.state()], []
+        states, filtered, taken = [recipe.state()], [recipe.filtered()], []
         poses: list[SmoothedPose] = []
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
         ):
             due = queue.due(epoch.stop)
             states.append(recipe.step(epoch, measurement, due))
+            if self.backend == "graph":
+                filtered.append(recipe.filtered(epoch.gap))
             if recipe.smoothed is not None and (not poses or recipe.smoothed is not poses[-1]):
                 poses.append(recipe.smoothed)
             taken.append(Taken(epoch, measurement, recipe.accepted, recipe.held, recipe.segment))
@@ -308,11 +310,14 @@ class Navigator:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
         queue.refuse("after the end", len(queue.due(math.inf)))
-        prior, states = states[0], in_last_world(states, recipe.world_changes)
-        notes = []
+        changes = recipe.world_changes
+        states, notes = in_last_world(states, changes), []
         if self.backend == "graph":
-            whole = smooth(states, prior, taken, recipe.world_changes, self.config)
-            states, notes, poses = whole.states, [whole.note], []
+            prior, filtered = filtered[0], in_last_world(filtered, changes)
+            expected = recipe.expected_gyro_bias()
+            whole = smooth(filtered, prior, taken, changes, self.config, expected)
+            notes, poses = [whole.note], []
+            states = states if whole.fell_back else whole.states
         health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
         track = track_from_states(
             states,
@@ -321,7 +326,7 @@ class Navigator:
             seconds_network=observed.seconds_network,
             seconds_filter=observed.seconds_intake + perf_counter() - began,
         )
-        return replace(track, smoothed=smoothed_track(poses, recipe.world_changes))
+        return replace(track, smoothed=smoothed_track(poses, changes))
 
     def _measure(self, epochs: Sequence[Epoch], progress: Progress) -> list[Measurement | None]:
         measurements: list[Measurement | None] = [None] * len(epochs)

@@ -20,6 +20,7 @@ from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import GateMode, UpdateResult
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.fixes import Fix, parts
+from stario.fusion.gyro_prior import GyroBelief, GyroPrior
 from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
 from stario.fusion.innovations import InnovationLog, count, is_gated
@@ -97,7 +98,7 @@ class FilterRecipe:
             last second is, since fixes may come late.
 
     Attributes:
-        ekf: the filter.
+        ekf: the filter, by the wide one of the gyroscope's two priors (`gyro_prior`).
         smoothed: the newest pose that left the window, corrected by all of it; None at first, and
             where mean velocities are measured.
         held: what the last step measured at rest, None where it moved or was refused.
@@ -118,6 +119,8 @@ class FilterRecipe:
         self.ekf = StateCloningEkf(
             slots=f.window_updates if self._uses_clones else 0, gravity=config.gravity
         )
+        self.gyro_prior = GyroPrior(config, start.time)
+        self._settled = StateCloningEkf(slots=0, gravity=config.gravity)
         self._slots: deque[int] = deque()
         self._motion = WindowMotion()
         self._gates = {n: float(chi2.ppf(f.gate, n)) for n in (3, 6)}
@@ -175,7 +178,26 @@ class FilterRecipe:
 
     def state(self, in_gap: bool = False) -> NavState:
         """The estimate now."""
+        return self.settled().state(in_gap, len(self._world.changes))
+
+    def filtered(self, in_gap: bool = False) -> NavState:
+        """The filter's own estimate now, by the wide one of the gyroscope's priors."""
         return self.ekf.state(in_gap, len(self._world.changes))
+
+    def settled(self) -> StateCloningEkf:
+        """The current state by both of the gyroscope's priors; the next call changes it."""
+        self._settled.settle(self.ekf, self.believe())
+        return self._settled
+
+    def expected_gyro_bias(self) -> FloatArray | None:
+        """Covariance (3, 3) to which the bias is expected to be zero beside the wide prior."""
+        belief = self.believe()
+        return None if belief is None else self.gyro_prior.covariance(belief.weight)
+
+    def believe(self) -> GyroBelief | None:
+        """What both of the gyroscope's priors say beyond the filter."""
+        ekf = self.ekf
+        return self.gyro_prior.believe(ekf.time, ekf.b_g, ekf.P[9:12, 9:12])
 
     @property
     def world_changes(self) -> list[WorldChange]:
@@ -370,11 +392,10 @@ class FilterRecipe:
     def _oldest(self) -> SmoothedPose:
         """The oldest clone, which a whole window of measurements has corrected since."""
         slot = self._slots[0]
-        R_WB, p_W = self.ekf.clone_pose(slot)
         time = self.ekf.clone_time(slot)
         assert time is not None  # the slot is taken
         world = len(self._world.changes)
-        return SmoothedPose(time, R_WB, p_W, self.ekf.clone_covariance(slot), world)
+        return SmoothedPose(time, *self.ekf.settled_clone(slot, self.believe()), world)
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""

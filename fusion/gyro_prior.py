@@ -1,0 +1,102 @@
+"""What is known of the gyroscope's bias beforehand: the device corrects it, or it does not.
+
+Many devices estimate their gyroscope's bias and hand out corrected rates, others hand out what the
+sensor says: biases are of two sizes. One Gaussian for both lets a corrected device be turned by
+whatever the network's errors look like, or holds an uncorrected one too tightly. So the prior is
+the mixture p N(0, s_c^2) + (1 - p) N(0, s^2).
+
+A filter carries one Gaussian, the wide one. The narrow one is the wide one times a measurement of
+zero with variance r = 1 / (1/s_c^2 - 1/s^2), and the filter knows how every error goes together
+with the bias, so what a filter with the narrow prior would say follows from what this one says:
+condition it on that measurement. The odds of the two are the ratio of the bias's densities after
+and before all measurements (Savage and Dickey: Dickey, "The weighted likelihood ratio", 1971),
+
+    p / (1 - p) (s / s_c)^3 r^(3/2) |S|^(-1/2) exp(-b^T S^-1 b / 2),    S = P_b + (r + q^2 t) I
+
+with the bias's estimate b and covariance P_b and its walk q since the start, t ago. What is given
+out is the mixture's mean and covariance; the filter itself goes on with the wide prior, so that
+nothing is decided that later measurements could not turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.lie import FloatArray
+
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class GyroBelief:
+    """What the mixture says of a filter's errors beyond the filter itself.
+
+    Attributes:
+        weight: probability that the device corrects its gyroscope.
+        to_zero: (3,) S^-1 b, so that an error with covariance P_xb with the bias moves by
+            -P_xb S^-1 b where the device does.
+        information: (3, 3) S^-1.
+    """
+
+    weight: float
+    to_zero: FloatArray
+    information: FloatArray
+
+    def settle(self, P_xx: FloatArray, P_xb: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (n,) of an error whose mean is zero to the filter, and its covariance (n, n).
+
+        Args:
+            P_xx: (n, n) covariance to the filter.
+            P_xb: (n, 3) with the gyroscope's bias.
+        """
+        w, move = self.weight, P_xb @ self.to_zero
+        spread = ((1.0 - w) * w * move)[:, None] * move
+        return -w * move, P_xx - (w * (P_xb @ self.information)) @ P_xb.T + spread
+
+
+class GyroPrior:
+    """The mixture as a configuration gives it.
+
+    Args:
+        config: probability and both deviations; where the narrow one is none, there is no mixture.
+        start: time of the bias that is meant [s].
+    """
+
+    def __init__(self, config: NavigatorConfig, start: float) -> None:
+        f = config.filter
+        narrow, wide = f.gyro_corrected_sigma, f.gyro_bias_sigma
+        self._mixed = f.gyro_corrected > 0.0 and 0.0 < narrow < wide
+        if not self._mixed:
+            return
+        self._start, self._walk = start, config.noise.gyro_walk**2
+        self._most_walk = wide**2
+        self._r = 1.0 / (1.0 / narrow**2 - 1.0 / wide**2)
+        odds = f.gyro_corrected / (1.0 - f.gyro_corrected)
+        self._log_odds = math.log(odds) + 3.0 * math.log(wide / narrow) + 1.5 * math.log(self._r)
+
+    def believe(self, time: float, b_g: FloatArray, P_b: FloatArray) -> GyroBelief | None:
+        """The belief where a filter has a bias (3,) with covariance (3, 3); None: as the filter."""
+        if not self._mixed:
+            return None
+        S = P_b + (self._r + min(self._walk * (time - self._start), self._most_walk)) * _EYE
+        information: FloatArray = np.linalg.inv(S)
+        to_zero = information @ b_g
+        log_odds = self._log_odds + 0.5 * math.log(np.linalg.det(information))
+        log_odds -= 0.5 * float(b_g @ to_zero)
+        weight = 0.5 * (1.0 + math.tanh(0.5 * log_odds))
+        return GyroBelief(weight, to_zero, information)
+
+    def covariance(self, weight: float) -> FloatArray | None:
+        """Of a measurement of zero (3, 3) that counts as likely as it is; None for hardly at all.
+
+        A graph, which starts from the filter's track, takes it for the whole mixture (a step of
+        expectation and maximisation).
+        """
+        return self._r / weight * _EYE if weight > _LEAST_WEIGHT else None
+
+
+_LEAST_WEIGHT = 1e-3
