@@ -164,7 +164,8 @@ def _streamed(observed: Observed, config: NavigatorConfig) -> tuple[Track, Float
     states, times = [recipe.state()], []
     for epoch, measurement in zip(observed.epochs, observed.measurements, strict=True):
         began = process_time()
-        states.append(recipe.step(epoch, measurement))
+        recipe.step(epoch, measurement)
+        states.append(recipe.state())
         times.append(process_time() - began)
     health = recipe.health(observed.intake.counts)
     track = track_from_states(states, recipe.innovations(), health, 0.0, 0.0)

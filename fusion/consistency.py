@@ -17,8 +17,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.epochs import Epoch
+from stario.fusion.estimate import Settled, settled
 from stario.fusion.intake import all_epochs
 from stario.fusion.lie import FloatArray, exp_so3, log_se23
 from stario.fusion.preintegration import CORE
@@ -210,7 +210,8 @@ def _run(
         recipe.step(epoch, _seen(walk, epoch, config, rng))
         if count % config.filter.output_rate == 0:
             k = round(epoch.stop * RATE)
-            rows.append(_errors(recipe.settled(), walk, k, b_g[k], b_a[k]))
+            now = settled([recipe.estimate()], recipe.gyro_prior)
+            rows.append(_errors(now, walk, k, b_g[k], b_a[k]))
     return np.array(rows), float(recipe.innovations().nis.mean())
 
 
@@ -252,10 +253,10 @@ def _seen(
 
 
 def _errors(
-    ekf: StateCloningEkf, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
+    now: Settled, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
 ) -> tuple[float, float, float]:
-    R = walk.R_WB[k] @ ekf.R_WB.T
-    pose = log_se23(R, walk.v_W[k] - R @ ekf.v_W, walk.p_W[k] - R @ ekf.p_W)
-    error = np.concatenate([pose, b_g - ekf.b_g, b_a - ekf.b_a])
-    P = ekf.core_covariance
+    X, P = now.X[0], now.P[0]
+    R = walk.R_WB[k] @ X[:, :3].T
+    pose = log_se23(R, walk.v_W[k] - R @ X[:, 3], walk.p_W[k] - R @ X[:, 4])
+    error = np.concatenate([pose, b_g - now.b_g[0], b_a - now.b_a[0]])
     return float(error @ np.linalg.solve(P, error)), float(error[2] ** 2), float(P[2, 2])

@@ -20,7 +20,7 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.engine import ErrorStateEngine, GateMode, UpdateResult
-from stario.fusion.gyro_prior import GyroBelief
+from stario.fusion.estimate import Estimate
 from stario.fusion.jacobians import (
     CLONE,
     displacement_jacobian,
@@ -33,7 +33,6 @@ from stario.fusion.jacobians import (
 )
 from stario.fusion.lie import FloatArray, exp_times, skew
 from stario.fusion.preintegration import CORE, Segment
-from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
@@ -41,6 +40,9 @@ _NO_GAIN = np.zeros(3)
 
 _GYRO = slice(9, 12)
 """The gyroscope's bias in the error state."""
+
+_POSE = [0, 1, 2, 4]
+"""Columns of a state that a clone has."""
 
 _FAR = 1e3
 """Farther from the world's origin than this [m] positions are counted from a point nearby: in the
@@ -111,34 +113,6 @@ class StateCloningEkf(ErrorStateEngine):
         X = self._X[1 + slot]
         return np.array(X[:, :3]), np.asarray(X[:, 4] + self._origin_W)
 
-    def clone_covariance(self, slot: int) -> FloatArray:
-        """Covariance (6, 6) of a clone's rotation about the world's axes [rad] and position [m].
-
-        Raises:
-            InputError: the slot holds no clone.
-        """
-        return self.settled_clone(slot, None)[2]
-
-    def settled_clone(
-        self, slot: int, belief: GyroBelief | None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """R_WB (3, 3), p_W (3,) and `clone_covariance` of a clone with a belief about the bias.
-
-        Raises:
-            InputError: the slot holds no clone.
-        """
-        self._check_slot(slot)
-        first = CORE + CLONE * slot
-        rows, X = self.P[first : first + CLONE], self._X[1 + slot]
-        P = rows[:, first : first + CLONE]
-        if belief is not None:
-            dx, P = belief.settle(P, rows[:, _GYRO])
-            xi = np.zeros((1, 3, 3))
-            xi[0, ::2] = dx.reshape(2, 3)
-            X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), X[None])[0]
-        p_W = np.asarray(X[:, 4] + self._origin_W)
-        return np.array(X[:, :3]), p_W, in_plain_terms(P, X[:, 4])
-
     def clone_time(self, slot: int) -> float | None:
         """Time [s] of the clone in a slot, None where it is empty."""
         return self._clone_time[slot]
@@ -148,11 +122,29 @@ class StateCloningEkf(ErrorStateEngine):
         """Covariance (15, 15) of the right-invariant error theta, rho_v, rho_p, d_bg, d_ba."""
         return np.array(self.P[:CORE, :CORE])
 
-    def state(self, in_gap: bool = False, world: int = 0) -> NavState:
-        """The newest state as callers get it."""
-        covariance = self.world_covariance()
-        core = self.R_WB, self.v_W, self.p_W, self.b_g, self.b_a
-        return NavState(self.time, *core, covariance, in_gap, world)
+    def estimate(self, in_gap: bool = False, world: int = 0) -> Estimate:
+        """The newest state."""
+        P = self.core_covariance
+        return self._estimate(self.time, self._X[0].copy(), P, P[:, _GYRO], in_gap, world)
+
+    def clone_estimate(self, slot: int, world: int = 0) -> Estimate:
+        """A clone as it is known now.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        self._check_slot(slot)
+        time, first = self._clone_time[slot], CORE + CLONE * slot
+        assert time is not None  # the slot is taken
+        rows = self.P[first : first + CLONE]
+        P, P_g = rows[:, first : first + CLONE].copy(), rows[:, _GYRO].copy()
+        return self._estimate(time, self._X[1 + slot][:, _POSE], P, P_g, False, world)
+
+    def _estimate(
+        self, time: float, X: FloatArray, P: FloatArray, P_g: FloatArray, in_gap: bool, world: int
+    ) -> Estimate:
+        P_gg = self.P[_GYRO, _GYRO].copy()
+        return Estimate(time, X, self._origin_W, self._b_g, self._b_a, P, P_g, P_gg, in_gap, world)
 
     def world_covariance(self) -> FloatArray:
         """Covariance (15, 15) in plain terms.
@@ -205,17 +197,6 @@ class StateCloningEkf(ErrorStateEngine):
         self.P[:CORE, :CORE] = in_plain_terms(covariance, -np.array((arrays["v_W"], p)))
         self.x[:] = 0.0
         self._last_downdate = None
-
-    def settle(self, other: StateCloningEkf, belief: GyroBelief | None) -> None:
-        """Become another filter's current state with a belief about the gyroscope's bias."""
-        P = other.P[:CORE, :CORE]
-        self.time, self._origin_W = other.time, other._origin_W
-        self._X[0], self._b_g, self._b_a = other._X[0], other._b_g, other._b_a
-        self.x[:CORE] = 0.0
-        if belief is not None:
-            self.x[:CORE, 0], P = belief.settle(P, P[:, _GYRO])
-            self._inject()
-        self.P[:CORE, :CORE] = P
 
     # --- propagation and clones ------------------------------------------------------------------
 

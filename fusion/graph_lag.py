@@ -15,6 +15,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
+from stario.fusion.estimate import nav_states
 from stario.fusion.fixes import Fix
 from stario.fusion.graph import IndeterminateError
 from stario.fusion.graph_builder import GraphBuilder
@@ -44,46 +45,48 @@ class GraphRecipe:
         self._filter = FilterRecipe(config, start, prior, streaming=True)
         self._fallbacks = 0
         self._why = ""
+        self._in_gap = False
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
-        self._settled = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)  # of the graph's positions: see `StateCloningEkf`
         self._builder: GraphBuilder
         self._begin(self._filter.filtered(), 0)
 
     def step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
-    ) -> NavState:
+    ) -> None:
         """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
-        world = self._filter.step(epoch, measurement, fixes).world
-        if world != self._world or epoch.anew is not None:
+        self._filter.step(epoch, measurement, fixes)
+        self._in_gap = epoch.gap
+        if self._filter.world != self._world or epoch.anew is not None:
             self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
-            return self.state(in_gap=epoch.gap)
+            return
         accepted = [fix.shifted(-self._origin_W) for fix in self._filter.accepted]
         if self._builder.step(epoch, measurement, accepted, self._filter.held):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
-        return self.state(in_gap=epoch.gap)
 
     def late_fix(self, fix: Fix) -> bool:
         """Take in a fix at a time before now; False where it is more than a window late."""
         if not self._filter.late_fix(fix):
             return False
-        state = self._filter.filtered()
-        if state.world != self._world:
-            self._begin(state, self._builder.count)
+        if self._filter.world != self._world:
+            self._begin(self._filter.filtered(), self._builder.count)
         elif any(taken is fix for taken in self._filter.accepted) and self._builder.fix(
             fix.shifted(-self._origin_W)
         ):
             self._solve()
         return True
 
-    def state(self, in_gap: bool = False) -> NavState:
-        """The estimate now."""
-        ahead = self._ahead
-        belief = self._filter.gyro_prior.believe(ahead.time, ahead.b_g, ahead.P[9:12, 9:12])
-        self._settled.settle(ahead, belief)
-        return self._settled.state(in_gap, self._world).shifted(self._origin_W)
+    @property
+    def time(self) -> float:
+        """Of the newest state [s]."""
+        return self._ahead.time
+
+    def state(self) -> NavState:
+        """The newest state."""
+        ahead = self._ahead.estimate(self._in_gap, self._world)
+        return nav_states([ahead], self._filter.gyro_prior)[0].shifted(self._origin_W)
 
     def innovations(self) -> Innovations:
         """Those of the filter alongside."""
@@ -105,6 +108,7 @@ class GraphRecipe:
             "ahead": self._ahead.checkpoint(),
             "origin": self._origin_W,
             "world": self._world,
+            "in_gap": self._in_gap,
             "fallbacks": self._fallbacks,
             "why": self._why,
         }
@@ -115,6 +119,7 @@ class GraphRecipe:
         self._builder.load(dump["builder"])
         self._ahead.rewind(dump["ahead"])
         self._world, self._origin_W = dump["world"], dump["origin"]
+        self._in_gap = dump["in_gap"]
         self._fallbacks, self._why = dump["fallbacks"], dump["why"]
 
     def _begin(self, first: NavState, count: int) -> None:

@@ -36,26 +36,27 @@ class GyroBelief:
     """What the mixture says of a filter's errors beyond the filter itself.
 
     Attributes:
-        weight: probability that the device corrects its gyroscope.
-        to_zero: (3,) S^-1 b, so that an error with covariance P_xb with the bias moves by
-            -P_xb S^-1 b where the device does.
-        information: (3, 3) S^-1.
+        weight: (...) probability that the device corrects its gyroscope.
+        to_zero: (..., 3) S^-1 b, so that an error with covariance P_g with the bias moves by
+            -P_g S^-1 b where the device does.
+        information: (..., 3, 3) S^-1.
     """
 
-    weight: float
+    weight: FloatArray
     to_zero: FloatArray
     information: FloatArray
 
-    def settle(self, P_xx: FloatArray, P_xb: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (n,) of an error whose mean is zero to the filter, and its covariance (n, n).
+    def settle(self, P: FloatArray, P_g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (..., n) of an error whose mean is zero to the filter, and its covariance.
 
         Args:
-            P_xx: (n, n) covariance to the filter.
-            P_xb: (n, 3) with the gyroscope's bias.
+            P: (..., n, n) covariance to the filter.
+            P_g: (..., n, 3) with the gyroscope's bias.
         """
-        w, move = self.weight, P_xb @ self.to_zero
-        spread = ((1.0 - w) * w * move)[:, None] * move
-        return -w * move, P_xx - (w * (P_xb @ self.information)) @ P_xb.T + spread
+        move = P_g @ self.to_zero[..., None]
+        w = self.weight[..., None, None]
+        settled = P - (w * (P_g @ self.information)) @ P_g.swapaxes(-1, -2)
+        return -(w * move)[..., 0], settled + (w * (1.0 - w) * move) * move.swapaxes(-1, -2)
 
 
 class GyroPrior:
@@ -78,17 +79,23 @@ class GyroPrior:
         odds = f.gyro_corrected / (1.0 - f.gyro_corrected)
         self._log_odds = math.log(odds) + 3.0 * math.log(wide / narrow) + 1.5 * math.log(self._r)
 
-    def believe(self, time: float, b_g: FloatArray, P_b: FloatArray) -> GyroBelief | None:
-        """The belief where a filter has a bias (3,) with covariance (3, 3); None: as the filter."""
+    def believe(self, time: FloatArray, b_g: FloatArray, P_gg: FloatArray) -> GyroBelief | None:
+        """The belief where a filter has these biases; None: as the filter.
+
+        Args:
+            time: (...) [s].
+            b_g: (..., 3) bias [rad/s].
+            P_gg: (..., 3, 3) its covariance.
+        """
         if not self._mixed:
             return None
-        S = P_b + (self._r + min(self._walk * (time - self._start), self._most_walk)) * _EYE
-        information: FloatArray = np.linalg.inv(S)
-        to_zero = information @ b_g
-        log_odds = self._log_odds + 0.5 * math.log(np.linalg.det(information))
-        log_odds -= 0.5 * float(b_g @ to_zero)
-        weight = 0.5 * (1.0 + math.tanh(0.5 * log_odds))
-        return GyroBelief(weight, to_zero, information)
+        walk = np.minimum(self._walk * (time - self._start), self._most_walk)
+        S = P_gg + (self._r + walk)[..., None, None] * _EYE
+        information = np.asarray(np.linalg.inv(S), dtype=np.float64)
+        to_zero = (information @ b_g[..., None])[..., 0]
+        log_odds = self._log_odds + 0.5 * np.log(np.linalg.det(information))
+        log_odds = log_odds - 0.5 * (b_g * to_zero).sum(axis=-1)
+        return GyroBelief(0.5 * (1.0 + np.tanh(0.5 * log_odds)), to_zero, information)
 
     def covariance(self, weight: float) -> FloatArray | None:
         """Of a measurement of zero (3, 3) that counts as likely as it is; None for hardly at all.

@@ -104,16 +104,16 @@ def in_plain_terms(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
     """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
 
     Args:
-        P: (n, n) of theta, then a rho for each vector, then whatever does not change.
-        vectors_W: (k, 3) velocity and position, or one of them.
+        P: (..., n, n) of theta, then a rho for each vector, then whatever does not change.
+        vectors_W: (..., k, 3) velocity and position, or one of them.
     """
-    A = skew(vectors_W).reshape(-1, 3)
-    stop = 3 + len(A)
+    A = skew(vectors_W).reshape(*vectors_W.shape[:-2], -1, 3)
+    stop = 3 + A.shape[-2]
     plain = P.copy()
-    plain[3:stop] -= A @ P[:3]
-    plain[:, 3:stop] -= plain[:, :3] @ A.T
+    plain[..., 3:stop, :] -= A @ P[..., :3, :]
+    plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
     # Far from the origin the products' rounding would leave it asymmetric.
-    return np.asarray(0.5 * (plain + plain.T))
+    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
 
 
 _UPSIDE_DOWN = 0.01

@@ -21,6 +21,7 @@ from stario.fusion.along_track import Predictor as Predictor
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.epochs import Epoch, Start
+from stario.fusion.estimate import Estimate, nav_states, smoothed_poses
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
 from stario.fusion.graph_batch import smooth
 from stario.fusion.graph_builder import Taken
@@ -294,30 +295,30 @@ class Navigator:
         recipe = FilterRecipe(self.config, start, self.prior)
         queue = FixQueue(fixes)
         queue.start(start.time)
-        states, filtered, taken = [recipe.state()], [recipe.filtered()], []
-        poses: list[SmoothedPose] = []
+        estimates, taken = [recipe.estimate()], []
+        clones: list[Estimate] = []
         for k, (epoch, measurement) in enumerate(
             zip(observed.epochs, observed.measurements, strict=True)
         ):
             due = queue.due(epoch.stop)
-            states.append(recipe.step(epoch, measurement, due))
-            if self.backend == "graph":
-                filtered.append(recipe.filtered(epoch.gap))
-            if recipe.smoothed is not None and (not poses or recipe.smoothed is not poses[-1]):
-                poses.append(recipe.smoothed)
+            recipe.step(epoch, measurement, due)
+            estimates.append(recipe.estimate())
+            if recipe.oldest is not None and (not clones or recipe.oldest is not clones[-1]):
+                clones.append(recipe.oldest)
             taken.append(Taken(epoch, measurement, recipe.accepted, recipe.held, recipe.segment))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
         queue.refuse("after the end", len(queue.due(math.inf)))
         changes = recipe.world_changes
-        states, notes = in_last_world(states, changes), []
+        states, notes = in_last_world(nav_states(estimates, recipe.gyro_prior), changes), []
         if self.backend == "graph":
-            prior, filtered = filtered[0], in_last_world(filtered, changes)
-            expected = recipe.expected_gyro_bias()
-            whole = smooth(filtered, prior, taken, changes, self.config, expected)
-            notes, poses = [whole.note], []
+            wide = nav_states(estimates)
+            filtered, expected = in_last_world(wide, changes), recipe.expected_gyro_bias()
+            whole = smooth(filtered, wide[0], taken, changes, self.config, expected)
+            notes, clones = [whole.note], []
             states = states if whole.fell_back else whole.states
+        poses = smoothed_poses(clones, recipe.gyro_prior)
         health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
         track = track_from_states(
             states,
@@ -357,7 +358,8 @@ class Navigator:
         if epoch.window is not None:
             mean, covariance = self._network.predict(epoch.window[None])
             measurement = _measurement(epoch, mean[0], covariance[0])
-        return self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
+        self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
+        return self._recipe.state()
 
     def _new_recipe(self, start: Start, prior: PriorPose | None) -> Any:
         if self.backend == "graph":
@@ -365,7 +367,7 @@ class Navigator:
         return FilterRecipe(self.config, start, prior, streaming=True)
 
     def _take(self, fix: Fix) -> None:
-        if self._recipe is None or fix.fault() or fix.time > self._recipe.state().time:
+        if self._recipe is None or fix.fault() or fix.time > self._recipe.time:
             self._fixes.hold(fix)
         elif not self._recipe.late_fix(fix):
             self._fixes.refuse("too late")

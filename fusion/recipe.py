@@ -19,8 +19,9 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import GateMode, UpdateResult
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
+from stario.fusion.estimate import Estimate, nav_states, smoothed_poses
 from stario.fusion.fixes import Fix, parts
-from stario.fusion.gyro_prior import GyroBelief, GyroPrior
+from stario.fusion.gyro_prior import GyroPrior
 from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
 from stario.fusion.innovations import InnovationLog, count, is_gated
@@ -99,7 +100,7 @@ class FilterRecipe:
 
     Attributes:
         ekf: the filter, by the wide one of the gyroscope's two priors (`gyro_prior`).
-        smoothed: the newest pose that left the window, corrected by all of it; None at first, and
+        oldest: the newest pose that left the window, corrected by all of it; None at first, and
             where mean velocities are measured.
         held: what the last step measured at rest, None where it moved or was refused.
         segment: the last step's samples, None where fixes cut them.
@@ -120,7 +121,6 @@ class FilterRecipe:
             slots=f.window_updates if self._uses_clones else 0, gravity=config.gravity
         )
         self.gyro_prior = GyroPrior(config, start.time)
-        self._settled = StateCloningEkf(slots=0, gravity=config.gravity)
         self._slots: deque[int] = deque()
         self._motion = WindowMotion()
         self._gates = {n: float(chi2.ppf(f.gate, n)) for n in (3, 6)}
@@ -129,7 +129,8 @@ class FilterRecipe:
         self.held: Held | None = None
         self.segment: Segment | None = None
         self.accepted: list[Fix] = []
-        self.smoothed: SmoothedPose | None = None
+        self.oldest: Estimate | None = None
+        self._in_gap = False
         self._gated_since: float | None = None
         self._world = WorldFrame(
             placed=prior is not None,
@@ -143,7 +144,7 @@ class FilterRecipe:
 
     def step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
-    ) -> NavState:
+    ) -> None:
         """Move to the epoch's end and take in the measurement of the window that ends there.
 
         Args:
@@ -156,7 +157,6 @@ class FilterRecipe:
             self._history.add(Step(epoch, measurement, list(fixes), before))
         self.accepted = []
         self._step(epoch, measurement, fixes)
-        return self.state(in_gap=epoch.gap)
 
     def late_fix(self, fix: Fix) -> bool:
         """Take in a fix at a time before now; False where it is more than a window late.
@@ -176,28 +176,39 @@ class FilterRecipe:
             done = True
         return done
 
-    def state(self, in_gap: bool = False) -> NavState:
-        """The estimate now."""
-        return self.settled().state(in_gap, len(self._world.changes))
+    @property
+    def time(self) -> float:
+        """Of the newest state [s]."""
+        return self.ekf.time
 
-    def filtered(self, in_gap: bool = False) -> NavState:
-        """The filter's own estimate now, by the wide one of the gyroscope's priors."""
-        return self.ekf.state(in_gap, len(self._world.changes))
+    @property
+    def world(self) -> int:
+        """How often fixes moved or turned the world so far."""
+        return len(self._world.changes)
 
-    def settled(self) -> StateCloningEkf:
-        """The current state by both of the gyroscope's priors; the next call changes it."""
-        self._settled.settle(self.ekf, self.believe())
-        return self._settled
+    def estimate(self) -> Estimate:
+        """The filter's newest state, by the wide one of the gyroscope's priors."""
+        return self.ekf.estimate(self._in_gap, self.world)
+
+    def state(self) -> NavState:
+        """The newest state, by both of them."""
+        return nav_states([self.estimate()], self.gyro_prior)[0]
+
+    def filtered(self) -> NavState:
+        """The newest state, by the wide one."""
+        return nav_states([self.estimate()])[0]
+
+    @property
+    def smoothed(self) -> SmoothedPose | None:
+        """`oldest` as callers get it."""
+        clones = [] if self.oldest is None else [self.oldest]
+        return next(iter(smoothed_poses(clones, self.gyro_prior)), None)
 
     def expected_gyro_bias(self) -> FloatArray | None:
         """Covariance (3, 3) to which the bias is expected to be zero beside the wide prior."""
-        belief = self.believe()
-        return None if belief is None else self.gyro_prior.covariance(belief.weight)
-
-    def believe(self) -> GyroBelief | None:
-        """What both of the gyroscope's priors say beyond the filter."""
-        ekf = self.ekf
-        return self.gyro_prior.believe(ekf.time, ekf.b_g, ekf.P[9:12, 9:12])
+        now = self.estimate()
+        belief = self.gyro_prior.believe(np.array(now.time), now.b_g, now.P_gg)
+        return None if belief is None else self.gyro_prior.covariance(float(belief.weight))
 
     @property
     def world_changes(self) -> list[WorldChange]:
@@ -218,7 +229,8 @@ class FilterRecipe:
             "ekf": self.ekf.checkpoint(),
             "slots": list(self._slots),
             "gated_since": self._gated_since,
-            "smoothed": self.smoothed and vars(self.smoothed),
+            "in_gap": self._in_gap,
+            "oldest": self.oldest and vars(self.oldest),
             "motion": self._motion.checkpoint(),
             "log": self._log.checkpoint(),
             "rest": self._rest.checkpoint(),
@@ -230,8 +242,8 @@ class FilterRecipe:
         self.ekf.rewind(checkpoint["ekf"])
         self._slots = deque(checkpoint["slots"])
         self._gated_since = checkpoint["gated_since"]
-        smoothed = checkpoint["smoothed"]
-        self.smoothed = None if smoothed is None else SmoothedPose(**smoothed)
+        self._in_gap, oldest = checkpoint["in_gap"], checkpoint["oldest"]
+        self.oldest = None if oldest is None else Estimate(**oldest)
         self._motion.rewind(checkpoint["motion"])
         self._log.rewind(checkpoint["log"])
         self._rest.rewind(checkpoint["rest"])
@@ -251,6 +263,7 @@ class FilterRecipe:
     def _step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
     ) -> None:
+        self._in_gap = epoch.gap
         if epoch.gap:
             self._forget_window()
         if epoch.anew is not None:
@@ -385,17 +398,9 @@ class FilterRecipe:
 
     def _clone(self, time: float) -> None:
         if len(self._slots) == self.ekf.slots:
-            self.smoothed = self._oldest()
+            self.oldest = self.ekf.clone_estimate(self._slots[0], self.world)
             self.ekf.release(self._slots.popleft())
         self._slots.append(self.ekf.clone(time))
-
-    def _oldest(self) -> SmoothedPose:
-        """The oldest clone, which a whole window of measurements has corrected since."""
-        slot = self._slots[0]
-        time = self.ekf.clone_time(slot)
-        assert time is not None  # the slot is taken
-        world = len(self._world.changes)
-        return SmoothedPose(time, *self.ekf.settled_clone(slot, self.believe()), world)
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""

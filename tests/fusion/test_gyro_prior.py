@@ -10,8 +10,8 @@ import support
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.ekf import StateCloningEkf
-from stario.fusion.gyro_prior import GyroBelief
+from stario.fusion.estimate import nav_states, smoothed_poses
+from stario.fusion.gyro_prior import GyroBelief, GyroPrior
 from stario.fusion.recipe import FilterRecipe
 from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence
@@ -29,8 +29,14 @@ def configured(**values: float) -> NavigatorConfig:
 
 
 MIXED = configured(gyro_bias_sigma=WIDE, gyro_corrected_sigma=NARROW, gyro_corrected=0.5)
+CERTAIN = configured(gyro_bias_sigma=WIDE, gyro_corrected_sigma=NARROW, gyro_corrected=1.0 - 1e-9)
 ONLY_WIDE = configured(gyro_bias_sigma=WIDE, gyro_corrected=0.0)
 ONLY_NARROW = configured(gyro_bias_sigma=NARROW, gyro_corrected=0.0)
+
+
+def believed(recipe: FilterRecipe) -> GyroBelief | None:
+    now = recipe.estimate()
+    return recipe.gyro_prior.believe(np.array(now.time), now.b_g, now.P_gg)
 
 
 def run(config: NavigatorConfig, sequence: ImuSequence, oracle: Any) -> tuple[FilterRecipe, float]:
@@ -59,7 +65,7 @@ def test_the_odds_are_the_ratio_of_two_filters_evidences(
 ) -> None:
     _, walk, oracle = walked
     evidences = [run(config, walk, oracle)[1] for config in (ONLY_NARROW, ONLY_WIDE)]
-    belief = run(MIXED, walk, oracle)[0].believe()
+    belief = believed(run(MIXED, walk, oracle)[0])
     assert belief is not None
     odds = np.log(belief.weight / (1.0 - belief.weight))
     assert odds == pytest.approx(evidences[0] - evidences[1], abs=0.1)
@@ -72,11 +78,8 @@ def test_certain_of_the_narrow_prior_the_state_is_that_filters(
     _, walk, oracle = walked
     narrow = run(ONLY_NARROW, walk, oracle)[0].state()
     recipe = run(MIXED, walk, oracle)[0]
-    wide, belief = recipe.filtered(), recipe.believe()
-    assert belief is not None
-    certain = StateCloningEkf(slots=0)
-    certain.settle(recipe.ekf, replace(belief, weight=1.0))
-    state = certain.state()
+    wide, certain = recipe.filtered(), GyroPrior(CERTAIN, recipe.gyro_prior._start)
+    state = nav_states([recipe.estimate()], certain)[0]
     for name in ("R_WB", "v_W", "p_W", "b_g"):
         apart = np.abs(getattr(wide, name) - getattr(narrow, name)).max()
         assert np.abs(getattr(state, name) - getattr(narrow, name)).max() < 0.03 * apart, name
@@ -87,7 +90,7 @@ def test_certain_of_the_narrow_prior_the_state_is_that_filters(
 def test_corrected_devices_are_told_from_others(walked: tuple[float, ImuSequence, Any]) -> None:
     bias, walk, oracle = walked
     recipe = run(MIXED, walk, oracle)[0]
-    belief = recipe.believe()
+    belief = believed(recipe)
     assert belief is not None
     assert belief.weight < 0.2 if bias > 1e-3 else belief.weight > 0.8
     state, wide = recipe.state(), recipe.filtered()
@@ -102,7 +105,7 @@ def test_a_mixture_has_the_moments_of_its_parts() -> None:
     P, b = root @ root.T, rng.normal(size=3)  # error and bias
     S = P[3:, 3:] + 0.5 * np.eye(3)
     gain = P[:, 3:] @ np.linalg.inv(S)
-    belief = GyroBelief(0.3, np.linalg.solve(S, b), np.linalg.inv(S))
+    belief = GyroBelief(np.array(0.3), np.linalg.solve(S, b), np.linalg.inv(S))
     mean, covariance = belief.settle(P, P[:, 3:])
     parts = [(0.7, np.zeros(6), P), (0.3, -gain @ b, P - gain @ P[3:])]
     expected = sum(w * m for w, m, _ in parts)
@@ -118,7 +121,7 @@ def test_without_a_narrower_prior_there_is_no_mixture(
     walk = make_walk()
     config = configured(gyro_bias_sigma=WIDE, **alone)
     recipe, _ = run(config, walk, make_oracle(walk, walk.truth, config))
-    assert recipe.believe() is None
+    assert believed(recipe) is None
     assert recipe.expected_gyro_bias() is None
     np.testing.assert_array_equal(recipe.state().p_W, recipe.filtered().p_W)
     np.testing.assert_array_equal(recipe.state().covariance, recipe.filtered().covariance)
@@ -130,11 +133,13 @@ def test_a_clone_is_settled_as_the_state_it_is_a_copy_of(
     walk = make_walk()
     recipe, _ = run(MIXED, walk, make_oracle(walk, walk.truth, MIXED))
     state = recipe.state()  # its newest clone was taken at this time
-    R_WB, p_W, covariance = recipe.ekf.settled_clone(recipe._slots[-1], recipe.believe())
-    np.testing.assert_allclose(R_WB, state.R_WB, atol=1e-12)
-    np.testing.assert_allclose(p_W, state.p_W, atol=1e-12)
+    clone = recipe.ekf.clone_estimate(recipe._slots[-1])
+    pose = smoothed_poses([clone], recipe.gyro_prior)[0]
+    assert pose.time == state.time
+    np.testing.assert_allclose(pose.R_WB, state.R_WB, atol=1e-12)
+    np.testing.assert_allclose(pose.p_W, state.p_W, atol=1e-12)
     rows = np.r_[0:3, 6:9]
-    np.testing.assert_allclose(covariance, state.covariance[np.ix_(rows, rows)], atol=1e-12)
+    np.testing.assert_allclose(pose.covariance, state.covariance[np.ix_(rows, rows)], atol=1e-12)
 
 
 def test_the_whole_graph_takes_the_bias_for_zero_as_far_as_the_filter_does(
