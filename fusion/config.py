@@ -47,8 +47,8 @@ class FilterConfig:
         velocity_sigma: of the first velocity, taken as zero [m/s].
         gyro_bias_sigma: of the first gyroscope bias [rad/s].
         gyro_corrected: probability that the device hands out corrected rates, so that their bias is
-            of `gyro_corrected_sigma` (`gyro_prior`); 0 leaves `gyro_bias_sigma` alone. Both of
-            greatest likelihood on the training and validation recordings.
+            of `gyro_corrected_sigma` (`gyro_prior`); 0 leaves `gyro_bias_sigma` alone. Both by the
+            likelihood of the training and validation recordings' innovations.
         gyro_corrected_sigma: of the first bias then [rad/s]; without meaning unless it is smaller.
         accel_bias_sigma: of the first accelerometer bias [m/s^2].
         gyro_motion_noise: white noise that grows with the rate, from scale and alignment errors

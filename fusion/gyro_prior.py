@@ -30,6 +30,9 @@ from stario.fusion.lie import FloatArray
 
 _EYE = np.eye(3)
 
+_LEAST_WEIGHT = 1e-3
+"""Of the narrow prior that a graph heeds."""
+
 
 @dataclass(frozen=True, eq=False)
 class GyroBelief:
@@ -104,6 +107,3 @@ class GyroPrior:
         expectation and maximisation).
         """
         return self._r / weight * _EYE if weight > _LEAST_WEIGHT else None
-
-
-_LEAST_WEIGHT = 1e-3

@@ -5,7 +5,7 @@ which `{"array": k}` stands for the member `a<k>`; not-a-number and infinity are
 Infinity. The object holds
 
     format    "stario snapshot"
-    version   2; another one is refused
+    version   of this layout; another one is refused
     backend   "ekf" or "graph"
     config    the effective configuration, which must equal the restoring navigator's
     model     checksum of the weights, likewise; empty for models without a card
@@ -29,7 +29,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 3
+FORMAT, VERSION = "stario snapshot", 4
 
 
 def pack(tree: dict[str, Any]) -> bytes:

@@ -167,7 +167,7 @@ def test_bytes_that_are_no_snapshot_are_refused(walk: ImuSequence, still_model: 
 def test_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     data = pack(unpack(navigator.snapshot()) | {"version": 1})
-    with pytest.raises(InputError, match="version: found 1, expected 3"):
+    with pytest.raises(InputError, match="version: found 1, expected 4"):
         navigator.restore(data)
 
 
