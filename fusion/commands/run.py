@@ -21,8 +21,7 @@ from stario.fusion.commands.common import (
     recordings_at,
     track_table,
 )
-from stario.sequences.batch import Skipped
-from stario.sequences.errors import InputError, StarioError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.fixes import Fix
@@ -44,6 +43,7 @@ def run(
     from stario.fusion.fixes import read_fixes
     from stario.fusion.many import distinct_name
     from stario.fusion.navigator import Navigator
+    from stario.sequences.batch import Skipped, each
 
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
@@ -52,15 +52,19 @@ def run(
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     names: set[str] = set()
+
+    def fused(file: Path) -> dict[str, object]:
+        sequence = reading.read(file)
+        name = distinct_name(sequence.name, names)
+        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
+        return _run(navigator, sequence, known, folder, told=not as_json)
+
     records: list[dict[str, object]] = []
-    for file in files:
-        try:
-            sequence = reading.read(file)
-            name = distinct_name(sequence.name, names)
-            folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-            records.append(_run(navigator, sequence, known, folder, told=not as_json))
-        except StarioError as error:
-            skipped.append(Skipped(str(file), str(error)))
+    for outcome in each(fused, files, jobs=1):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            records.append(outcome)
     if as_json and records:
         print_json(records[0] if len(files) == 1 else records)
     leave_with_skipped(skipped)
