@@ -22,6 +22,9 @@ from stario.sequences.windows import WINDOW_SECONDS
 UPDATE_RATES = (1, 2, 5, 10, 20)
 """Network updates per second that may be asked for."""
 
+SMALLEST_SIGMA = 1e-6
+"""What is known exactly is given this much, so that a covariance stays positive definite."""
+
 LEAST_OUTPUT_RATE = 10
 """States per second where the network is asked less often [Hz]."""
 
@@ -45,11 +48,12 @@ class FilterConfig:
         tilt_sigma: of the first attitude when the device is moving [rad].
         yaw_sigma: of the first attitude's yaw [rad]; small, since the start defines the yaw.
         velocity_sigma: of the first velocity, taken as zero [m/s].
-        gyro_bias_sigma: of the first gyroscope bias [rad/s].
+        gyro_bias_sigma: of the first gyroscope bias [rad/s], where the device does not correct it.
         gyro_corrected: probability that the device hands out corrected rates, so that their bias is
             of `gyro_corrected_sigma` (`gyro_prior`); 0 leaves `gyro_bias_sigma` alone. Both by the
             likelihood of the training and validation recordings' innovations.
-        gyro_corrected_sigma: of the first bias then [rad/s]; without meaning unless it is smaller.
+        gyro_corrected_sigma: of the first bias then [rad/s]; unless it is above 0 and the smaller
+            one there is but `gyro_bias_sigma`.
         accel_bias_sigma: of the first accelerometer bias [m/s^2].
         gyro_motion_noise: white noise that grows with the rate, from scale and alignment errors
             [rad/s/sqrt(Hz) per rad/s].
@@ -95,6 +99,11 @@ class FilterConfig:
                 raise ConfigError(item.name, repr(value), "a finite value >= 0")
         if self.covariance_scale == 0.0:
             raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
+
+    @property
+    def two_gyro_priors(self) -> bool:
+        """Whether the gyroscope's bias is of one of two sizes."""
+        return self.gyro_corrected > 0.0 and 0.0 < self.gyro_corrected_sigma < self.gyro_bias_sigma
 
     @property
     def output_rate(self) -> int:

@@ -232,7 +232,7 @@ def _first_errors(
         velocity_sigma=velocity,
         position_sigma=position,
     )
-    narrow = rng.uniform() < f.gyro_corrected and f.gyro_corrected_sigma < f.gyro_bias_sigma
+    narrow = f.two_gyro_priors and rng.uniform() < f.gyro_corrected
     sigmas = f.gyro_corrected_sigma if narrow else f.gyro_bias_sigma, f.accel_bias_sigma
     b_g, b_a = (np.tile(sigma * rng.normal(size=3), (len(walk.time), 1)) for sigma in sigmas)
     return prior, b_g, b_a

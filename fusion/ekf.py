@@ -113,18 +113,9 @@ class StateCloningEkf(ErrorStateEngine):
         X = self._X[1 + slot]
         return np.array(X[:, :3]), np.asarray(X[:, 4] + self._origin_W)
 
-    def clone_time(self, slot: int) -> float | None:
-        """Time [s] of the clone in a slot, None where it is empty."""
-        return self._clone_time[slot]
-
-    @property
-    def core_covariance(self) -> FloatArray:
-        """Covariance (15, 15) of the right-invariant error theta, rho_v, rho_p, d_bg, d_ba."""
-        return np.array(self.P[:CORE, :CORE])
-
     def estimate(self, in_gap: bool = False, world: int = 0) -> Estimate:
         """The newest state."""
-        P = self.core_covariance
+        P = self.P[:CORE, :CORE].copy()
         return self._estimate(self.time, self._X[0].copy(), P, P[:, _GYRO], in_gap, world)
 
     def clone_estimate(self, slot: int, world: int = 0) -> Estimate:

@@ -18,6 +18,9 @@ from stario.fusion.jacobians import in_plain_terms
 from stario.fusion.lie import FloatArray, exp_times
 from stario.fusion.state import NavState, SmoothedPose
 
+_AT_ONCE = 2000
+"""Estimates that are turned at once: an hour's would take hundreds of megabytes besides."""
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -84,6 +87,11 @@ def settled(estimates: Sequence[Estimate], prior: GyroPrior | None) -> Settled:
 
 def nav_states(estimates: Sequence[Estimate], prior: GyroPrior | None = None) -> list[NavState]:
     """The newest states as callers get them."""
+    parts = range(0, len(estimates), _AT_ONCE)
+    return [state for k in parts for state in _nav_states(estimates[k : k + _AT_ONCE], prior)]
+
+
+def _nav_states(estimates: Sequence[Estimate], prior: GyroPrior | None) -> list[NavState]:
     table = settled(estimates, prior)
     rows = zip(estimates, *table, table.plain_covariance, strict=True)
     return [

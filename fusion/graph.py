@@ -90,7 +90,7 @@ class KeyframeGraph:
         self._tree: Any = None
         self.last = -1
         self._insert(first)
-        self._add_prior(_prior(0, first))
+        self.add(_prior(0, first), gated=False)
 
     @property
     def keyframes(self) -> list[int]:
@@ -111,12 +111,12 @@ class KeyframeGraph:
     def add_apart(self, state: NavState) -> int:
         """A new keyframe that nothing binds to the last one; its covariance is its prior."""
         self._insert(state)
-        self._add_prior(_prior(self.last, state))
+        self.add(_prior(self.last, state), gated=False)
         return self.last
 
-    def add(self, term: Term) -> None:
+    def add(self, term: Term, gated: bool = True) -> None:
         """Take in a measurement; its covariance is positive definite."""
-        limit = _quantile(self._gate, len(term.covariance))
+        limit = _quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(_Whitened.of(term, limit))
         self._tree = None
 
@@ -180,7 +180,7 @@ class KeyframeGraph:
             raise IndeterminateError(self._named(str(error))) from error
         self._factors = [item for item in self._factors if item[0] >= before]
         self._terms = [term for term in self._terms if term.first >= before]
-        self._add_prior(self._marginal(range(before, max(reached) + 1), rest))
+        self.add(self._marginal(range(before, max(reached) + 1), rest), gated=False)
         for key in keys:
             self._values.erase(key)
         for k in old:
@@ -225,9 +225,6 @@ class KeyframeGraph:
         about = tuple(self.pose(k) for k in reached)
         to_local = block_diag(*(np.linalg.inv(state.invariant_from_local()) for state in about))
         return Prior(reached[0], about, table[:, :-1] @ to_local, table[:, -1])
-
-    def _add_prior(self, prior: Prior) -> None:
-        self._terms.append(_Whitened.of(prior, math.inf))
 
     def _insert(self, state: NavState) -> None:
         self.last += 1

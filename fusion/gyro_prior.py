@@ -13,9 +13,11 @@ and before all measurements (Savage and Dickey: Dickey, "The weighted likelihood
 
     p / (1 - p) (s / s_c)^3 r^(3/2) |S|^(-1/2) exp(-b^T S^-1 b / 2),    S = P_b + (r + q^2 t) I
 
-with the bias's estimate b and covariance P_b and its walk q since the start, t ago. What is given
-out is the mixture's mean and covariance; the filter itself goes on with the wide prior, so that
-nothing is decided that later measurements could not turn.
+with the bias's estimate b and covariance P_b and its walk q since the start, t ago, which is taken
+for independent of what is known of b: right while q^2 t is small against s_c^2 (over six hours for
+the default configuration). What is given out is the mixture's mean and covariance; the filter
+itself goes on with the wide prior, so that nothing is decided that later measurements could not
+turn.
 """
 
 from __future__ import annotations
@@ -25,10 +27,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.lie import FloatArray
 
 _EYE = np.eye(3)
+
+_NARROWEST = 1e-3
+"""Of the wide deviation: a narrow one below is rounding."""
 
 _LEAST_WEIGHT = 1e-3
 """Of the narrow prior that a graph heeds."""
@@ -66,19 +71,20 @@ class GyroPrior:
     """The mixture as a configuration gives it.
 
     Args:
-        config: probability and both deviations; where the narrow one is none, there is no mixture.
+        config: probability and both deviations, where there are two.
         start: time of the bias that is meant [s].
     """
 
     def __init__(self, config: NavigatorConfig, start: float) -> None:
         f = config.filter
-        narrow, wide = f.gyro_corrected_sigma, f.gyro_bias_sigma
-        self._mixed = f.gyro_corrected > 0.0 and 0.0 < narrow < wide
+        self._mixed = f.two_gyro_priors
         if not self._mixed:
             return
+        wide = max(f.gyro_bias_sigma, SMALLEST_SIGMA)  # as the filter begins
+        narrow = max(f.gyro_corrected_sigma, _NARROWEST * wide)
         self._start, self._walk = start, config.noise.gyro_walk**2
-        self._most_walk = wide**2
-        self._r = 1.0 / (1.0 / narrow**2 - 1.0 / wide**2)
+        self._most_walk = wide * wide
+        self._r = narrow * narrow / (1.0 - (narrow / wide) ** 2)
         odds = f.gyro_corrected / (1.0 - f.gyro_corrected)
         self._log_odds = math.log(odds) + 3.0 * math.log(wide / narrow) + 1.5 * math.log(self._r)
 
@@ -103,7 +109,7 @@ class GyroPrior:
     def covariance(self, weight: float) -> FloatArray | None:
         """Of a measurement of zero (3, 3) that counts as likely as it is; None for hardly at all.
 
-        A graph, which starts from the filter's track, takes it for the whole mixture (a step of
-        expectation and maximisation).
+        A graph, which starts from the filter's track, takes it for the whole mixture: a step of
+        expectation and maximisation, without the spread between the two.
         """
         return self._r / weight * _EYE if weight > _LEAST_WEIGHT else None

@@ -313,9 +313,9 @@ class Navigator:
         changes = recipe.world_changes
         states, notes = in_last_world(nav_states(estimates, recipe.gyro_prior), changes), []
         if self.backend == "graph":
-            wide = nav_states(estimates)
-            filtered, expected = in_last_world(wide, changes), recipe.expected_gyro_bias()
-            whole = smooth(filtered, wide[0], taken, changes, self.config, expected)
+            own, wide = recipe.filter_changes, nav_states(estimates)
+            filtered, expected = in_last_world(wide, own), recipe.expected_gyro_bias()
+            whole = smooth(filtered, wide[0], taken, own, self.config, expected)
             notes, clones = [whole.note], []
             states = states if whole.fell_back else whole.states
         poses = smoothed_poses(clones, recipe.gyro_prior)

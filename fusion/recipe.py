@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import GateMode, UpdateResult
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
@@ -38,9 +38,6 @@ from stario.sequences.windows import WINDOW_SECONDS
 
 STILL_TILT_SIGMA = 0.01
 """Of the first attitude when the device was at rest [rad]."""
-
-SMALLEST_SIGMA = 1e-6
-"""What is known exactly is given this much, so that the covariance stays positive definite."""
 
 GAP_TURN = 0.5
 """How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
@@ -136,6 +133,7 @@ class FilterRecipe:
             placed=prior is not None,
             oriented=prior is not None and prior.yaw_sigma <= KNOWN_YAW,
             gate=f.gate,
+            prior=self.gyro_prior,
         )
         every = max(1, round(_CHECKPOINT_SECONDS * f.output_rate))
         self._history = History(every) if streaming else None
@@ -212,8 +210,13 @@ class FilterRecipe:
 
     @property
     def world_changes(self) -> list[WorldChange]:
-        """How fixes moved and turned the world so far."""
+        """How fixes moved and turned the world of the states given out so far."""
         return list(self._world.changes)
+
+    @property
+    def filter_changes(self) -> list[WorldChange]:
+        """How they moved and turned that of `filtered`."""
+        return list(self._world.filter_changes)
 
     def innovations(self) -> Innovations:
         """Every innovation so far."""
@@ -302,6 +305,8 @@ class FilterRecipe:
         turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
         drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
         covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
+        # What both priors of the gyroscope say of the position hangs on this.
+        covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
         yaw = yaw_twist(ekf.R_WB)
         turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
         R_WB, b_g, b_a = turn @ start.R_WB, ekf.b_g, ekf.b_a

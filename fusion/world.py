@@ -10,6 +10,11 @@ turn was not known at all, then the fix is an ordinary measurement.
 
 Behind a gap in which the direction was lost the same holds of the track from there on: the next
 position places it, the next direction turns it, and what was before the gap stays where it is.
+
+The filter knows the wide one of the gyroscope's two priors, callers see both (`gyro_prior`): two
+tracks that a drifting yaw may lead far apart until a fix brings them together. So a change is two,
+one for the states that the filter holds and one for those given out, which also decide whether the
+direction is known.
 """
 
 from __future__ import annotations
@@ -24,9 +29,11 @@ from scipy.stats import chi2
 
 from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import UpdateResult
+from stario.fusion.estimate import nav_states
 from stario.fusion.fixes import Fix
+from stario.fusion.gyro_prior import GyroPrior
 from stario.fusion.jacobians import yaw_twist
-from stario.fusion.lie import FloatArray, skew
+from stario.fusion.lie import FloatArray, exp_so3, skew
 from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.sequence import Trajectory
 
@@ -77,93 +84,106 @@ class WorldFrame:
         placed: whether the first position was given.
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
+        prior: by which the filter's states are given out.
+
+    Attributes:
+        changes: of the states given out.
+        filter_changes: of the states as the filter holds them; as many.
     """
 
-    def __init__(self, placed: bool, oriented: bool, gate: float) -> None:
+    def __init__(self, placed: bool, oriented: bool, gate: float, prior: GyroPrior) -> None:
         self.placed, self.oriented = placed, oriented
         self.changes: list[WorldChange] = []
-        self._pivot, self._since = np.zeros(3), -math.inf
+        self.filter_changes: list[WorldChange] = []
+        self._prior = prior
+        self._pivots, self._since = [np.zeros(3), np.zeros(3)], -math.inf
         self._gates = {n: float(chi2.ppf(gate, n)) for n in (1, 3)}
 
     def apply(self, ekf: StateCloningEkf, fix: Fix) -> tuple[UpdateResult, WorldChange | None]:
-        """Take in a fix at the filter's time; also the change of world it brought."""
-        change = None
+        """Take in a fix at the filter's time; also the change it brought to the filter's world."""
         if fix.kind == "position" and not self.placed:
-            change = self._place(ekf, fix)
-        elif not self.oriented:
-            change = self._orient(ekf, fix)
-            if change is None:
-                return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known"), None
+            changes = self._place(ekf, fix)
+        elif self.oriented:
+            return self._update(ekf, fix), None
+        else:
+            changes = self._orient(ekf, fix)
+        if not changes:
+            return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known"), None
         result = self._update(ekf, fix)
-        if change is None:
-            return result, None
-        P = ekf.world_covariance()
-        change = replace(
-            change,
-            yaw_sigma=math.sqrt(P[2, 2]) if self.oriented else 0.0,
-            position_covariance=P[6:9, 6:9] if not self.oriented else np.zeros((3, 3)),
+        own, seen = (
+            self._with_what_is_left(change, state)
+            for change, state in zip(changes, self._states(ekf), strict=True)
         )
-        self.changes.append(change)
-        return result, change
+        self.filter_changes.append(own)
+        self.changes.append(seen)
+        return result, own
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
-        if self.oriented and ekf.world_covariance()[2, 2] > KNOWN_YAW**2:
+        if not self.oriented:
+            return
+        own, seen = self._states(ekf)
+        if seen.covariance[2, 2] > KNOWN_YAW**2:
             self.placed = self.oriented = False
-            self._pivot, self._since = ekf.p_W, ekf.time
+            self._pivots, self._since = [own.p_W, seen.p_W], ekf.time
 
     def checkpoint(self) -> dict[str, Any]:
         """Everything that `rewind` needs."""
         return {
             "placed": self.placed,
             "oriented": self.oriented,
-            "pivot": self._pivot,
+            "pivots": list(self._pivots),
             "since": self._since,
             "changes": [vars(change) for change in self.changes],
+            "filter_changes": [vars(change) for change in self.filter_changes],
         }
 
     def rewind(self, checkpoint: dict[str, Any]) -> None:
         """Go back to a checkpoint."""
         self.placed, self.oriented = checkpoint["placed"], checkpoint["oriented"]
-        self._pivot, self._since = checkpoint["pivot"], checkpoint["since"]
+        self._pivots, self._since = list(checkpoint["pivots"]), checkpoint["since"]
         self.changes = [WorldChange(**change) for change in checkpoint["changes"]]
+        self.filter_changes = [WorldChange(**change) for change in checkpoint["filter_changes"]]
 
-    def _place(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange:
-        shift = fix.value - ekf.p_W
-        ekf.move_world(np.eye(3), shift)
+    def _states(self, ekf: StateCloningEkf) -> list[NavState]:
+        """The newest state as the filter holds it, and as it is given out."""
+        now = ekf.estimate()
+        return [*nav_states([now]), *nav_states([now], self._prior)]
+
+    def _place(self, ekf: StateCloningEkf, fix: Fix) -> list[WorldChange]:
+        changes = [
+            WorldChange(fix.time, np.eye(3), fix.value - s.p_W, fix.value, True, self._since)
+            for s in self._states(ekf)
+        ]
+        ekf.move_world(np.eye(3), changes[0].shift)
         left = np.trace(fix.covariance) + np.trace(ekf.world_covariance()[6:9, 6:9])
         ekf.loosen_position(min(_MUCH_LARGER * math.sqrt(left), _LARGEST))
-        self.placed, self._pivot = True, fix.value
-        return WorldChange(fix.time, np.eye(3), shift, fix.value, True, self._since)
+        self.placed, self._pivots = True, [fix.value, fix.value]
+        return changes
 
-    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> WorldChange | None:
-        turn, sigma = self._turn(ekf, fix)
-        if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "heading")):
-            return None
-        c, s = math.cos(turn), math.sin(turn)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        shift = self._pivot - R @ self._pivot
-        ekf.move_world(R, shift)
-        ekf.loosen_yaw(self._pivot, UNKNOWN_YAW)
+    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> list[WorldChange]:
+        """Empty where the fix does not tell the direction."""
+        states = zip(self._states(ekf), self._pivots, strict=True)
+        turns, sigmas = zip(*(_turn(s, pivot, fix) for s, pivot in states), strict=True)
+        if not (np.isfinite(turns).all() and (sigmas[1] < FAR_ENOUGH or fix.kind == "heading")):
+            return []
+        changes = []
+        for turn, pivot in zip(turns, self._pivots, strict=True):
+            R = exp_so3(np.array([0.0, 0.0, turn]))
+            changes.append(WorldChange(fix.time, R, pivot - R @ pivot, pivot, False, self._since))
+        ekf.move_world(changes[0].R, changes[0].shift)
+        ekf.loosen_yaw(self._pivots[0], UNKNOWN_YAW)
         self.oriented = True
-        return WorldChange(fix.time, R, shift, self._pivot, False, self._since)
+        return changes
 
-    def _turn(self, ekf: StateCloningEkf, fix: Fix) -> tuple[float, float]:
-        """Turn of the world a fix asks for, and how well it tells it [rad]."""
-        if fix.kind == "heading":
-            yaw = yaw_twist(ekf.R_WB)
-            return float(fix.value[0]) - yaw, math.sqrt(fix.covariance[0, 0])
-        first, seen, ours = 3, fix.value, ekf.v_W
-        if fix.kind == "position":
-            first, seen, ours = 6, fix.value - self._pivot, ekf.p_W - self._pivot
-        P = ekf.world_covariance()
-        by_yaw = P[first : first + 2, 2]
-        # What of it comes from the yaw is what the fix is to tell.
-        P = P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2]
-        arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
-        across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
-        turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
-        return turn, across / arm if arm > 0.0 else math.inf
+    def _with_what_is_left(self, change: WorldChange, state: NavState) -> WorldChange:
+        """A change with what is not known of it, by the state behind it."""
+        P = state.covariance
+        return replace(
+            change,
+            yaw_sigma=math.sqrt(P[2, 2]) if self.oriented else 0.0,
+            position_covariance=np.zeros((3, 3)) if self.oriented else P[6:9, 6:9],
+        )
 
     def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         gate = self._gates[len(fix.value)]
@@ -172,6 +192,23 @@ class WorldFrame:
         if fix.kind == "velocity":
             return ekf.update_velocity_W(fix.value, fix.covariance, gate)
         return ekf.update_heading(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+
+
+def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
+    """Turn of the world about a point that a fix asks for, and how well it tells it [rad]."""
+    if fix.kind == "heading":
+        return float(fix.value[0]) - yaw_twist(state.R_WB), math.sqrt(fix.covariance[0, 0])
+    first, seen, ours = 3, fix.value, state.v_W
+    if fix.kind == "position":
+        first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
+    P = state.covariance
+    by_yaw = P[first : first + 2, 2]
+    # What of it comes from the yaw is what the fix is to tell.
+    P = P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2]
+    arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
+    across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
+    turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
+    return turn, across / arm if arm > 0.0 else math.inf
 
 
 def in_last_world(states: list[NavState], changes: list[WorldChange]) -> list[NavState]:

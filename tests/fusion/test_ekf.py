@@ -269,7 +269,8 @@ def test_a_clone_is_the_current_pose(driven: StateCloningEkf) -> None:
 
 def test_a_released_slot_is_empty(driven: StateCloningEkf) -> None:
     driven.release(2)
-    assert driven.clone_time(2) is None
+    with pytest.raises(InputError, match="slot"):
+        driven.clone_estimate(2)
     first = 15 + 6 * 2
     assert not driven.P[first : first + 6].any()
     assert not driven.P[:, first : first + 6].any()
@@ -323,7 +324,7 @@ def test_displacements_carry_no_information_about_yaw_and_position(
     driven: StateCloningEkf,
 ) -> None:
     """Information N^T P^-1 N about turning or shifting all poses together does not change."""
-    newest = max(range(6), key=lambda slot: driven.clone_time(slot) or 0.0)
+    newest = max(range(6), key=lambda slot: driven.clone_estimate(slot).time)
     driven.release(newest)  # it equals the current pose, P has no inverse with it
     held = np.flatnonzero(np.diag(driven.P))
     N = np.zeros((driven.dim_x, 4))

@@ -11,6 +11,7 @@ import support
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.estimate import nav_states, smoothed_poses
+from stario.fusion.fixes import position_fix
 from stario.fusion.gyro_prior import GyroBelief, GyroPrior
 from stario.fusion.recipe import FilterRecipe
 from stario.sequences.errors import ConfigError
@@ -159,3 +160,51 @@ def test_the_whole_graph_takes_the_bias_for_zero_as_far_as_the_filter_does(
 def test_a_probability_is_one(share: float) -> None:
     with pytest.raises(ConfigError, match="gyro_corrected"):
         configured(gyro_corrected=share)
+
+
+@pytest.fixture(scope="module")
+def far_apart(make_walk: Make, make_oracle: Make) -> tuple[ImuSequence, Any]:
+    """A walk whose bias is none, on which the two priors lead metres apart."""
+    walk = make_walk(3, 120.0, 100.0, ImuErrors(support.NOISE, gyro_turn_on=0.0))
+    oracle = make_oracle(walk, walk.truth, MIXED, noise=0.05, sigma=0.05)
+    recipe, _ = run(MIXED, walk, oracle)
+    assert np.linalg.norm(recipe.state().p_W - recipe.filtered().p_W) > 2.0
+    return walk, oracle
+
+
+def test_fixes_place_and_turn_the_track_that_is_given_out(
+    far_apart: tuple[ImuSequence, Any],
+) -> None:
+    """Not the filter's own, or it would jump where they come."""
+    walk, oracle = far_apart
+    fixes = [
+        position_fix(t, walk.truth.at(np.array([t])).position_W[0], 1e-4 * np.eye(3))
+        for t in (60.0, 110.0)
+    ]
+    track = Navigator(oracle, MIXED).run(walk, fixes=fixes)
+    assert track.health.fixes == {"applied": 2}
+    steps = np.linalg.norm(np.diff(track.trajectory.position_W, axis=0), axis=1)
+    assert steps.max() < 0.5
+    smoothed = track.smoothed.position_W
+    assert np.linalg.norm(np.diff(smoothed, axis=0), axis=1).max() < 1.5  # twice a second
+
+
+def test_a_long_gap_does_not_lead_back_to_the_filter(
+    far_apart: tuple[ImuSequence, Any], without: Make, make_oracle: Make
+) -> None:
+    walk, _ = far_apart
+    holed = without(walk, (walk.time > 100.0) & (walk.time < 112.0))
+    oracle = make_oracle(holed, walk.truth, MIXED, noise=0.05, sigma=0.05)
+    recipe, _ = run(MIXED, holed, oracle)
+    assert recipe.time > 118.0
+    assert np.linalg.norm(recipe.state().p_W - recipe.filtered().p_W) > 2.0
+
+
+@pytest.mark.parametrize(
+    ("wide", "narrow"), [(4e-3, 1e-170), (1e6, 1e-3), (1e-7, 5e-8), (1e-3, 1e-3 - 1e-12)]
+)
+def test_extreme_priors_leave_finite_weights(wide: float, narrow: float) -> None:
+    prior = GyroPrior(configured(gyro_bias_sigma=wide, gyro_corrected_sigma=narrow), 0.0)
+    belief = prior.believe(np.array(0.0), np.zeros(3), max(wide, 1e-6) ** 2 * np.eye(3))
+    assert belief is not None
+    assert belief.weight == pytest.approx(0.7, abs=1e-3)
