@@ -310,14 +310,16 @@ class Navigator:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)
         queue.refuse("after the end", len(queue.due(math.inf)))
-        changes = recipe.world_changes
-        states, notes = in_last_world(nav_states(estimates, recipe.gyro_prior), changes), []
+        changes, notes = recipe.world_changes, []
+        states: list[NavState] = []
         if self.backend == "graph":
             own, wide = recipe.filter_changes, nav_states(estimates)
             filtered, expected = in_last_world(wide, own), recipe.expected_gyro_bias()
             whole = smooth(filtered, wide[0], taken, own, self.config, expected)
             notes, clones = [whole.note], []
-            states = states if whole.fell_back else whole.states
+            states = [] if whole.fell_back else whole.states
+        if not states:
+            states = in_last_world(nav_states(estimates, recipe.gyro_prior), changes)
         poses = smoothed_poses(clones, recipe.gyro_prior)
         health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
         track = track_from_states(
