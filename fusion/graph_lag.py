@@ -45,7 +45,6 @@ class GraphRecipe:
         self._filter = FilterRecipe(config, start, prior, streaming=True)
         self._fallbacks = 0
         self._why = ""
-        self._in_gap = False
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)  # of the graph's positions: see `StateCloningEkf`
         self._builder: GraphBuilder
@@ -56,7 +55,6 @@ class GraphRecipe:
     ) -> None:
         """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
         self._filter.step(epoch, measurement, fixes)
-        self._in_gap = epoch.gap
         if self._filter.world != self._world or epoch.anew is not None:
             self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
             return
@@ -85,7 +83,7 @@ class GraphRecipe:
 
     def state(self) -> NavState:
         """The newest state."""
-        ahead = self._ahead.estimate(self._in_gap, self._world)
+        ahead = self._ahead.estimate(self._filter.in_gap, self._world)
         return nav_states([ahead], self._filter.gyro_prior)[0].shifted(self._origin_W)
 
     def innovations(self) -> Innovations:
@@ -108,7 +106,6 @@ class GraphRecipe:
             "ahead": self._ahead.checkpoint(),
             "origin": self._origin_W,
             "world": self._world,
-            "in_gap": self._in_gap,
             "fallbacks": self._fallbacks,
             "why": self._why,
         }
@@ -119,7 +116,6 @@ class GraphRecipe:
         self._builder.load(dump["builder"])
         self._ahead.rewind(dump["ahead"])
         self._world, self._origin_W = dump["world"], dump["origin"]
-        self._in_gap = dump["in_gap"]
         self._fallbacks, self._why = dump["fallbacks"], dump["why"]
 
     def _begin(self, first: NavState, count: int) -> None:

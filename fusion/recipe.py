@@ -99,6 +99,7 @@ class FilterRecipe:
         ekf: the filter, by the wide one of the gyroscope's two priors (`gyro_prior`).
         oldest: the newest pose that left the window, corrected by all of it; None at first, and
             where mean velocities are measured.
+        in_gap: whether the last epoch had no samples.
         held: what the last step measured at rest, None where it moved or was refused.
         segment: the last step's samples, None where fixes cut them.
         accepted: fixes that the last call of `step` or `late_fix` took in, in order.
@@ -127,7 +128,7 @@ class FilterRecipe:
         self.segment: Segment | None = None
         self.accepted: list[Fix] = []
         self.oldest: Estimate | None = None
-        self._in_gap = False
+        self.in_gap = False
         self._gated_since: float | None = None
         self._world = WorldFrame(
             placed=prior is not None,
@@ -186,7 +187,7 @@ class FilterRecipe:
 
     def estimate(self) -> Estimate:
         """The filter's newest state, by the wide one of the gyroscope's priors."""
-        return self.ekf.estimate(self._in_gap, self.world)
+        return self.ekf.estimate(self.in_gap, self.world)
 
     def state(self) -> NavState:
         """The newest state, by both of them."""
@@ -232,7 +233,7 @@ class FilterRecipe:
             "ekf": self.ekf.checkpoint(),
             "slots": list(self._slots),
             "gated_since": self._gated_since,
-            "in_gap": self._in_gap,
+            "in_gap": self.in_gap,
             "oldest": self.oldest and vars(self.oldest),
             "motion": self._motion.checkpoint(),
             "log": self._log.checkpoint(),
@@ -245,7 +246,7 @@ class FilterRecipe:
         self.ekf.rewind(checkpoint["ekf"])
         self._slots = deque(checkpoint["slots"])
         self._gated_since = checkpoint["gated_since"]
-        self._in_gap, oldest = checkpoint["in_gap"], checkpoint["oldest"]
+        self.in_gap, oldest = checkpoint["in_gap"], checkpoint["oldest"]
         self.oldest = None if oldest is None else Estimate(**oldest)
         self._motion.rewind(checkpoint["motion"])
         self._log.rewind(checkpoint["log"])
@@ -266,7 +267,7 @@ class FilterRecipe:
     def _step(
         self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
     ) -> None:
-        self._in_gap = epoch.gap
+        self.in_gap = epoch.gap
         if epoch.gap:
             self._forget_window()
         if epoch.anew is not None:

@@ -179,3 +179,22 @@ def test_nothing_in_it_is_pickled(walk: ImuSequence, still_model: Any) -> None:
             header = file.read(name)[:128]
             assert header.startswith(b"\x93NUMPY")
             assert b"|O" not in header
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_state_behind_a_gap_says_so_wherever_it_is_asked(
+    walk: ImuSequence, still_model: Any, without: Any, backend: Any
+) -> None:
+    holed = without(walk, (walk.time > 5.0) & (walk.time < 5.6))
+    navigator = Navigator(still_model, CONFIG, backend=backend)
+    for row in zip(holed.time, holed.gyro, holed.accel, strict=True):
+        state = navigator.push(*row)
+        if state is not None:
+            assert navigator.state.in_gap == state.in_gap
+            if state.in_gap:
+                break
+    assert state is not None
+    assert 5.0 < state.time < 5.8
+    other = Navigator(still_model, CONFIG, backend=backend)
+    other.restore(navigator.snapshot())
+    assert other.state.in_gap
