@@ -34,9 +34,6 @@ from stario.fusion.lie import FloatArray
 from stario.fusion.preintegration import CORE, Segment
 from stario.fusion.state import NavState
 
-_MOST_STEPS = 1
-"""Of Levenberg-Marquardt per round: no more pay before the measurements are linearised anew."""
-
 _MOVED = 1e-3
 """A round that moves no keyframe further [m] is the last."""
 
@@ -130,16 +127,15 @@ class KeyframeGraph:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
                 keyframes stay as they were.
         """
-        start, self._tree = self._values, None
+        start = self._values
         try:
             rounds = self._optimise(most_rounds)
-            self._tree = self._linear().eliminateMultifrontal(self._ordering(), gtsam.EliminateQR)
             self._check_determined()
         except RuntimeError as error:  # gtsam's way to report it
-            self._values = start
+            self._values, self._tree = start, None
             raise IndeterminateError(self._named(str(error))) from error
         except IndeterminateError:
-            self._values = start
+            self._values, self._tree = start, None
             raise
         light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
         return Solution(rounds, light)
@@ -235,18 +231,22 @@ class KeyframeGraph:
         self._tree = None
 
     def _optimise(self, most_rounds: int) -> int:
-        fixed = gtsam.NonlinearFactorGraph()
+        """Full steps of Gauss and Newton, which follow the IMU's stiff factors as a filter does.
+
+        A step may raise their error by its second order and yet be right, where a start was askew:
+        Levenberg and Marquardt's damping then creeps, and a stream gives out what has not arrived.
+        """
+        factors = gtsam.NonlinearFactorGraph()
         for _first, factor in self._factors:
-            fixed.add(factor)
+            factors.add(factor)
+        ordering = self._ordering()
         for _round in range(most_rounds):
-            graph = gtsam.NonlinearFactorGraph(fixed)
+            linear = factors.linearize(self._values)
             for term in self._terms:
-                graph.add(gtsam.LinearContainerFactor(term.factor(self._values), self._values))
+                linear.push_back(term.factor(self._values))
+            self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
             before = self._positions()
-            optimizer = gtsam.LevenbergMarquardtOptimizer(
-                graph, self._values, self._ordering(), _parameters()
-            )
-            self._values = optimizer.optimize()
+            self._values = self._values.retract(self._tree.optimize())
             moved = float(np.abs(self._positions() - before).max())
             if not moved > _MOVED:
                 break
@@ -256,15 +256,6 @@ class KeyframeGraph:
 
     def _positions(self) -> FloatArray:
         return np.array([self._values.atPose3(X(k)).translation() for k in self._time])
-
-    def _linear(self) -> Any:
-        graph = gtsam.NonlinearFactorGraph()
-        for _first, factor in self._factors:
-            graph.add(factor)
-        linear = graph.linearize(self._values)
-        for term in self._terms:
-            linear.push_back(term.factor(self._values))
-        return linear
 
     def _ordering(self) -> Any:
         """Time's: the graph is a chain whose longest link is a window."""
@@ -374,14 +365,6 @@ def _ordering(keys: list[int]) -> Any:
     for key in keys:
         ordering.push_back(key)
     return ordering
-
-
-@cache
-def _parameters() -> Any:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    parameters.setMaxIterations(_MOST_STEPS)
-    return parameters
 
 
 @cache

@@ -59,7 +59,7 @@ class GraphRecipe:
             self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
             return
         accepted = [fix.shifted(-self._origin_W) for fix in self._filter.accepted]
-        if self._builder.step(epoch, measurement, accepted, self._filter.held):
+        if self._builder.step(epoch, self._filter.taken, accepted, self._filter.held):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -122,8 +122,7 @@ class GraphRecipe:
         """A new graph from a state of the filter."""
         self._world, self._origin_W = first.world, first.p_W
         first = first.shifted(-self._origin_W)
-        overlap = 1 if self._config.filter.update_rate % 2 else 2
-        self._builder = GraphBuilder(self._config, first, count, overlap)
+        self._builder = GraphBuilder(self._config, first, count, streaming=True)
         self._take(first)
 
     def _solve(self) -> None:

@@ -20,6 +20,7 @@ integration algorithm design", 1998 (coning, sculling).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -141,7 +142,7 @@ def preintegrate(
     accel: FloatArray,
     b_g: FloatArray,
     b_a: FloatArray,
-    noise: ImuNoise,
+    noise: ImuNoise | Sequence[ImuNoise],
     gravity: float,
 ) -> Segment:
     """Fold the samples of an interval into a segment.
@@ -152,7 +153,8 @@ def preintegrate(
         accel: (n + 1, 3) specific force [m/s^2] in B, likewise.
         b_g: (3,) gyroscope bias to integrate with [rad/s]; later changes act to first order.
         b_a: (3,) accelerometer bias [m/s^2], likewise.
-        noise: noise densities over this interval.
+        noise: noise densities over this interval, or over each of the n steps; the walks are the
+            first's.
         gravity: magnitude [m/s^2].
 
     Raises:
@@ -161,11 +163,17 @@ def preintegrate(
     """
     _check_samples(time, gyro, accel)
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
-    params = _params(noise, gravity)
+    each = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
+    held = each[0]
+    params = _params(held, gravity) if held is noise else _new_params(held, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     integrate = pim.integrateMeasurement
     # gtsam subtracts the bias itself, so it is added back here.
-    for step_force, step_rate, step in zip(force + b_a, rate + b_g, dt.tolist(), strict=True):
+    steps = zip(force + b_a, rate + b_g, dt.tolist(), each, strict=True)
+    for step_force, step_rate, step, density in steps:
+        if density is not held:
+            held = density
+            _set_white_noise(params, held)
         integrate(step_force, step_rate, step)
     return Segment(float(time[0]), float(time[-1]), gravity, pim)
 
@@ -221,16 +229,22 @@ def _nav_transition(dt: float, gravity: float) -> FloatArray:
     return transition
 
 
-# Noise that grows with motion comes in steps (`segments`): the range in use fits.
-@lru_cache(maxsize=512)
-def _params(noise: ImuNoise, gravity: float) -> Any:
+def _new_params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
-    params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2)
-    params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
+    _set_white_noise(params, noise)
     params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
     params.setBiasOmegaCovariance(_EYE * noise.gyro_walk**2)
     params.setBiasAccCovariance(_EYE * noise.accel_walk**2)
     return params
+
+
+def _set_white_noise(params: Any, noise: ImuNoise) -> None:
+    params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2)
+    params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
+
+
+# Noise that grows with motion comes in steps (`segments`): the range in use fits.
+_params = lru_cache(maxsize=512)(_new_params)
 
 
 def _check_samples(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:

@@ -102,6 +102,8 @@ class FilterRecipe:
         in_gap: whether the last epoch had no samples.
         held: what the last step measured at rest, None where it moved or was refused.
         segment: the last step's samples, None where fixes cut them.
+        taken: the last step's measurement with its covariance as inflated, None where there was
+            none or it was left out.
         accepted: fixes that the last call of `step` or `late_fix` took in, in order.
     """
 
@@ -126,6 +128,7 @@ class FilterRecipe:
         self._rest = RestDetector(round(f.output_rate * WINDOW_SECONDS), f.rest_noise)
         self.held: Held | None = None
         self.segment: Segment | None = None
+        self.taken: Measurement | None = None
         self.accepted: list[Fix] = []
         self.oldest: Estimate | None = None
         self.in_gap = False
@@ -284,8 +287,7 @@ class FilterRecipe:
         if fixes:
             self.segment = None
         self.held = self._hold_still() if self._rest.at_rest(epoch) else None
-        if measurement is not None:
-            self._update(epoch, measurement)
+        self.taken = None if measurement is None else self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
             self._clone(epoch.stop)
 
@@ -354,7 +356,7 @@ class FilterRecipe:
         if self._uses_clones:
             self._clone(start.time)
 
-    def _update(self, epoch: Epoch, measurement: Measurement) -> None:
+    def _update(self, epoch: Epoch, measurement: Measurement) -> Measurement | None:
         # What is not finite is the filter's to refuse and count.
         with np.errstate(invalid="ignore"):
             result = self._offer(epoch, *measurement, self._gate_mode(epoch.stop))
@@ -363,6 +365,8 @@ class FilterRecipe:
             self._gated_since = self._gated_since if result.reason else None
         elif self._gated_since is None:
             self._gated_since = epoch.stop
+        displacement_N, covariance_N = measurement
+        return (displacement_N, result.scale * covariance_N) if result.accepted else None
 
     def _gate_mode(self, time: float) -> GateMode:
         since = self._gated_since

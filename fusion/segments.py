@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -34,6 +36,24 @@ def segment_of(
         return _unseen(epoch, R_WB, b_g, b_a, config)
     noise = _noise(epoch, config)
     return preintegrate(epoch.time, epoch.gyro, epoch.accel, b_g, b_a, noise, config.gravity)
+
+
+def segment_of_all(
+    epochs: Sequence[Epoch], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+) -> Segment:
+    """The segment of several epochs in a row, none of them a gap, each with its own noise.
+
+    The noise of their mean would spread over half a second what a step's impact did in a tenth;
+    position and speed at the end are then correlated as they are not.
+    """
+    first, rest = epochs[0], epochs[1:]
+
+    def joined(name: str) -> FloatArray:  # each begins with the sample that ended the one before
+        return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
+
+    noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in epochs)
+    samples = joined("time"), joined("gyro"), joined("accel")
+    return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
 
 
 def _unseen(

@@ -16,6 +16,8 @@ from support import stream
 from stario.fusion import Navigator, NavState
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.graph import IndeterminateError, KeyframeGraph
+from stario.fusion.graph_lag import GraphRecipe
+from stario.fusion.lie import exp_so3
 from stario.fusion.recipe import PriorPose
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
@@ -58,6 +60,44 @@ def test_a_stream_knows_what_the_filter_knows(make_walk: Make, make_oracle: Make
     sigma, expected = (np.sqrt(np.diag(states[-1].covariance)) for states in (ours, theirs))
     np.testing.assert_allclose(sigma[:9], expected[:9], rtol=0.1)
     assert 0.95 < sigma[2] / expected[2] < 1.05
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.2, 0.3])
+def test_a_start_askew_leads_a_stream_no_further_astray_than_the_filter(
+    tilt: float, make_walk: Make, make_oracle: Make
+) -> None:
+    """Starts in motion are up to 0.2 rad off level, and then right displacements look false."""
+    walk = make_walk(5, 20.0)
+    config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=1))
+    oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    askew = replace(start, R_WB=exp_so3(np.array([tilt, 0.0, 0.0])) @ start.R_WB, tilt_sigma=0.05)
+    ours, theirs = (
+        stream(Navigator(oracle, config, askew, backend), walk) for backend in ("graph", "ekf")
+    )
+    assert errors(ours, walk).max() < 1.1 * errors(theirs, walk).max() + 0.1
+
+
+def test_a_stream_takes_displacements_as_its_filter_judges_them(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """One window that is 5 m off is left out by both."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    observed = Navigator(oracle, CONFIG).observe(walk)
+    start = observed.intake.start
+    assert start is not None
+    ends: list[np.ndarray] = []
+    for offset in (0.0, 5.0):
+        recipe = GraphRecipe(CONFIG, start)
+        for n, (epoch, measurement) in enumerate(
+            zip(observed.epochs[:60], observed.measurements[:60], strict=True)
+        ):
+            if measurement is not None and n // 10 == 4:
+                measurement = (measurement[0] + [offset, 0.0, 0.0], measurement[1])
+            recipe.step(epoch, measurement)
+        ends.append(recipe.state().p_W)
+        assert recipe.health(observed.intake.counts).gated == (2 if offset else 0)
+    assert np.linalg.norm(ends[1] - ends[0]) < 0.1
 
 
 def test_at_first_a_stream_is_the_batch(walk: ImuSequence, make_oracle: Make) -> None:

@@ -217,6 +217,32 @@ def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
     np.testing.assert_array_equal(scaled[9:, 9:], plain[9:, 9:])
 
 
+def test_a_segment_with_the_noise_of_its_parts_is_their_sequence() -> None:
+    """An impact is followed by what it did to the speed: the noise of their mean is another."""
+    x = state()
+    t, gyro, accel = samples(200)
+    loud = [replace(NOISE, accel_noise=size * NOISE.accel_noise) for size in (8.0, 1.0, 1.0, 4.0)]
+    parts, step = [], (len(t) - 1) // 4
+    transition, noise, y = np.eye(15), np.zeros((15, 15)), x[:3]
+    for k, density in enumerate(loud):
+        part = slice(k * step, (k + 1) * step + 1)
+        segment = preintegrate(t[part], gyro[part], accel[part], *x[3:], density, GRAVITY)
+        ahead = segment.linearise(*y, *x[3:])
+        transition = ahead.transition @ transition
+        noise = ahead.transition @ noise @ ahead.transition.T + ahead.noise
+        y = ahead[:3]
+        parts += [density] * step
+    whole = preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY).linearise(*x)
+    np.testing.assert_allclose(whole.transition, transition, atol=1e-2)
+    sigma = np.sqrt(noise.diagonal())
+    np.testing.assert_allclose(
+        whole.noise / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
+    )
+    mean = replace(NOISE, accel_noise=NOISE.accel_noise * np.sqrt(np.mean([64, 1, 1, 16])))
+    other = preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY).linearise(*x).noise
+    assert other[6, 6] < 0.8 * noise[6, 6]
+
+
 def test_noise_does_not_depend_on_the_sensor_rate() -> None:
     x = state()
     slow, fast = (
