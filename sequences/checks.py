@@ -143,7 +143,9 @@ def check_gyro(
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
     field = f"{sequence.name}: accelerometer"
-    if not average > _COHERENT * force or average < _NO_GRAVITY:
+    # A device that is shaken presses harder than it weighs: an average that is gravity clears it.
+    gravity = abs(average / STANDARD_GRAVITY - 1.0) <= _OFF_GRAVITY
+    if not (gravity or average > _COHERENT * force) or average < _NO_GRAVITY:
         raise InputError(
             field,
             f"an average of {average:.3g} in samples of {force:.3g}",

@@ -59,6 +59,14 @@ def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
     assert "record the raw accelerometer" in refused(without_gravity(walk).without_truth())
 
 
+def test_a_device_shaken_harder_than_it_weighs_passes_and_its_motion_alone_does_not() -> None:
+    """Its samples are of 14 m/s^2 in the median, their average is gravity all the same."""
+    shaken = simulate_imu(generate_walk(19, 10.0), 200.0, PHONE_IMU, 19)
+    assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 14.0
+    check_units(shaken)
+    assert "--gravity removed" in refused(without_gravity(shaken))
+
+
 def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
     """In deg/s even a bias of 0.01 rad/s turns gravity away within seconds."""
     t = np.arange(2001) / 100.0
