@@ -42,8 +42,8 @@ _LOST_SIGMA = 1e5
 
 _FALSE, _FALSE_WAY = 0.5, 0.75
 """Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,
-as the filter does. Displacements go wrong in rows, and count less: five seconds of them, two a
-second, off by 1 m cost 0.08 to 0.24 m in three walks, 0.5 to 0.6 m with the half."""
+as the filter does. Displacements go wrong in rows, and count less: five seconds of them off by 1 m
+cost 0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with the half."""
 
 _LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
@@ -73,8 +73,8 @@ class KeyframeGraph:
 
     Args:
         first: the first keyframe; its covariance is the prior.
-        gate: probability from which a residual counts as an outlier; its covariance is then
-            inflated by its squared norm / quantile, as in the filter.
+        gate: probability from which a residual counts as an outlier and is weighed down, where it
+            is not added as judged already.
     """
 
     def __init__(self, first: NavState, gate: float) -> None:
@@ -112,7 +112,7 @@ class KeyframeGraph:
         return self.last
 
     def add(self, term: Term, gated: bool = True) -> None:
-        """Take in a measurement; its covariance is positive definite."""
+        """Take in a measurement, of positive definite covariance; `gated` ones may be outliers."""
         limit = _quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(_Whitened.of(term, limit))
         self._tree = None
@@ -131,13 +131,13 @@ class KeyframeGraph:
         try:
             rounds = self._optimise(most_rounds)
             self._check_determined()
+            light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
         except RuntimeError as error:  # gtsam's way to report it
             self._values, self._tree = start, None
             raise IndeterminateError(self._named(str(error))) from error
         except IndeterminateError:
             self._values, self._tree = start, None
             raise
-        light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
         return Solution(rounds, light)
 
     def pose(self, k: int) -> KeyframeState:

@@ -53,10 +53,11 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: epochs since the start or the last gap, where a graph is begun anew.
-        streaming: take two windows of a second where updates come as often, and displacements as
-            the filter judged them. A loss of the graph's own starts from what the IMU says: while
-            the speed is not yet known it took right displacements for outliers, one after the
-            other, in 2 of 100 simulated walks for good.
+        streaming: take two windows of a second where updates come as often, and fixes as the
+            filter judged them; displacements too, where it gives them the same weight. A loss of
+            the graph's own starts from what the IMU says: while the speed is not yet known it took
+            right displacements for outliers, one after the other, in 2 of 100 simulated walks for
+            good.
 
     Attributes:
         graph: the graph so far.
@@ -73,9 +74,13 @@ class GraphBuilder:
         self.starts = [0]
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
-        self._judged = streaming
-        self._overlap = 2 if streaming and config.filter.update_rate % 2 == 0 else 1
-        self._window = round(config.filter.output_rate * WINDOW_SECONDS)  # epochs
+        f = config.filter
+        self._streaming = streaming
+        self._overlap = 2 if streaming and f.update_rate % 2 == 0 else 1
+        # The filter weighs every window of a second, the graph one or two of them.
+        same_weight = f.measurement == "displacement" and f.update_rate == self._overlap
+        self._judged = streaming and same_weight
+        self._window = round(f.output_rate * WINDOW_SECONDS)  # epochs
         self._spacing = self._window // self._overlap  # epochs
         self._pending: list[Epoch] = []
         # Keyframes where windows end and begin, by the count of epochs; a gap ends them all.
@@ -152,7 +157,7 @@ class GraphBuilder:
         before = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
         if not before:
             return False
-        graph.add(self._fix_term(fix, before[-1]))
+        graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
         return True
 
     def expect_gyro_bias(self, covariance: FloatArray) -> None:

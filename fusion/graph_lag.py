@@ -1,7 +1,8 @@
 """The fixed-lag graph for streams: the last seconds optimised anew at every keyframe.
 
-What leaves the lag is marginalised. The filter runs alongside: it judges measurements, fixes and
-rest for both, and where the graph does not determine a state the stream goes on from the filter's.
+What leaves the lag is marginalised. The filter runs alongside: it judges what is measured for both
+(`GraphBuilder`), and the stream goes on from the filter's state where the graph does not determine
+its own, or where a late fix has changed what was judged.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class GraphRecipe:
         if self._filter.world != self._world or epoch.anew is not None:
             self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
             return
-        accepted = [fix.shifted(-self._origin_W) for fix in self._filter.accepted]
+        accepted = [fix.inflated.shifted(-self._origin_W) for fix in self._filter.accepted]
         if self._builder.step(epoch, self._filter.taken, accepted, self._filter.held):
             self._solve()
         else:
@@ -66,14 +67,15 @@ class GraphRecipe:
 
     def late_fix(self, fix: Fix) -> bool:
         """Take in a fix at a time before now; False where it is more than a window late."""
+        judged = self._filter.judged
         if not self._filter.late_fix(fix):
             return False
-        if self._filter.world != self._world:
+        if self._filter.world != self._world or self._filter.judged != judged:
             self._begin(self._filter.filtered(), self._builder.count)
-        elif any(taken is fix for taken in self._filter.accepted) and self._builder.fix(
-            fix.shifted(-self._origin_W)
-        ):
-            self._solve()
+            return True
+        for taken in self._filter.accepted:
+            if taken.fix is fix and self._builder.fix(taken.inflated.shifted(-self._origin_W)):
+                self._solve()
         return True
 
     @property

@@ -305,7 +305,8 @@ class Navigator:
             estimates.append(recipe.estimate())
             if recipe.oldest is not None and (not clones or recipe.oldest is not clones[-1]):
                 clones.append(recipe.oldest)
-            taken.append(Taken(epoch, measurement, recipe.accepted, recipe.held, recipe.segment))
+            accepted = [fix for fix, _scale in recipe.accepted]
+            taken.append(Taken(epoch, measurement, accepted, recipe.held, recipe.segment))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)

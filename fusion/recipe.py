@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,6 +85,19 @@ class Held(NamedTuple):
     """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; once per epoch, so wide as that."""
 
 
+class Accepted(NamedTuple):
+    """A fix that the filter took in."""
+
+    fix: Fix
+    scale: float
+    """Factor by which its covariance was inflated."""
+
+    @property
+    def inflated(self) -> Fix:
+        """The fix as it was taken in."""
+        return replace(self.fix, covariance=self.scale * self.fix.covariance)
+
+
 class FilterRecipe:
     """The state-cloning EKF driven by epochs.
 
@@ -129,7 +142,7 @@ class FilterRecipe:
         self.held: Held | None = None
         self.segment: Segment | None = None
         self.taken: Measurement | None = None
-        self.accepted: list[Fix] = []
+        self.accepted: list[Accepted] = []
         self.oldest: Estimate | None = None
         self.in_gap = False
         self._gated_since: float | None = None
@@ -177,6 +190,12 @@ class FilterRecipe:
             self._step(step.epoch, step.measurement, step.fixes)
             done = True
         return done
+
+    @property
+    def judged(self) -> object:
+        """What became of displacements and rest so far: a late fix may change it."""
+        log = self._log
+        return log.gated, dict(log.refused), dict(log.rests)
 
     @property
     def time(self) -> float:
@@ -330,7 +349,7 @@ class FilterRecipe:
         result, change = self._world.apply(self.ekf, fix)
         self._log.add_fix(result)
         if result.accepted:
-            self.accepted.append(fix)
+            self.accepted.append(Accepted(fix, result.scale))
         if change is not None:
             self._motion.turn(change.R)
 

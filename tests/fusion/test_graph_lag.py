@@ -19,7 +19,7 @@ from stario.fusion.graph import IndeterminateError, KeyframeGraph
 from stario.fusion.graph_lag import GraphRecipe
 from stario.fusion.lie import exp_so3
 from stario.fusion.recipe import PriorPose
-from stario.sequences.rotations import about_z
+from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
@@ -100,8 +100,48 @@ def test_a_stream_takes_displacements_as_its_filter_judges_them(
     assert np.linalg.norm(ends[1] - ends[0]) < 0.1
 
 
+def test_a_heading_far_from_what_was_thought_turns_a_stream_as_its_filter(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """It is likely enough; to a loss of the graph's own it was an outlier of 60 sigmas."""
+    walk = make_walk(5, 16.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    askew = replace(start, R_WB=about_z(0.6).as_matrix() @ start.R_WB, yaw_sigma=0.5)
+    yaw = float(yaw_of(walk.truth.at(np.array([10.0])).attitude_WB)[0])
+    ends = []
+    for backend in ("graph", "ekf"):
+        navigator = Navigator(oracle, CONFIG, askew, backend)
+        navigator.update_heading(10.0, yaw, 0.01)
+        ends.append(errors(stream(navigator, walk), walk)[-1])
+        assert navigator.health.fixes == {"applied": 1}
+    assert ends[0] < 1.2 * ends[1] + 0.1
+
+
+def test_a_late_fix_that_changes_what_was_judged_leads_a_stream_to_its_filter(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """A start 4 m/s off makes right displacements look false, until the speed is told."""
+    walk = make_walk(5, 6.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    fast = replace(start, v_W=start.v_W + np.array([4.0, 0.0, 0.0]), velocity_sigma=0.5)
+    v_W = walk.truth.at(np.array([0.3])).velocity_W[0]
+    late: list[np.ndarray] = []
+    for backend in ("graph", "ekf"):
+        navigator = Navigator(oracle, CONFIG, fast, backend)
+        states = []
+        for time, gyro, accel in zip(walk.time, walk.gyro, walk.accel, strict=True):
+            states.append(navigator.push(time, gyro, accel))
+            if abs(time - 1.15) < 1e-6:
+                navigator.update_velocity(0.3, v_W, 1e-4 * np.eye(3))
+        late.append(errors([s for s in states if s is not None and s.time > 1.2], walk))
+    assert late[1].max() < 0.5
+    assert late[0].max() < late[1].max() + 0.1
+
+
 def test_at_first_a_stream_is_the_batch(walk: ImuSequence, make_oracle: Make) -> None:
-    """Until something has left the lag both optimise the same graph."""
+    """Until something has left the lag both hold all of it, one window a second or two."""
     short = walk.slice(0.0, 4.0)
     oracle = make_oracle(short, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     track, states = lagged(oracle).run(short), stream(lagged(oracle), short)
