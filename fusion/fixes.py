@@ -22,7 +22,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -82,6 +82,19 @@ class Fix:
         if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or np.linalg.eigvalsh(C).min() <= 0.0:
             return "covariance not positive definite"
         return ""
+
+
+class Accepted(NamedTuple):
+    """A fix that a filter took in."""
+
+    fix: Fix
+    scale: float
+    """Factor by which its covariance was inflated."""
+
+    @property
+    def inflated(self) -> Fix:
+        """The fix as it was taken in."""
+        return replace(self.fix, covariance=self.scale * self.fix.covariance)
 
 
 def position_fix(time: float, p_W: Any, covariance: Any) -> Fix:

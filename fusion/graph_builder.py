@@ -43,11 +43,11 @@ class Taken(NamedTuple):
 class GraphBuilder:
     """Feeds epochs to a `KeyframeGraph`.
 
-    Keyframes stand where windows begin and end and at both ends of a gap. More
-    of them bring nothing: the IMU binds them as well over half a second as over a tenth, and tells
-    what lies between a keyframe and a fix. A stream does better with both windows of a second, a
-    whole track with one, trusted as both together (on the validation recordings 0.91 and 0.92 of
-    the filter's error instead of 1.02 and 0.97, with two networks that had not seen them).
+    Keyframes stand where windows begin and end and at both ends of a gap. More of them bring
+    nothing: the IMU binds them as well over half a second as over a tenth, and tells what lies
+    between a keyframe and a fix. A stream does better with both windows of a second, a whole track
+    with one, trusted as both together (on the validation recordings 0.91 and 0.92 of the filter's
+    error instead of 1.02 and 0.97, with two networks that had not seen them).
 
     Args:
         config: noise, filter and graph settings.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from stario.fusion.ekf import StateCloningEkf
 from stario.fusion.engine import GateMode, UpdateResult
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.estimate import Estimate, nav_states, smoothed_poses
-from stario.fusion.fixes import Fix, parts
+from stario.fusion.fixes import Accepted, Fix, parts
 from stario.fusion.gyro_prior import GyroPrior
 from stario.fusion.history import History, Step
 from stario.fusion.history import Measurement as Measurement
@@ -83,19 +83,6 @@ class Held(NamedTuple):
     """(3,) mean rate [rad/s]."""
     covariance: FloatArray
     """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; once per epoch, so wide as that."""
-
-
-class Accepted(NamedTuple):
-    """A fix that the filter took in."""
-
-    fix: Fix
-    scale: float
-    """Factor by which its covariance was inflated."""
-
-    @property
-    def inflated(self) -> Fix:
-        """The fix as it was taken in."""
-        return replace(self.fix, covariance=self.scale * self.fix.covariance)
 
 
 class FilterRecipe:
