@@ -101,6 +101,30 @@ def test_a_stream_takes_displacements_as_its_filter_judges_them(
     assert np.linalg.norm(ends[1] - ends[0]) < 0.1
 
 
+def test_what_the_filter_weighs_otherwise_a_stream_judges_itself(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """At 20 updates a second it takes one window in ten: a false one pulls harder."""
+    config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=20))
+    oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
+    observed = Navigator(oracle, config).observe(walk)
+    start = observed.intake.start
+    assert start is not None
+    false = next(k for k, epoch in enumerate(observed.epochs) if epoch.stop > walk.time[0] + 9.99)
+    tracks = []
+    for by in (0.0, 1.2):
+        recipe, states = GraphRecipe(config, start), []
+        for k, (epoch, measurement) in enumerate(
+            zip(observed.epochs[: false + 60], observed.measurements, strict=False)
+        ):
+            if measurement is not None and k == false:
+                measurement = (measurement[0] + [by, 0.0, 0.0], measurement[1])
+            recipe.step(epoch, measurement)
+            states.append(recipe.state().p_W)
+        tracks.append(np.array(states))
+    assert np.linalg.norm(tracks[1] - tracks[0], axis=1).max() < 0.35
+
+
 def test_a_heading_far_from_what_was_thought_turns_a_stream_as_its_filter(
     make_walk: Make, make_oracle: Make
 ) -> None:
