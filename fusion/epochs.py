@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.fusion.state import Health
 from stario.fusion.suspects import FINE, Flags
 from stario.sequences.sequence import FloatArray
 
@@ -79,6 +80,10 @@ class Epoch:
         return float(self.time[-1])
 
 
+GAPS_LISTED = 100
+"""How many gaps are kept one by one: an endless stream may have any number."""
+
+
 @dataclass
 class IntakeCounts:
     """What became of the samples.
@@ -91,7 +96,9 @@ class IntakeCounts:
         future: dropped for a time ahead of those that followed.
         spike: used, but replaced for standing off its neighbours.
         saturated: used, but at the sensor's limit.
-        gaps: (start, length) [s] of the stretches without samples that were not bridged.
+        gap_count: stretches without samples that were not bridged.
+        longest_gap: of them [s].
+        gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
     """
 
     used: int = 0
@@ -101,13 +108,23 @@ class IntakeCounts:
     future: int = 0
     spike: int = 0
     saturated: int = 0
+    gap_count: int = 0
+    longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
 
-    def samples(self) -> dict[str, int]:
-        """Samples by what became of them: used, or why they were dropped."""
-        names = ("used", "not_finite", "duplicate", "out_of_order", "future")
-        return {name: getattr(self, name) for name in names}
+    def add_gap(self, start: float, length: float) -> None:
+        """Count a stretch without samples [s]."""
+        self.gap_count += 1
+        self.longest_gap = max(self.longest_gap, length)
+        self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
 
-    def flagged(self) -> dict[str, int]:
-        """Samples that were used but are not to be trusted."""
-        return {"spike": self.spike, "saturated": self.saturated}
+    def health(self) -> Health:
+        """The part of the report that tells of the samples."""
+        names = ("used", "not_finite", "duplicate", "out_of_order", "future")
+        return Health(
+            samples={name: getattr(self, name) for name in names},
+            flagged={"spike": self.spike, "saturated": self.saturated},
+            gap_count=self.gap_count,
+            longest_gap=self.longest_gap,
+            gaps=list(self.gaps),
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,10 +77,8 @@ class InnovationLog:
             "gyro_bias_rad_s": sigma[9:12],
             "accel_bias_m_s2": sigma[12:15],
         }
-        return Health(
-            samples=counts.samples(),
-            flagged=counts.flagged(),
-            gaps=list(counts.gaps),
+        return replace(
+            counts.health(),
             updates=self.offered,
             gated=self.gated,
             refused=dict(self.refused),

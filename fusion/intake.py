@@ -155,7 +155,7 @@ class Intake:
         """End the epoch in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
-        self.counts.gaps.append((before[-1][0], sample[0] - before[-1][0]))
+        self.counts.add_gap(before[-1][0], sample[0] - before[-1][0])
         self._window.clear()
         self._starts.clear()
         self._suspect.clear()

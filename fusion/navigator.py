@@ -179,10 +179,7 @@ class Navigator:
     def health(self) -> Health:
         """The stream's report so far."""
         counts = self._intake.counts
-        if self._recipe is None:
-            health = Health(samples=counts.samples(), gaps=list(counts.gaps))
-        else:
-            health = self._recipe.health(counts)
+        health = counts.health() if self._recipe is None else self._recipe.health(counts)
         return _with_refused(health, self._fixes)
 
     def snapshot(self) -> bytes:

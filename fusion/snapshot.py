@@ -29,7 +29,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 4
+FORMAT, VERSION = "stario snapshot", 5
 
 
 def pack(tree: dict[str, Any]) -> bytes:

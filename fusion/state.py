@@ -94,7 +94,9 @@ class Health:
     Attributes:
         samples: used, and dropped by reason.
         flagged: of those used, spikes that were replaced and samples at the sensor's limit.
-        gaps: start and length [s] of each stretch without samples.
+        gap_count: stretches without samples.
+        longest_gap: of them [s].
+        gaps: start and length [s] of the newest of them, at most a hundred.
         updates: network measurements offered.
         gated: of these, how many had their covariance inflated.
         refused: of these, how many were left out, by reason.
@@ -109,6 +111,8 @@ class Health:
 
     samples: dict[str, int] = field(default_factory=dict)
     flagged: dict[str, int] = field(default_factory=dict)
+    gap_count: int = 0
+    longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
     updates: int = 0
     gated: int = 0
@@ -126,8 +130,7 @@ class Health:
         text = [f"samples used {self.samples.get('used', 0)}, dropped {dropped or 'none'}"]
         if any(self.flagged.values()):
             text.append(f"samples flagged: {_counted(self.flagged)}")
-        longest = max((length for _, length in self.gaps), default=0.0)
-        text.append(f"gaps {len(self.gaps)}, longest {longest:.2f} s")
+        text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
         share = self.gated / self.updates if self.updates else 0.0
         text.append(
             f"updates {self.updates}, gated {share:.1%}, refused {self.refused or 'none'}, "

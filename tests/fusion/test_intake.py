@@ -207,6 +207,21 @@ def test_two_gaps_with_one_sample_between_them(
     assert_seamless(epochs, walk.time[0])
 
 
+def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
+    walk: ImuSequence,
+) -> None:
+    intake = Intake(CONFIG)
+    for k in range(250):  # half a second of samples, then 0.5 s without, once 0.8 s
+        for j in range(50):
+            row = (float(k) + (0.3 if k > 100 else 0.0) + 0.01 * j, *walk.gyro[j], *walk.accel[j])
+            intake.push(row)
+    counts = intake.counts
+    assert counts.gap_count == 249
+    assert counts.longest_gap == pytest.approx(0.81)
+    assert [start for start, _ in counts.gaps] == pytest.approx(np.arange(149, 249) + 0.79)
+    assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
+
+
 def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence) -> None:
     late = replace(walk, time=walk.time + 1.7e9)
     ours, theirs = (

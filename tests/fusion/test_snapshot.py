@@ -14,7 +14,7 @@ import pytest
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.config import FilterConfig
-from stario.fusion.snapshot import pack, unpack
+from stario.fusion.snapshot import VERSION, pack, unpack
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -167,7 +167,7 @@ def test_bytes_that_are_no_snapshot_are_refused(walk: ImuSequence, still_model: 
 def test_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     data = pack(unpack(navigator.snapshot()) | {"version": 1})
-    with pytest.raises(InputError, match="version: found 1, expected 4"):
+    with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
         navigator.restore(data)
 
 
