@@ -12,7 +12,7 @@ from stario.fusion.navigator import Navigator, Predictor, Progress
 from stario.fusion.state import Track
 from stario.fusion.tracks import inertial_track, network_track, network_track_true_attitude
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import CONVENTIONS, align, evaluate_track, position_nees
+from stario.sequences.metrics import CONVENTIONS, Alignment, align, evaluate_track, position_nees
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulate import PHONE_IMU, simulate_imu
 from stario.sequences.walks import WalkStyle, generate_walk
@@ -40,13 +40,20 @@ METRICS = (
 
 METRIC_WORDS = {
     **CONVENTIONS,
-    "nees": "median over time of the 3-D position's NEES, aligned at the start (expected: 3)",
+    "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 3)",
     "nis": "mean NIS of the network's measurements (expected: 3)",
     "seconds_network": "computing time of the network [s]",
     "seconds_filter": "computing time of everything but the network [s]",
     "alignment": "yaw and position of the first common pose; tilt is never aligned",
 }
 """What every figure in `metrics.json` means."""
+
+_FITTED = "yaw and position of least squared error over all poses, for fixes gave the world"
+
+
+def metric_words(alignment: Alignment) -> dict[str, str]:
+    """What the figures of `measure` mean."""
+    return METRIC_WORDS | ({"alignment": _FITTED} if alignment == "yaw" else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +121,20 @@ def compare(
     return Comparison(sequence, tracks, metrics)
 
 
-def measure(track: Track, truth: Trajectory | None) -> Metrics:
-    """Figures of one track; null where there is no truth, or no covariance."""
+def measure(track: Track, truth: Trajectory | None, alignment: Alignment = "first") -> Metrics:
+    """Figures of one track; null where there is no truth, or no covariance.
+
+    Args:
+        track: to measure.
+        truth: None where there is none.
+        alignment: of position errors and of the NEES, as of `align`.
+    """
     figures: Metrics = dict.fromkeys(METRICS)
     if truth is not None:
-        result = evaluate_track(track.trajectory, truth)
+        result = evaluate_track(track.trajectory, truth, alignment=alignment)
         figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
         if track.trajectory.position_covariance_W is not None:
-            figures["nees"] = position_nees(track.trajectory, truth).median
+            figures["nees"] = position_nees(track.trajectory, truth, alignment).median
     figures["nis"] = track.nis
     figures["seconds_network"] = track.seconds_network
     figures["seconds_filter"] = track.seconds_filter

@@ -237,7 +237,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
     """
     path = Path(path)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error

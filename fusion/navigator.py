@@ -303,7 +303,8 @@ class Navigator:
             if recipe.oldest is not None and (not clones or recipe.oldest is not clones[-1]):
                 clones.append(recipe.oldest)
             accepted = [fix for fix, _scale in recipe.accepted]
-            taken.append(Taken(epoch, measurement, accepted, recipe.held, recipe.segment))
+            walked = measurement if recipe.held is None else None
+            taken.append(Taken(epoch, walked, accepted, recipe.held, recipe.segment))
             if k % 500 == 0:
                 progress(0.6 + 0.4 * k / len(observed.epochs))
         progress(1.0)

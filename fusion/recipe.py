@@ -103,7 +103,7 @@ class FilterRecipe:
         held: what the last step measured at rest, None where it moved or was refused.
         segment: the last step's samples, None where fixes cut them.
         taken: the last step's measurement with its covariance as inflated, None where there was
-            none or it was left out.
+            none, it was left out, or the device was at rest.
         accepted: fixes that the last call of `step` or `late_fix` took in, in order.
     """
 
@@ -293,7 +293,10 @@ class FilterRecipe:
         if fixes:
             self.segment = None
         self.held = self._hold_still() if self._rest.at_rest(epoch) else None
-        self.taken = None if measurement is None else self._update(epoch, measurement)
+        self.taken = None
+        # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
+        if measurement is not None and self.held is None:
+            self.taken = self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
             self._clone(epoch.stop)
 

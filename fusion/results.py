@@ -24,6 +24,7 @@ def write_run(
     truth: Trajectory | None,
     aligned: Trajectory,
     metrics: Metrics,
+    words: dict[str, str],
     config: NavigatorConfig,
     backend: Backend = "ekf",
 ) -> list[Path]:
@@ -37,7 +38,7 @@ def write_run(
     """
     make_folder(folder)
     written = _track_files(folder, backend, track)
-    record = {"recording": name, backend: metrics, "conventions": METRIC_WORDS}
+    record = {"recording": name, backend: metrics, "conventions": words}
     for file, content in (
         ("metrics.json", record),
         ("config.json", asdict(config)),

@@ -61,6 +61,8 @@ def unpack(data: bytes) -> dict[str, Any]:
     Raises:
         InputError: the bytes are no snapshot, or one of another version.
     """
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        raise InputError("snapshot", "bytes of something else", f"bytes of a {FORMAT}, whole")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -221,7 +221,7 @@ def weights_named(name: str, runs: Path) -> str | Path:
 
 
 def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:
-    batch = np.ascontiguousarray(windows, dtype=np.float32)
+    batch = np.require(windows, np.float32, ["C", "W"])  # torch warns of what is read-only
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):
         raise InputError("windows", f"shape {batch.shape}", f"(B, 6, {WINDOW_SAMPLES})")
     if not np.isfinite(batch).all():

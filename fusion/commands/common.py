@@ -199,7 +199,10 @@ _WHOLE = 0.98
 
 
 def track_table(
-    metrics: dict[str, dict[str, float | None]], time: FloatArray, truth: Trajectory | None
+    metrics: dict[str, dict[str, float | None]],
+    time: FloatArray,
+    truth: Trajectory | None,
+    words: dict[str, str],
 ) -> str:
     """A row of figures for each track, and what they mean where there is truth.
 
@@ -207,9 +210,8 @@ def track_table(
         metrics: by track.
         time: (N,) of a track [s].
         truth: None where there is none.
+        words: what the figures mean.
     """
-    from stario.fusion.compare import METRIC_WORDS
-
     columns = {
         "ate_m": "ATE [m]",
         "rte_m": "RTE [m]",
@@ -226,7 +228,7 @@ def track_table(
         lines.append(f"{name:<22}" + "".join(f"{_cell(value):>12}" for value in cells))
     if truth is None:
         return "\n".join(lines)
-    lines += [f"{key}: {METRIC_WORDS[key]}." for key in ("ate_m", "rte_m", "alignment")]
+    lines += [f"{key}: {words[key]}." for key in ("ate_m", "rte_m", "alignment")]
     covered = float(truth.covers(time).mean())
     if covered < _WHOLE:
         lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")

@@ -76,9 +76,11 @@ def compare(
 
 
 def _print_comparison(comparison: Comparison) -> None:
+    from stario.fusion.compare import METRIC_WORDS
+
     sequence = comparison.sequence
     path = comparison.path_m
     way = "no truth" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
     time = comparison.tracks["ekf"].time
-    typer.echo(track_table(comparison.metrics, time, sequence.truth))
+    typer.echo(track_table(comparison.metrics, time, sequence.truth, METRIC_WORDS))

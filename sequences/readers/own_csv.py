@@ -261,13 +261,13 @@ def _seconds(
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:
-    """The track of the rows that hold truth; None if none does."""
+    """The track of the rows that hold truth; None if fewer than two do."""
     time = rows.time
     poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
     kept = kept[advancing(time[kept])]
-    if not len(kept):
-        _log.warning("%s: no row holds truth", path)
+    if len(kept) < 2:
+        _log.warning("%s: %d rows hold truth, which makes no track", path, len(kept))
         return None
     norm = np.linalg.norm(poses[kept, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE

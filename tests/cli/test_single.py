@@ -23,6 +23,7 @@ from stario.network.model import save_model
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
+from stario.sequences.sequence import Trajectory
 
 COMMANDS = (
     "run",
@@ -143,6 +144,53 @@ def test_run_needs_no_truth_and_the_track_is_the_same(
     assert json.loads(done.out)["ekf"]["ate_m"] is None
     seen, blind = ((tmp_path / name / "ekf.tum").read_bytes() for name in ("seen", "blind"))
     assert seen == blind
+
+
+def write_fixes(path: Path, truth: Trajectory, turn: float = 0.0, late: float = 0.0) -> Path:
+    """The true position of every second, in a world that is turned and on a clock that is late."""
+    R = Rotation.from_rotvec([0.0, 0.0, turn])
+    rows = ["t,kind,x,y,z,sx,sy,sz"]
+    for t in np.arange(truth.time[0] + 0.5, truth.time[-1], 1.0):
+        x, y, z = R.apply(truth.at(np.array([t])).position_W[0])
+        rows.append(f"{t + late},position,{x},{y},{z},0.05,,")
+    path.write_text("\ufeff" + "\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    truth = read_own_csv(recording).truth
+    assert truth is not None
+    for turn in (0.0, 1.0):
+        fixes = write_fixes(tmp_path / "fixes.csv", truth, turn)
+        done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
+        assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
+    words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
+    assert "least squared" in words["alignment"]
+
+
+def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
+    truth = read_own_csv(recording).truth
+    assert truth is not None
+    fixes = write_fixes(tmp_path / "fixes.csv", truth, late=1.7e9)
+    done = stario("run", recording, "--fixes", fixes)
+    done.assert_one_line_error("--fixes", "1.7e+09", "first sample")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_one_row_of_truth_is_none(stario, recording: Path, tmp_path: Path) -> None:
+    lines = recording.read_text().splitlines()
+    kept = len(lines) // 2
+    for k, line in enumerate(lines):
+        if k not in (0, kept):
+            lines[k] = ",".join(line.split(",")[:7]) + "," * (lines[0].count(",") - 6)
+    path = tmp_path / "one.csv"
+    path.write_text("\n".join(lines) + "\n")
+    done = stario("run", path, "--out", "one", "--json")
+    assert done.code == 0
+    assert json.loads(done.out)["ekf"]["ate_m"] is None
 
 
 @pytest.mark.usefixtures("undrawn")

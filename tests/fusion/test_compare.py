@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import compare as compare_module
-from stario.fusion.compare import TRACKS, Comparison, compare, demonstration
+from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison, compare, demonstration
 from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
 from stario.fusion.evaluate import scores_of, summary, summary_table
 from stario.fusion.results import write_comparison, write_run
@@ -143,8 +143,9 @@ def test_a_run_leaves_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
     track = compared.tracks["ekf"]
     aligned = align(track.trajectory, walk.truth, "first")
     files = write_run(
-        tmp_path / "run", walk.name, track, walk.truth, aligned, compared.metrics["ekf"], CONFIG
-    )
+        tmp_path / "run", walk.name, track, walk.truth, aligned, compared.metrics["ekf"],
+        METRIC_WORDS, CONFIG,
+    )  # fmt: skip
     assert {p.name for p in files} == {
         "ekf.tum", "ekf.npz", "metrics.json", "config.json", "health.json",
         "plan.png", "error.png", "innovations.png",

@@ -15,7 +15,9 @@ from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.intake import all_epochs
 from stario.fusion.lie import exp_so3
+from stario.fusion.navigator import Backend
 from stario.fusion.rest import RestDetector
+from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulate import PHONE_IMU
@@ -94,6 +96,15 @@ def test_rest_measures_the_bias_and_holds_yaw_and_place(still_model: Any) -> Non
     sigma = np.sqrt(np.diag(with_rest.covariance[-1]))
     assert (np.abs(with_rest.b_g[-1] - BIAS) < 3.0 * sigma[9:12]).all()
     assert sigma[11] < 0.3 * np.sqrt(without.covariance[-1, 11, 11])
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_what_lies_still_does_not_drift_by_what_the_network_says(backend: Backend) -> None:
+    """The network learned from walking: of a table it says a centimetre a second."""
+    track = Navigator(load_model(), CONFIG, backend=backend).run(lying(60.0))
+    assert np.linalg.norm(track.trajectory.position_W[-1]) < 0.05
+    error, P = track.trajectory.position_W[-1], track.covariance[-1, 6:9, 6:9]
+    assert error @ np.linalg.solve(P, error) < 12.0
 
 
 def test_rest_says_nothing_of_yaw(still_model: Any) -> None:
