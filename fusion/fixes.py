@@ -2,7 +2,7 @@
 
 A file of fixes is a CSV with the header `t,kind,x,y,z,sx,sy,sz` and one fix per line:
 
-    t     time [s], on the recording's clock
+    t     time [s] since the recording's first sample
     kind  position, velocity or heading
     x y z position [m] or velocity [m/s] in W; a heading gives its yaw [rad] in x and leaves y, z
     sx    standard deviation [m], [m/s] or [rad]

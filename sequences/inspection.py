@@ -15,6 +15,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
     is_gap,
+    too_slow,
 )
 from stario.sequences.still import Rest, find_rest
 from stario.sequences.truth_fit import TruthFit, fit_truth
@@ -222,7 +223,10 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         problems.append(str(error))
     fit: TruthFit | None = None
     coverage = None if sequence.truth is None else _coverage(sequence, sequence.truth)
-    if coverage is not None and coverage.share > 0.0:
+    slow = "" if sequence.truth is None else too_slow(sequence.truth)
+    if slow:
+        problems.append(f"{sequence.name}: truth: {slow}")
+    elif coverage is not None and coverage.share > 0.0:
         try:
             fit = fit_truth(sequence)
         except InputError as error:

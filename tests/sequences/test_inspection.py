@@ -100,6 +100,16 @@ def test_a_truth_on_another_clock_is_named_with_the_offset(walk: ImuSequence) ->
     assert "add +0.25" in problem(late)
 
 
+def test_a_truth_too_slow_to_compare_is_named_as_that(walk: ImuSequence) -> None:
+    """Nothing is known of its attitude between two poses: no clock and no axes are to be blamed."""
+    truth = walk.truth
+    assert truth is not None
+    found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
+    (problem,) = found.problems
+    assert "5 Hz, at least 10 Hz" in problem
+    assert found.fit is None
+
+
 def test_a_truth_of_another_body_is_named_in_degrees(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     # About the vertical of a device held level, so that gravity says nothing.
