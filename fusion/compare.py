@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.fixes import Fix
+from stario.fusion.fixes import Fix, check_within
 from stario.fusion.navigator import Navigator, Predictor, Progress
 from stario.fusion.state import Track
 from stario.fusion.tracks import inertial_track, network_track, network_track_true_attitude
@@ -51,6 +51,14 @@ METRIC_WORDS = {
 _FITTED = "yaw and position of least squared error over all poses, for fixes gave the world"
 
 
+def alignment_with(fixes: Sequence[Fix]) -> Alignment:
+    """How a track is aligned with the truth.
+
+    Where fixes give the world, the first pose's yaw is the one that is known least.
+    """
+    return "yaw" if fixes else "first"
+
+
 def metric_words(alignment: Alignment) -> dict[str, str]:
     """What the figures of `measure` mean."""
     return METRIC_WORDS | ({"alignment": _FITTED} if alignment == "yaw" else {})
@@ -65,11 +73,13 @@ class Comparison:
         tracks: by name, in the order of `TRACKS`; without truth there is no
             "network_true_attitude".
         metrics: by track name.
+        alignment: of the tracks with the truth, for metrics and figures.
     """
 
     sequence: ImuSequence
     tracks: dict[str, Track]
     metrics: dict[str, Metrics]
+    alignment: Alignment = "first"
 
     @property
     def path_m(self) -> float | None:
@@ -84,12 +94,12 @@ class Comparison:
         return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
 
     def aligned(self) -> dict[str, Trajectory]:
-        """Trajectories for figures: aligned with the truth at the start where there is one."""
+        """Trajectories for figures: aligned with the truth where there is one."""
         truth = self.sequence.truth
         raw = {name: track.trajectory for name, track in self.tracks.items()}
         if truth is None:
             return raw
-        return {name: align(track, truth, "first") for name, track in raw.items()}
+        return {name: align(track, truth, self.alignment) for name, track in raw.items()}
 
 
 def compare(
@@ -102,8 +112,10 @@ def compare(
     """Every track of a recording; the network sees each window once, EKF and graph the fixes.
 
     Raises:
-        InputError: the recording is too short, or its units or rate are wrong.
+        InputError: the recording is too short, its units or rate are wrong, or no fix is within
+            its time.
     """
+    check_within(fixes, sequence)
     navigator = Navigator(model, config)
     observed = navigator.observe(sequence, progress)
     tracks = {
@@ -117,8 +129,9 @@ def compare(
             log.warning("no track with true attitude: %s", error)
     tracks["ekf"] = navigator.track(observed, progress, fixes)
     tracks["graph"] = Navigator(model, config, backend="graph").track(observed, fixes=fixes)
-    metrics = {name: measure(track, sequence.truth) for name, track in tracks.items()}
-    return Comparison(sequence, tracks, metrics)
+    alignment = alignment_with(fixes)
+    metrics = {name: measure(track, sequence.truth, alignment) for name, track in tracks.items()}
+    return Comparison(sequence, tracks, metrics, alignment)
 
 
 def measure(track: Track, truth: Trajectory | None, alignment: Alignment = "first") -> Metrics:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison, Metrics
+from stario.fusion.compare import METRIC_WORDS, TRACKS, Comparison, Metrics, metric_words
 from stario.sequences.sequence import FloatArray
 
 _COLUMNS = (
@@ -30,16 +30,19 @@ class Scores:
         name: the recording's.
         metrics: by track name.
         record: the recording's entry in `metrics.json`.
+        words: what the figures mean.
     """
 
     name: str
     metrics: dict[str, Metrics]
     record: dict[str, object]
+    words: dict[str, str]
 
 
 def scores_of(comparison: Comparison) -> Scores:
     """The figures of a comparison."""
-    return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict())
+    words = metric_words(comparison.alignment)
+    return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict(), words)
 
 
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:

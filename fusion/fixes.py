@@ -19,7 +19,7 @@ from __future__ import annotations
 import bisect
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -28,7 +28,8 @@ import numpy as np
 
 from stario.fusion.checked import floored, shaped
 from stario.fusion.lie import FloatArray
-from stario.sequences.errors import ReadError
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.sequence import ImuSequence
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -246,6 +247,19 @@ def read_fixes(path: Path | str) -> list[Fix]:
     if header != list(_COLUMNS):
         raise ReadError(path, "line 1", ",".join(header) or "nothing", f"the header {expected}")
     return [_read_row(path, k, row) for k, row in enumerate(rows[1:], start=2) if any(row)]
+
+
+def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
+    """Refuse fixes of which none is of the recording's time.
+
+    Raises:
+        InputError: they are of another clock.
+    """
+    times, start, stop = [fix.time for fix in fixes], sequence.time[0], sequence.time[-1]
+    if times and not any(start <= t <= stop for t in times):
+        found = f"times from {min(times):.6g} to {max(times):.6g} s"
+        expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"
+        raise InputError("fixes", found, expected, "count them from the recording's first sample")
 
 
 def _read_row(path: Path, number: int, row: list[str]) -> Fix:

@@ -105,7 +105,9 @@ def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
     """The same from the figures alone."""
     records = {scores.name: scores.record for scores in recordings}
-    return {"recordings": records, "conventions": METRIC_WORDS}
+    # Fixes, which change how tracks are aligned, are those of one recording.
+    words = next((scores.words for scores in recordings), METRIC_WORDS)
+    return {"recordings": records, "conventions": words}
 
 
 def make_folder(folder: Path) -> None:

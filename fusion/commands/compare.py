@@ -76,11 +76,12 @@ def compare(
 
 
 def _print_comparison(comparison: Comparison) -> None:
-    from stario.fusion.compare import METRIC_WORDS
+    from stario.fusion.compare import metric_words
 
     sequence = comparison.sequence
     path = comparison.path_m
     way = "no truth" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
     time = comparison.tracks["ekf"].time
-    typer.echo(track_table(comparison.metrics, time, sequence.truth, METRIC_WORDS))
+    words = metric_words(comparison.alignment)
+    typer.echo(track_table(comparison.metrics, time, sequence.truth, words))

@@ -26,7 +26,6 @@ from stario.sequences.errors import InputError
 if TYPE_CHECKING:
     from stario.fusion.fixes import Fix
     from stario.fusion.navigator import Navigator
-    from stario.sequences.metrics import Alignment
     from stario.sequences.sequence import ImuSequence
 
 
@@ -75,16 +74,16 @@ def _run(
     navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, told: bool
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
-    from stario.fusion.compare import measure, metric_words
+    from stario.fusion.compare import alignment_with, measure, metric_words
+    from stario.fusion.fixes import check_within
     from stario.fusion.results import write_run
     from stario.sequences.metrics import align
 
-    _check_within(fixes, sequence)
+    check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
     truth, backend = sequence.truth, navigator.backend
-    # Where fixes give the world, the first pose's yaw is the one that is known least.
-    alignment: Alignment = "yaw" if fixes else "first"
+    alignment = alignment_with(fixes)
     metrics = measure(track, truth, alignment)
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, alignment)
     words = metric_words(alignment)
@@ -106,12 +105,3 @@ def _run(
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")
     return record
-
-
-def _check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
-    """Fixes of which none is of the recording's time are on another clock."""
-    times, start, stop = [fix.time for fix in fixes], sequence.time[0], sequence.time[-1]
-    if times and not any(start <= t <= stop for t in times):
-        found = f"times from {min(times):.6g} to {max(times):.6g} s"
-        expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"
-        raise InputError("--fixes", found, expected, "count them from the recording's first sample")

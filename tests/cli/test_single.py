@@ -169,6 +169,10 @@ def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
         assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
     assert "least squared" in words["alignment"]
+    done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
+    compared = json.loads(done.out)
+    assert compared["conventions"] == words
+    assert compared["recordings"]["walk"]["tracks"]["ekf"]["ate_m"] < 0.3
 
 
 def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
@@ -176,7 +180,7 @@ def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: P
     assert truth is not None
     fixes = write_fixes(tmp_path / "fixes.csv", truth, late=1.7e9)
     done = stario("run", recording, "--fixes", fixes)
-    done.assert_one_line_error("--fixes", "1.7e+09", "first sample")
+    done.assert_one_line_error("fixes", "1.7e+09", "first sample")
 
 
 @pytest.mark.usefixtures("undrawn")
