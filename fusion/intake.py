@@ -15,6 +15,7 @@ and still give the streamed track.
 from __future__ import annotations
 
 import math
+import statistics
 from collections import deque
 from dataclasses import asdict, replace
 from typing import Any
@@ -26,6 +27,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.epochs import Epoch, IntakeCounts, Start
 from stario.fusion.gyro_unit import GyroUnitWatch
 from stario.fusion.suspects import Flags, Screen
+from stario.sequences.errors import InputError
 from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
@@ -38,6 +40,9 @@ from stario.sequences.windows import (
 
 _TAIL = 4
 """Samples kept of the epoch before: half a step of the window's grid at the fastest rate."""
+
+_ALONE = 20
+"""Samples in a row that stand alone: then their times are not in seconds."""
 
 _ABSURD = 1e5
 """No sensor reads this much in any unit used here; also catches infinities."""
@@ -134,7 +139,8 @@ class Intake:
     def _begin(self) -> list[Epoch]:
         """Level the first attitude once its stretch is there, then catch up."""
         first = self._samples[0][0]
-        if self._newest < first + START_SECONDS:
+        # One sample alone: its time is so large that a second does not count beside it.
+        if self._newest < first + START_SECONDS or len(self._samples) == 1:
             self._next = first + START_SECONDS
             return []
         table = np.array(self._samples)
@@ -151,11 +157,21 @@ class Intake:
             self._before_long_gap = None
         return epochs + self._complete()
 
+    def _check_pace(self) -> None:
+        """Refuse a stream of which every sample from the first on stands alone."""
+        alone = self.counts.gap_count
+        if alone >= _ALONE and self.counts.used == alone + 1:
+            step = statistics.median(length for _, length in self.counts.gaps)
+            raise InputError(
+                "time", f"samples {step:.3g} s apart", "50 to 1000 in a second", "give times in s"
+            )
+
     def _bridge_gap(self, sample: Sample) -> list[Epoch]:
         """End the epoch in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
         self.counts.add_gap(before[-1][0], sample[0] - before[-1][0])
+        self._check_pace()
         self._window.clear()
         self._starts.clear()
         self._suspect.clear()

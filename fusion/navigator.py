@@ -123,9 +123,10 @@ class Navigator:
             The newest state if this sample completed an update period, else None.
 
         Raises:
-            InputError: time is no number, gyro or accel does not hold three, the first second's
-                average force cannot be gravity in m/s^2, or gyro cannot be in rad/s, which shows
-                once the device turns. In the last two cases the stream then begins anew.
+            InputError: time is no number, or every sample is far from the one before, as where it
+                is not in seconds; gyro or accel does not hold three; the first second's average
+                force cannot be gravity in m/s^2, or gyro cannot be in rad/s, which shows once the
+                device turns. In the last two cases the stream then begins anew.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None

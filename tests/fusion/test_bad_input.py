@@ -72,6 +72,19 @@ def test_states_stay_finite_under_bursts_of_nan(
 
 
 @pytest.mark.parametrize(
+    ("factor", "start"), [(1e3, 0.0), (1e3, 1.7e12), (1e6, 0.0), (1e9, 1.7e18), (100.0, 0.0)]
+)
+def test_a_stream_whose_times_are_not_in_seconds_is_refused(
+    walk: ImuSequence, still_model: Any, factor: float, start: float
+) -> None:
+    navigator = Navigator(still_model, CONFIG)
+    mistimed = replace(walk, time=start + factor * walk.time)
+    with pytest.raises(InputError, match=r"time: found samples .* s apart.*give times in s"):
+        list(stream(navigator, mistimed))
+    assert navigator.state is None
+
+
+@pytest.mark.parametrize(
     ("mean", "variance", "reason"),
     [
         (np.nan, 1e-4, "value that is not finite"),
