@@ -294,8 +294,11 @@ class FilterRecipe:
             self.segment = None
         self.held = self._hold_still() if self._rest.at_rest(epoch) else None
         self.taken = None
-        # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
-        if measurement is not None and self.held is None:
+        if self.held is not None:
+            # Rest says it better than a network that learned from walking and sees 1 cm/s in it;
+            # and a filter that agrees with it is not lost, whatever was left out before.
+            self._gated_since = None
+        elif measurement is not None:
             self.taken = self._update(epoch, measurement)
         if self._uses_clones and (epoch.update or epoch.gap):
             self._clone(epoch.stop)
