@@ -16,8 +16,8 @@ import joblib
 from distributed import Client, LocalCluster
 
 from stario.fusion import NavigatorConfig
-from stario.fusion.evaluate import Scores, scores_of, summary_table
-from stario.fusion.many import compare_recordings
+from stario.fusion.evaluation.many import compare_recordings
+from stario.fusion.evaluation.summary import Scores, scores_of, summary_table
 from stario.sequences import generate_walk, simulate_imu
 from stario.sequences.batch import Skipped
 from stario.sequences.readers.own_csv import write_csv

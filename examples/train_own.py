@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from stario.network import DisplacementModel, TrainingConfig, load_model
-from stario.network.train import train
+from stario.network.training.train import train
 from stario.sequences import generate_walk, simulate_imu
 from stario.sequences.windows import world_streams
 

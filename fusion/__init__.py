@@ -5,17 +5,17 @@ from typing import TYPE_CHECKING
 from stario.sequences.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from stario.fusion.compare import demonstration as demonstration
     from stario.fusion.config import FilterConfig as FilterConfig
     from stario.fusion.config import NavigatorConfig as NavigatorConfig
     from stario.fusion.config import read_config as read_config
-    from stario.fusion.ekf import StateCloningEkf as StateCloningEkf
+    from stario.fusion.evaluation.compare import demonstration as demonstration
+    from stario.fusion.filter.ekf import StateCloningEkf as StateCloningEkf
+    from stario.fusion.filter.estimator import PriorPose as PriorPose
     from stario.fusion.fixes import heading_fix as heading_fix
     from stario.fusion.fixes import position_fix as position_fix
     from stario.fusion.fixes import read_fixes as read_fixes
     from stario.fusion.fixes import velocity_fix as velocity_fix
     from stario.fusion.navigator import Navigator as Navigator
-    from stario.fusion.recipe import PriorPose as PriorPose
     from stario.fusion.state import Health as Health
     from stario.fusion.state import NavState as NavState
     from stario.fusion.state import Track as Track
@@ -26,10 +26,10 @@ _MODULES = {
     "NavState": "state",
     "Navigator": "navigator",
     "NavigatorConfig": "config",
-    "PriorPose": "recipe",
-    "StateCloningEkf": "ekf",
+    "PriorPose": "filter.estimator",
+    "StateCloningEkf": "filter.ekf",
     "Track": "state",
-    "demonstration": "compare",
+    "demonstration": "evaluation.compare",
     "heading_fix": "fixes",
     "position_fix": "fixes",
     "read_config": "config",

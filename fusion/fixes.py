@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-    from stario.fusion.epochs import Epoch
+    from stario.fusion.imu.intervals import Epoch
 
 FixKind = Literal["position", "heading", "velocity"]
 

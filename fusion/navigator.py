@@ -16,21 +16,21 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion.along_track import AlongTrack
-from stario.fusion.along_track import Predictor as Predictor
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.epochs import Epoch, Start
-from stario.fusion.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.estimator import FilterRecipe, Measurement, PriorPose
+from stario.fusion.filter.map_frame import in_last_world, smoothed_track
 from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
-from stario.fusion.graph_batch import smooth
-from stario.fusion.graph_builder import Taken
-from stario.fusion.graph_lag import GraphRecipe
-from stario.fusion.intake import Intake, all_epochs
-from stario.fusion.recipe import FilterRecipe, Measurement, PriorPose
+from stario.fusion.graph.batch import smooth
+from stario.fusion.graph.builder import Taken
+from stario.fusion.graph.fixed_lag import GraphRecipe
+from stario.fusion.imu.front_end import Intake, all_epochs
+from stario.fusion.imu.intervals import Epoch, Start
+from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.imu.stateful import Predictor as Predictor
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track, track_from_states
-from stario.fusion.world import in_last_world, smoothed_track
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence

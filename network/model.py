@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
 from stario.network.displacement import DisplacementNetwork as DisplacementNetwork
-from stario.network.engines import Engine, TorchEngine
+from stario.network.runtime.engines import Engine, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
@@ -176,7 +176,7 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """
     path = Path(name_or_path)
     if path.suffix == ".onnx":
-        from stario.network.export import load_onnx
+        from stario.network.runtime.export import load_onnx
 
         return DisplacementModel(*load_onnx(path))
     if str(name_or_path) == "default":

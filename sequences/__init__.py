@@ -24,40 +24,40 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import ImuSequence as ImuSequence
     from stario.sequences.sequence import Trajectory as Trajectory
-    from stario.sequences.simulate import GOOD_IMU as GOOD_IMU
-    from stario.sequences.simulate import PERFECT_IMU as PERFECT_IMU
-    from stario.sequences.simulate import PHONE_IMU as PHONE_IMU
-    from stario.sequences.simulate import ImuErrors as ImuErrors
-    from stario.sequences.simulate import simulate_imu as simulate_imu
+    from stario.sequences.simulation.imu import GOOD_IMU as GOOD_IMU
+    from stario.sequences.simulation.imu import PERFECT_IMU as PERFECT_IMU
+    from stario.sequences.simulation.imu import PHONE_IMU as PHONE_IMU
+    from stario.sequences.simulation.imu import ImuErrors as ImuErrors
+    from stario.sequences.simulation.imu import simulate_imu as simulate_imu
+    from stario.sequences.simulation.walks import WalkStyle as WalkStyle
+    from stario.sequences.simulation.walks import generate_walk as generate_walk
     from stario.sequences.units import with_units as with_units
-    from stario.sequences.walks import WalkStyle as WalkStyle
-    from stario.sequences.walks import generate_walk as generate_walk
 
 _MODULES = {
     "ConfigError": "errors",
-    "GOOD_IMU": "simulate",
-    "ImuErrors": "simulate",
+    "GOOD_IMU": "simulation.imu",
+    "ImuErrors": "simulation.imu",
     "ImuNoise": "noise",
     "ImuSequence": "sequence",
     "InputError": "errors",
-    "PERFECT_IMU": "simulate",
-    "PHONE_IMU": "simulate",
+    "PERFECT_IMU": "simulation.imu",
+    "PHONE_IMU": "simulation.imu",
     "ReadError": "errors",
     "STANDARD_GRAVITY": "sequence",
     "StarioError": "errors",
     "Trajectory": "sequence",
-    "WalkStyle": "walks",
+    "WalkStyle": "simulation.walks",
     "WeightsError": "errors",
     "align": "metrics",
     "check_units": "checks",
     "evaluate_track": "metrics",
     "find_recordings": "readers",
-    "generate_walk": "walks",
+    "generate_walk": "simulation.walks",
     "inspect_recording": "inspection",
     "position_nees": "metrics",
     "read_recording": "readers",
     "read_tum": "files",
-    "simulate_imu": "simulate",
+    "simulate_imu": "simulation.imu",
     "with_conventions": "conventions",
     "with_units": "units",
     "write_tum": "files",

@@ -18,7 +18,7 @@ from stario.sequences.sequence import (
     too_slow,
 )
 from stario.sequences.still import Rest, find_rest
-from stario.sequences.truth_fit import TruthFit, fit_truth
+from stario.sequences.truth.fit import TruthFit, fit_truth
 
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)

@@ -44,7 +44,7 @@ def test_sequences_import_neither_network_nor_fusion_and_network_not_fusion():
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys, stario.fusion.cli\n"
+        "import sys, stario.fusion.commands.cli\n"
         "heavy = {'torch', 'gtsam', 'matplotlib', 'scipy', 'numpy'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )

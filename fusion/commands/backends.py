@@ -21,7 +21,7 @@ from stario.fusion.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from stario.fusion.backends import Score
+    from stario.fusion.evaluation.backends import Score
     from stario.sequences.batch import Skipped
 
 
@@ -42,7 +42,7 @@ def backends(
 
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
-    from stario.fusion.backends import score_recording, score_table, score_walk, summary
+    from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
     from stario.sequences.batch import Skipped, each
     from stario.sequences.splits import split_paths
 

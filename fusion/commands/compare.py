@@ -25,7 +25,7 @@ from stario.fusion.commands.common import (
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.compare import Comparison
+    from stario.fusion.evaluation.compare import Comparison
 
 
 @grouped
@@ -39,11 +39,11 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
-    from stario.fusion.compare import Comparison, demonstration
-    from stario.fusion.compare import compare as compare_tracks
+    from stario.fusion.evaluation.compare import Comparison, demonstration
+    from stario.fusion.evaluation.compare import compare as compare_tracks
+    from stario.fusion.evaluation.many import compare_recordings
+    from stario.fusion.evaluation.results import comparison_dict, write_comparison
     from stario.fusion.fixes import read_fixes
-    from stario.fusion.many import compare_recordings
-    from stario.fusion.results import comparison_dict, write_comparison
 
     settings, network = estimating.settings(), estimating.network_for(jobs)
     known = [] if fixes is None else read_fixes(fixes)
@@ -76,7 +76,7 @@ def compare(
 
 
 def _print_comparison(comparison: Comparison) -> None:
-    from stario.fusion.compare import metric_words
+    from stario.fusion.evaluation.compare import metric_words
 
     sequence = comparison.sequence
     path = comparison.path_m

@@ -55,9 +55,9 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Accuracy and consistency over many recordings with truth, medians and means."""
-    from stario.fusion.evaluate import scores_of, summary, summary_table
-    from stario.fusion.many import compare_recordings
-    from stario.fusion.results import write_recording, write_summary
+    from stario.fusion.evaluation.many import compare_recordings
+    from stario.fusion.evaluation.results import write_recording, write_summary
+    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
     from stario.sequences.batch import Skipped
     from stario.sequences.errors import InputError
     from stario.sequences.splits import split_paths
@@ -106,8 +106,13 @@ def _networks(
     as_json: bool,
 ) -> list[Skipped]:
     """The table of networks; returns the recordings that could not be used."""
-    from stario.fusion.results import make_folder
-    from stario.fusion.table import compare_networks, table_dict, table_text, write_table
+    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.evaluation.tables import (
+        compare_networks,
+        table_dict,
+        table_text,
+        write_table,
+    )
     from stario.network.model import load_model, weights_named
     from stario.sequences.metrics import check_convention
 

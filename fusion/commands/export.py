@@ -27,8 +27,8 @@ def export(
     ] = None,
 ) -> None:
     """Export a network with its calibration; `--model FILE.onnx` then runs it anywhere."""
-    from stario.network.export import export_onnx
     from stario.network.model import load_model, weights_named
+    from stario.network.runtime.export import export_onnx
 
     if format != "onnx":
         raise InputError("--format", repr(format), "onnx")

@@ -18,7 +18,7 @@ def inspect(
     as_json: JsonOption = False,
 ) -> None:
     """Look a recording over: timing, noise, units, signs, and how its truth fits."""
-    from stario.fusion.results import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.sequences.files import write_json
     from stario.sequences.inspection import inspect_recording
     from stario.sequences.plots import imu_overview, save_figure

@@ -17,7 +17,7 @@ def models(
 ) -> None:
     """Parameters, FLOPs, time and memory of each network, beside the paper's figures."""
     from stario.network.architectures import ARCHITECTURES
-    from stario.network.survey import survey, survey_table
+    from stario.network.runtime.survey import survey, survey_table
     from stario.sequences.stream_cache import cache_folder
 
     with progress_bar("models") as progress:

@@ -40,8 +40,8 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
+    from stario.fusion.evaluation.many import distinct_name
     from stario.fusion.fixes import read_fixes
-    from stario.fusion.many import distinct_name
     from stario.fusion.navigator import Navigator
     from stario.sequences.batch import Skipped, each
 
@@ -74,9 +74,9 @@ def _run(
     navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, told: bool
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
-    from stario.fusion.compare import alignment_with, measure, metric_words
+    from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
+    from stario.fusion.evaluation.results import write_run
     from stario.fusion.fixes import check_within
-    from stario.fusion.results import write_run
     from stario.sequences.metrics import align
 
     check_within(fixes, sequence)

@@ -24,8 +24,8 @@ def simulate(
 ) -> None:
     """Write a simulated walk with its truth as a CSV recording."""
     from stario.sequences.readers.own_csv import write_csv
-    from stario.sequences.simulate import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
-    from stario.sequences.walks import WalkStyle, generate_walk
+    from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
+    from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     if imu not in sensors:

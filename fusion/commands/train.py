@@ -24,7 +24,7 @@ from stario.fusion.commands.common import (
 from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from stario.network.recipe import TrainingConfig
+    from stario.network.training.config import TrainingConfig
     from stario.sequences.batch import Skipped
     from stario.sequences.windows import Attitude, WorldStream
 
@@ -85,11 +85,11 @@ def train(
     The same recipe for every network. In several processes, on GPUs or CPUs:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
-    from stario.fusion.results import make_folder
-    from stario.network.data import gather
+    from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
-    from stario.network.parallel import leads
-    from stario.network.train import train as train_network
+    from stario.network.training.data import gather
+    from stario.network.training.parallel import leads
+    from stario.network.training.train import train as train_network
     from stario.sequences.stream_cache import cache_folder
 
     recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
@@ -142,7 +142,7 @@ def train(
 
 
 def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
-    from stario.network.recipe import training_config
+    from stario.network.training.config import training_config
 
     values: dict[str, Any] = {}
     if path is not None:
@@ -162,7 +162,7 @@ def _recorded(
     streams_of: Callable[[list[Path]], tuple[list[list[WorldStream]], list[Skipped]]],
 ) -> tuple[list[WorldStream], list[WorldStream], list[Skipped]]:
     """Streams to learn from, streams held out, and what could not be used, named at once."""
-    from stario.network.data import split_off
+    from stario.network.training.data import split_off
     from stario.sequences.splits import split_paths
 
     files, missing = recordings_at(paths)
@@ -200,8 +200,8 @@ def _streams_of(
 
 
 def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldStream]:
-    from stario.network.data import captured_streams, simulated_streams
-    from stario.sequences.vicon import read_vicon_walks
+    from stario.network.training.data import captured_streams, simulated_streams
+    from stario.sequences.simulation.vicon import read_vicon_walks
 
     seed, attitude = recipe.seed, recipe.attitude
 
@@ -212,7 +212,7 @@ def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldSt
 
 
 def _generated(count: int, seed: int, attitude: Attitude, folder: Path) -> list[WorldStream]:
-    from stario.network.data import generated_streams, simulated_streams
+    from stario.network.training.data import generated_streams, simulated_streams
 
     build = partial(generated_streams, count, 60.0, seed, attitude)
     return simulated_streams("generated", build, folder, count, seed, attitude)

@@ -13,7 +13,7 @@ phone's clock by what both see of the turning. The Nexus 5 of `multi devices` wr
 `raw`: time, code of the sensor (1 accelerometer [m/s^2], 4 gyroscope [rad/s]) and xyz.
 
 The phone sits turned in the tracked body, the capture glitches and flips, and its world is not
-quite level: see `stario.sequences.alignment`.
+quite level: see `stario.sequences.truth.alignment`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.alignment import align_tracked_body
-from stario.sequences.clock_offset import clock_offset
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import on_one_clock, time_unit
 from stario.sequences.readers.text import (
@@ -41,6 +39,8 @@ from stario.sequences.readers.text import (
 )
 from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.clock_offset import clock_offset
 
 RATE = 100.0
 _log = logging.getLogger(__name__)

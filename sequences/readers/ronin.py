@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.alignment import cumulative_rotations
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, optional_package, rotations, trajectory
 from stario.sequences.readers.json_fields import JsonFields
 from stario.sequences.readers.text import magic
 from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.truth.alignment import cumulative_rotations
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _FIELDS = {

@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.intake import all_epochs
+from stario.fusion.imu.front_end import all_epochs
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.simulate import ImuErrors, simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS
 
 

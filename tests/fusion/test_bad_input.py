@@ -14,7 +14,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import align
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.walks import CARRY_WAYS
+from stario.sequences.simulation.walks import CARRY_WAYS
 
 Make = Callable[..., Any]
 

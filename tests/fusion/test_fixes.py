@@ -12,20 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.fixes import Fix, cut, heading_fix, position_fix, read_fixes, velocity_fix
-from stario.fusion.intake import all_epochs
-from stario.fusion.jacobians import (
+from stario.fusion.filter.jacobians import (
     heading_jacobian,
     position_jacobian,
     velocity_jacobian,
     yaw_twist,
 )
+from stario.fusion.fixes import Fix, cut, heading_fix, position_fix, read_fixes, velocity_fix
+from stario.fusion.imu.front_end import all_epochs
 from stario.fusion.lie import exp_se23, exp_so3
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulate import ImuErrors
+from stario.sequences.simulation.imu import ImuErrors
 
 NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)

@@ -11,12 +11,12 @@ from support import CONFIG, VELOCITY, ate, stream, streamed_off
 
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.tracks import inertial_track
+from stario.fusion.evaluation.tracks import inertial_track
 from stario.sequences.metrics import align, pose_errors, position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulate import PERFECT_IMU, ImuErrors
+from stario.sequences.simulation.imu import PERFECT_IMU, ImuErrors
 
 Make = Callable[..., Any]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.compare import compare
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import compare
 from stario.network import DisplacementModel, load_model
 from stario.sequences import ImuSequence, read_recording
 

@@ -12,7 +12,7 @@ from stario.fusion.fixes import position_fix
 from stario.sequences.metrics import align, pose_errors
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.simulate import ImuErrors
+from stario.sequences.simulation.imu import ImuErrors
 
 NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)

@@ -84,8 +84,8 @@ SCRIPT = """
 import sys
 import numpy as np
 from stario.fusion import Navigator
-from stario.sequences.simulate import simulate_imu
-from stario.sequences.walks import generate_walk
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 
 class Still:
     def predict(self, windows):
@@ -109,8 +109,8 @@ else:
 
 
 def test_another_process_continues_it(tmp_path: Path, still_model: Any) -> None:
-    from stario.sequences.simulate import simulate_imu
-    from stario.sequences.walks import generate_walk
+    from stario.sequences.simulation.imu import simulate_imu
+    from stario.sequences.simulation.walks import generate_walk
 
     data, result = str(tmp_path / "stream.npz"), str(tmp_path / "result.npy")
     for arguments in ([data], [data, result]):

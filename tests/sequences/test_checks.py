@@ -11,9 +11,9 @@ from stario.sequences.conventions import with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
-from stario.sequences.simulate import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk
 from stario.sequences.units import with_units
-from stario.sequences.walks import CARRY_WAYS, WalkStyle, generate_walk
 
 DATA = Path(
     os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")

@@ -16,8 +16,8 @@ from stario.sequences.conventions import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulate import simulate_imu
-from stario.sequences.walks import generate_walk
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
-from stario.sequences.simulate import simulate_imu
-from stario.sequences.walks import generate_walk
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 
 
 @pytest.fixture(scope="module")

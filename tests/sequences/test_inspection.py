@@ -16,8 +16,8 @@ from stario.sequences.inspection import inspect_recording
 from stario.sequences.plots import imu_overview
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
-from stario.sequences.simulate import simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 DATA = Path(
     os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")

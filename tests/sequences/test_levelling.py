@@ -12,8 +12,8 @@ from stario.sequences.levelling import (
     start_from_gravity,
 )
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulate import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
-from stario.sequences.walks import CARRY_WAYS, WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk
 
 UP = np.array([0.0, 0.0, 1.0])
 

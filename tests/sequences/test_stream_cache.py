@@ -15,9 +15,9 @@ from stario.sequences import stream_cache
 from stario.sequences.batch import Skipped
 from stario.sequences.readers import read_recording, write_csv
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulate import simulate_imu
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.stream_cache import cache_folder, cached, recorded, recording_files
-from stario.sequences.walks import generate_walk
 from stario.sequences.windows import WorldStream, world_streams
 
 WALK = simulate_imu(generate_walk(6, 9.0), 100.0, seed=4, name="walk")

@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.intake import all_epochs
+from stario.fusion.imu.front_end import all_epochs
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulate import PERFECT_IMU, simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     Attitude,
     clean_samples,

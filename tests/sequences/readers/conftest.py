@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.readers.checked import trajectory
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulate import PERFECT_IMU, simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 START_NS = 1520531124153717567
 """A start that float64 cannot hold: it is off by up to 128 ns there."""

@@ -10,9 +10,9 @@ from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.own_csv import read_own_csv
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulate import simulate_imu
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import with_units
-from stario.sequences.walks import WalkStyle, generate_walk
 
 ROW = "0.1,0.2,0.3,1.0,2.0,9.0"
 

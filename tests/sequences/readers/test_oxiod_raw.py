@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulate import PERFECT_IMU, simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 EPOCH_NS = 1_496_840_000_000_000_000

@@ -13,8 +13,8 @@ from stario.sequences.readers.euroc import read_euroc
 from stario.sequences.readers.lists import is_list
 from stario.sequences.readers.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulate import PERFECT_IMU, PHONE_IMU, simulate_imu
-from stario.sequences.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 DATA = Path(
     os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")

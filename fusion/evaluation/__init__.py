@@ -1,0 +1,1 @@
+"""Tracks side by side, their errors in tables and figures, faults, consistency and speed."""

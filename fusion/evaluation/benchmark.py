@@ -1,0 +1,146 @@
+"""What the filter costs, and what its structured algebra saves against filterpy's dense one.
+
+Timings are processor time, the least of several runs: whatever else the machine does only adds.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.jacobians import Block
+from stario.fusion.imu.preintegration import CORE, Segment, preintegrate
+from stario.fusion.lie import FloatArray
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY
+
+
+class DenseEkf(StateCloningEkf):
+    """The same filter through filterpy's own `predict` and `update` on the full matrices."""
+
+    def _propagate_covariance(self, transition: FloatArray, noise: FloatArray) -> None:
+        self.F[:CORE, :CORE] = transition
+        self.Q[:CORE, :CORE] = noise
+        self.predict()
+
+    def _correct(
+        self,
+        residual: FloatArray,
+        blocks: Sequence[Block],
+        covariance: FloatArray,
+        HP: FloatArray,
+        HPH: FloatArray,
+        whitener: FloatArray,
+    ) -> None:
+        H = np.zeros((len(residual), self.dim_x))
+        for first, block in blocks:
+            H[:, first : first + block.shape[1]] = block
+        self.R = covariance
+        self.update(residual[:, None], lambda x: H, lambda x: H @ x)
+
+
+@dataclass(frozen=True)
+class FilterSpeed:
+    """Seconds of computing per minute of data, preintegration included, network excluded.
+
+    Attributes:
+        structured: `StateCloningEkf`.
+        dense: `DenseEkf`, filterpy's own algebra.
+        preintegration: the part of either that folds the raw samples.
+        states: size of the error state.
+    """
+
+    structured: float
+    dense: float
+    preintegration: float
+    states: int
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster the structured algebra is."""
+        return self.dense / self.structured
+
+
+def filter_speed(
+    duration: float = 5.0,
+    imu_rate: float = 200.0,
+    update_rate: float = 20.0,
+    window: float = 1.0,
+    runs: int = 9,
+    seed: int = 0,
+) -> FilterSpeed:
+    """Time the filter on a swaying device that is measured by displacements.
+
+    Args:
+        duration: length of the data [s]; its cost is scaled to a minute.
+        imu_rate: samples per second [Hz].
+        update_rate: displacements per second [Hz].
+        window: length of the displacement's window [s].
+        runs: how often each engine runs, in turn; the fastest counts.
+        seed: of the sensor's and the measurement's noise.
+    """
+    data = _SwayingDevice(duration, imu_rate, update_rate, window, seed)
+    slots = round(update_rate * window) + 1
+    engines = [StateCloningEkf(slots), DenseEkf(slots)]
+    best = np.full(3, np.inf)
+    for _ in range(runs):
+        seconds = [_timed(data.run, ekf) for ekf in engines]
+        best = np.minimum(best, [*seconds, _timed(data.preintegrate)])
+    structured, dense, folding = (best * 60.0 / duration).tolist()
+    return FilterSpeed(structured, dense, folding, engines[0].dim_x)
+
+
+class _SwayingDevice:
+    """IMU samples and displacements of a device that sways about one place."""
+
+    def __init__(
+        self, duration: float, imu_rate: float, update_rate: float, window: float, seed: int
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        self.per_segment = round(imu_rate / update_rate)
+        self.per_window = round(update_rate * window)
+        n = round(duration * update_rate) * self.per_segment + 1
+        self.time = np.arange(n) / imu_rate
+        sway = np.sin(2.0 * np.pi * self.time)[:, None]
+        self.gyro = sway * [0.5, -0.3, 0.8] + rng.normal(0.0, 0.01, (n, 3))
+        self.accel = np.array([0.0, 0.0, STANDARD_GRAVITY]) + sway + rng.normal(0.0, 0.1, (n, 3))
+        self.noise = ImuNoise()
+        self.displacements = rng.normal(0.0, 0.1, (n // self.per_segment, 3))
+
+    def preintegrate(self) -> None:
+        for first in range(0, len(self.time) - 1, self.per_segment):
+            self._segment(first, np.zeros(3), np.zeros(3))
+
+    def run(self, ekf: StateCloningEkf) -> None:
+        zero = np.zeros(3)
+        ekf.initialise(0.0, np.eye(3), zero, zero, zero, zero, np.eye(CORE) * 1e-4)
+        covariance = np.eye(3) * 0.01 * self.per_window
+        held = [ekf.clone(0.0)]
+        for k, displacement in enumerate(self.displacements):
+            ekf.propagate(self._segment(k * self.per_segment, ekf.b_g, ekf.b_a))
+            held.append(ekf.clone(ekf.time))
+            if len(held) > self.per_window:
+                ekf.update_displacement(held[0], held[-1], displacement, covariance, gate=16.3)
+                ekf.release(held.pop(0))
+
+    def _segment(self, first: int, b_g: FloatArray, b_a: FloatArray) -> Segment:
+        part = slice(first, first + self.per_segment + 1)
+        return preintegrate(
+            self.time[part],
+            self.gyro[part],
+            self.accel[part],
+            b_g,
+            b_a,
+            self.noise,
+            STANDARD_GRAVITY,
+        )
+
+
+def _timed(run: Callable[..., None], *args: StateCloningEkf) -> float:
+    start = clock.process_time()
+    run(*args)
+    return clock.process_time() - start

@@ -1,0 +1,165 @@
+"""Tracks of one recording side by side, measured against its truth where there is one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.tracks import (
+    inertial_track,
+    network_track,
+    network_track_true_attitude,
+)
+from stario.fusion.fixes import Fix, check_within
+from stario.fusion.navigator import Navigator, Predictor, Progress
+from stario.fusion.state import Track
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import CONVENTIONS, Alignment, align, evaluate_track, position_nees
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+log = logging.getLogger(__name__)
+
+TRACKS = ("inertial", "network", "network_true_attitude", "ekf", "graph")
+
+DEMONSTRATION_SEED = 2**31 + 2026
+"""Of the bundled demonstration; training draws its seeds below 2^31, so it never saw this walk."""
+
+Metrics = dict[str, float | None]
+
+METRICS = (
+    "ate_m",
+    "rte_m",
+    "pde",
+    "aye_rad",
+    "nees",
+    "nis",
+    "seconds_network",
+    "seconds_filter",
+)
+"""Figures of a track, null where they are not known."""
+
+METRIC_WORDS = {
+    **CONVENTIONS,
+    "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 3)",
+    "nis": "mean NIS of the network's measurements (expected: 3)",
+    "seconds_network": "computing time of the network [s]",
+    "seconds_filter": "computing time of everything but the network [s]",
+    "alignment": "yaw and position of the first common pose; tilt is never aligned",
+}
+"""What every figure in `metrics.json` means."""
+
+_FITTED = "yaw and position of least squared error over all poses, for fixes gave the world"
+
+
+def alignment_with(fixes: Sequence[Fix]) -> Alignment:
+    """How a track is aligned with the truth.
+
+    Where fixes give the world, the first pose's yaw is the one that is known least.
+    """
+    return "yaw" if fixes else "first"
+
+
+def metric_words(alignment: Alignment) -> dict[str, str]:
+    """What the figures of `measure` mean."""
+    return METRIC_WORDS | ({"alignment": _FITTED} if alignment == "yaw" else {})
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The tracks of one recording.
+
+    Attributes:
+        sequence: the recording.
+        tracks: by name, in the order of `TRACKS`; without truth there is no
+            "network_true_attitude".
+        metrics: by track name.
+        alignment: of the tracks with the truth, for metrics and figures.
+    """
+
+    sequence: ImuSequence
+    tracks: dict[str, Track]
+    metrics: dict[str, Metrics]
+    alignment: Alignment = "first"
+
+    @property
+    def path_m(self) -> float | None:
+        """Length of the true way [m], None without truth."""
+        truth = self.sequence.truth
+        return None if truth is None else truth.path_length()
+
+    def as_dict(self) -> dict[str, object]:
+        """The recording's entry in `metrics.json`."""
+        unknown: Metrics = dict.fromkeys(METRICS)
+        tracks = {name: self.metrics.get(name, unknown) for name in TRACKS}
+        return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
+
+    def aligned(self) -> dict[str, Trajectory]:
+        """Trajectories for figures: aligned with the truth where there is one."""
+        truth = self.sequence.truth
+        raw = {name: track.trajectory for name, track in self.tracks.items()}
+        if truth is None:
+            return raw
+        return {name: align(track, truth, self.alignment) for name, track in raw.items()}
+
+
+def compare(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    progress: Progress = lambda share: None,
+    fixes: Sequence[Fix] = (),
+) -> Comparison:
+    """Every track of a recording; the network sees each window once, EKF and graph the fixes.
+
+    Raises:
+        InputError: the recording is too short, its units or rate are wrong, or no fix is within
+            its time.
+    """
+    check_within(fixes, sequence)
+    navigator = Navigator(model, config)
+    observed = navigator.observe(sequence, progress)
+    tracks = {
+        "inertial": inertial_track(observed, config),
+        "network": network_track(observed),
+    }
+    if sequence.truth is not None:
+        try:
+            tracks["network_true_attitude"] = network_track_true_attitude(model, sequence, config)
+        except InputError as error:
+            log.warning("no track with true attitude: %s", error)
+    tracks["ekf"] = navigator.track(observed, progress, fixes)
+    tracks["graph"] = Navigator(model, config, backend="graph").track(observed, fixes=fixes)
+    alignment = alignment_with(fixes)
+    metrics = {name: measure(track, sequence.truth, alignment) for name, track in tracks.items()}
+    return Comparison(sequence, tracks, metrics, alignment)
+
+
+def measure(track: Track, truth: Trajectory | None, alignment: Alignment = "first") -> Metrics:
+    """Figures of one track; null where there is no truth, or no covariance.
+
+    Args:
+        track: to measure.
+        truth: None where there is none.
+        alignment: of position errors and of the NEES, as of `align`.
+    """
+    figures: Metrics = dict.fromkeys(METRICS)
+    if truth is not None:
+        result = evaluate_track(track.trajectory, truth, alignment=alignment)
+        figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
+        if track.trajectory.position_covariance_W is not None:
+            figures["nees"] = position_nees(track.trajectory, truth, alignment).median
+    figures["nis"] = track.nis
+    figures["seconds_network"] = track.seconds_network
+    figures["seconds_filter"] = track.seconds_filter
+    return figures
+
+
+def demonstration() -> ImuSequence:
+    """The bundled demonstration: a simulated phone carried in the hand for two minutes."""
+    style = WalkStyle(carry="handheld", preferred_speed=1.1, mount_rotvec=(0.3, -0.2, 0.9))
+    walk = generate_walk(DEMONSTRATION_SEED, duration=120.0, style=style)
+    return simulate_imu(walk, 200.0, PHONE_IMU, DEMONSTRATION_SEED, name="demonstration")

@@ -1,0 +1,390 @@
+"""Faults put into a recording, and what each costs: the same recording run with and without.
+
+A fault changes the recording, or what is measured of it. What a fault costs the fusion shows best
+where the displacements are the true ones under white noise of a known size; a network's own errors,
+which differ from window to window, hide it. So that is what measures unless a network is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.navigator import Backend, Navigator, Observed, Predictor
+from stario.fusion.state import Health, Track
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import align, evaluate_track
+from stario.sequences.noise import ImuNoise
+from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.windows import WINDOW_SECONDS
+
+Spoil = Callable[[ImuSequence, np.random.Generator], ImuSequence]
+Corrupt = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
+"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place, given the share (M,) of
+the windows that are over at each one's end."""
+
+
+WHITE_NOISE = 0.05
+"""Of the true displacements where no network measures, per axis [m]."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        name: in the table.
+        spoil: what it does to the recording.
+        corrupt: what it does to the network's answers.
+    """
+
+    name: str
+    spoil: Spoil | None = None
+    corrupt: Corrupt | None = None
+
+
+@dataclass(frozen=True)
+class FaultResult:
+    """What a fault cost.
+
+    Attributes:
+        fault: its name.
+        backend: "ekf" or "graph".
+        error_without: absolute trajectory error of the untouched recording [m].
+        error_with: of the spoilt one [m].
+        end_error: distance from the truth at the end [m].
+        end_sigma: what the track says of it, root of the covariance's trace [m].
+        finite: whether every state, covariance included, is finite.
+        reported: what the health report says of it.
+    """
+
+    fault: str
+    backend: str
+    error_without: float
+    error_with: float
+    end_error: float
+    end_sigma: float
+    finite: bool
+    reported: str
+
+
+def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
+    """A simulated walk and a configuration that knows its sensor's errors as they are."""
+    noise = ImuNoise()
+    errors = ImuErrors(noise=noise, gyro_turn_on=5e-4, accel_turn_on=0.02)
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
+    walk = generate_walk(seed, seconds, style=style)
+    known = FilterConfig(
+        covariance_scale=1.0,
+        gyro_bias_sigma=errors.gyro_turn_on,
+        gyro_corrected=0.0,
+        accel_bias_sigma=errors.accel_turn_on,
+        accel_motion_noise=0.0,
+    )
+    sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
+    return sequence, NavigatorConfig(noise=noise, filter=known)
+
+
+def faults(duration: float) -> list[Fault]:
+    """Every fault of the table, for a recording that long [s]."""
+    half = 0.5 * duration
+    return [
+        Fault("none"),
+        Fault("network off by 1 m for 5 s", corrupt=_offset_block(5.0 / duration, 1.0)),
+        Fault("5 % of windows off by 2 m", corrupt=_outliers(0.05, 2.0)),
+        Fault("covariance 100 times too small", corrupt=_overconfident(0.01)),
+        *(Fault(f"gap of {gap:g} s", _gap(half, gap)) for gap in (0.1, 1.0, 3.0)),
+        *(Fault(f"{share:.0%} of samples dropped", _drops(share)) for share in (0.05, 0.2)),
+        *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
+        Fault("accelerometer clipped", _clipped(0.98)),
+        *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
+        Fault("one NaN from the network", corrupt=_nan_answer(0)),
+        Fault("one NaN in the covariance", corrupt=_nan_answer(1)),
+        Fault("1 % duplicated, 1 % swapped", _reordered(0.01)),
+        Fault("three wild timestamps", _wild_times(3)),
+        Fault("ten spikes", _spikes(10)),
+    ]
+
+
+def run_faults(
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    model: Predictor | None = None,
+    seed: int = 0,
+    backends: Sequence[Backend] = get_args(Backend),
+    only: Sequence[Fault] | None = None,
+) -> list[FaultResult]:
+    """Run a recording with each fault through each back end.
+
+    Args:
+        sequence: a recording with truth.
+        config: of the navigator.
+        model: the network; None for the true displacements under white noise.
+        seed: of the faults' draws.
+        backends: which to run.
+        only: the faults; None for all of them.
+
+    Raises:
+        InputError: the recording has no truth, or is too short.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+    results: list[FaultResult] = []
+    for backend in backends:
+        without = _error(_run(Fault(""), sequence, config, model, seed, backend), sequence)
+        for fault in faults(sequence.duration) if only is None else only:
+            track = _run(fault, sequence, config, model, seed, backend)
+            results.append(_result(fault, backend, track, sequence, without))
+    return results
+
+
+def fault_table(results: Sequence[FaultResult]) -> str:
+    """The results for a person."""
+    head = f"{'fault':<32}{'back end':<10}{'without':>9}{'with':>9}{'end':>9}{'sigma':>9}  reported"
+    lines = [head, f"{'':<42}{'ATE [m]':>9}{'ATE [m]':>9}{'[m]':>9}{'[m]':>9}"]
+    for r in results:
+        figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
+        cells = "".join(f"{value:>9.3f}" for value in figures)
+        state = "" if r.finite else "NOT FINITE, "
+        lines.append(f"{r.fault:<32}{r.backend:<10}{cells}  {state}{r.reported}")
+    return "\n".join(lines)
+
+
+def reported(health: Health) -> str:
+    """What a health report says of faults, in a few words."""
+    words = [f"{name} {n}" for name, n in health.samples.items() if n and name != "used"]
+    words += [f"{name} {n}" for name, n in health.flagged.items() if n]
+    words += [f"refused {reason} {n}" for reason, n in health.refused.items()]
+    words += [f"gap {length:.1f} s" for _, length in health.gaps]
+    words += [f"gated {health.gated} of {health.updates}", *health.notes]
+    return ", ".join(words)
+
+
+def _run(
+    fault: Fault,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    model: Predictor | None,
+    seed: int,
+    backend: Backend,
+) -> Track:
+    rng = np.random.default_rng(seed)
+    spoilt = sequence if fault.spoil is None else fault.spoil(sequence, rng)
+    navigator = Navigator(model or _Silent(), config, backend=backend)
+    observed = navigator.observe(spoilt)
+    if model is None and sequence.truth is not None:
+        observed = with_true_displacements(observed, sequence.truth, config, seed)
+    if fault.corrupt is not None:
+        observed = _corrupted(observed, fault.corrupt, rng)
+    return navigator.track(observed)
+
+
+class _Silent:
+    """Stands where a network would."""
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        n = len(np.asarray(windows))
+        return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+
+
+def with_true_displacements(
+    observed: Observed,
+    truth: Trajectory,
+    config: NavigatorConfig,
+    seed: int,
+    noise: float = WHITE_NOISE,
+) -> Observed:
+    """A prepared recording measured by its true displacements under white noise.
+
+    Like a network's they are given in each window's frame, off by the yaw of the attitude the
+    window was prepared with, and with the covariance that the filter then takes at its word.
+
+    Args:
+        observed: the prepared recording.
+        truth: of its poses.
+        config: of the navigator.
+        seed: of the noise; a window draws the same one whatever happened before it.
+        noise: per axis [m].
+    """
+    covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
+    known = [k for k, epoch in enumerate(observed.epochs) if epoch.window is not None]
+    epochs = [observed.epochs[k] for k in known]
+    stop = np.array([epoch.stop for epoch in epochs])
+    ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
+    first, last = truth.at(ends[0]), truth.at(ends[1])
+    seen = [epoch.R_NB_window for epoch in epochs if epoch.R_NB_window is not None]
+    R_NB = Rotation.from_matrix(np.stack(seen))
+    turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
+    displacement_N = turn.apply(last.position_W - first.position_W)
+    measurements = list(observed.measurements)
+    for k, d_N, time in zip(known, displacement_N, stop - truth.time[0], strict=True):
+        rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
+        measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
+    return replace(observed, measurements=measurements)
+
+
+def _corrupted(observed: Observed, corrupt: Corrupt, rng: np.random.Generator) -> Observed:
+    """What the fault makes of the measurements, all of them at once."""
+    known = [k for k, measurement in enumerate(observed.measurements) if measurement is not None]
+    pairs = [measurement for measurement in observed.measurements if measurement is not None]
+    mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
+    corrupt((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
+    measurements = list(observed.measurements)
+    for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
+        measurements[k] = (d_N, cov_N)
+    return replace(observed, measurements=measurements)
+
+
+def _result(
+    fault: Fault, backend: str, track: Track, sequence: ImuSequence, without: float
+) -> FaultResult:
+    assert sequence.truth is not None and track.covariance is not None  # noqa: PT018
+    aligned = align(track.trajectory, sequence.truth, "first")
+    last = sequence.truth.at(np.clip(track.time[-1:], *sequence.truth.time[[0, -1]]))
+    arrays = [values for values in track.arrays().values() if values.dtype.kind == "f"]
+    return FaultResult(
+        fault=fault.name,
+        backend=backend,
+        error_without=without,
+        error_with=_error(track, sequence),
+        end_error=float(np.linalg.norm(aligned.position_W[-1] - last.position_W[0])),
+        end_sigma=float(np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9]))),
+        finite=all(bool(np.isfinite(values).all()) for values in arrays),
+        reported="" if track.health is None else reported(track.health),
+    )
+
+
+def _error(track: Track, sequence: ImuSequence) -> float:
+    assert sequence.truth is not None  # checked at the edge
+    return evaluate_track(track.trajectory, sequence.truth).ate_m
+
+
+# --- what the faults do ------------------------------------------------------------------------
+
+
+def _offset_block(share: float, metres: float) -> Corrupt:
+    def corrupt(
+        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+    ) -> None:
+        mean[(over > 0.5) & (over <= 0.5 + share), 0] += metres
+
+    return corrupt
+
+
+def _outliers(share: float, metres: float) -> Corrupt:
+    def corrupt(
+        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+    ) -> None:
+        hit = rng.random(len(mean)) < share
+        mean[hit] += rng.choice([-metres, metres], (int(hit.sum()), 3)) / np.sqrt(3.0)
+
+    return corrupt
+
+
+def _overconfident(factor: float) -> Corrupt:
+    def corrupt(
+        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+    ) -> None:
+        covariance *= factor
+
+    return corrupt
+
+
+def _nan_answer(which: int) -> Corrupt:
+    def corrupt(
+        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+    ) -> None:
+        (mean, covariance)[which][len(mean) // 2] = np.nan
+
+    return corrupt
+
+
+def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
+    return replace(
+        sequence, time=sequence.time[keep], gyro=sequence.gyro[keep], accel=sequence.accel[keep]
+    )
+
+
+def _gap(start: float, seconds: float) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        since = sequence.time - sequence.time[0] - start
+        return _kept(sequence, (since <= 0.0) | (since >= seconds))
+
+    return spoil
+
+
+def _drops(share: float) -> Spoil:
+    return lambda sequence, rng: _kept(sequence, rng.random(len(sequence)) >= share)
+
+
+def _resampled(rate: float) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        time = np.arange(sequence.time[0], sequence.time[-1], 1.0 / rate)
+        gyro, accel = (
+            np.stack([np.interp(time, sequence.time, column) for column in values.T], axis=1)
+            for values in (sequence.gyro, sequence.accel)
+        )
+        return replace(sequence, time=time, gyro=gyro, accel=accel)
+
+    return spoil
+
+
+def _clipped(quantile: float) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        limit = float(np.quantile(np.abs(sequence.accel).max(axis=1), quantile))
+        return replace(sequence, accel=np.clip(sequence.accel, -limit, limit))
+
+    return spoil
+
+
+def _one_nan(field: str) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        values = getattr(sequence, field).copy()
+        values[len(values) // 2] = np.nan
+        return replace(sequence, **{field: values})
+
+    return spoil
+
+
+def _reordered(share: float) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        order = np.arange(len(sequence))
+        for k in np.flatnonzero(rng.random(len(order) - 1) < share):
+            order[[k, k + 1]] = order[[k + 1, k]]
+        order = np.repeat(order, 1 + (rng.random(len(order)) < share))
+        return replace(
+            sequence,
+            time=sequence.time[order],
+            gyro=sequence.gyro[order],
+            accel=sequence.accel[order],
+        )
+
+    return spoil
+
+
+def _wild_times(count: int) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        time = sequence.time.copy()
+        time[rng.integers(0, len(time), count)] += 1e6
+        return replace(sequence, time=time)
+
+    return spoil
+
+
+def _spikes(count: int) -> Spoil:
+    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+        gyro, accel = sequence.gyro.copy(), sequence.accel.copy()
+        gyro[rng.integers(0, len(gyro), count // 2), 1] += 200.0
+        accel[rng.integers(0, len(accel), count - count // 2), 2] += 500.0
+        return replace(sequence, gyro=gyro, accel=accel)
+
+    return spoil

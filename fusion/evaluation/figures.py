@@ -1,0 +1,166 @@
+"""Figures of networks side by side: cost against error, distributions, sample tracks.
+
+Drawn as those of `stario.sequences.plots`, without pyplot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample
+from stario.sequences.sequence import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_INK, _GREY = "#333333", "#999999"
+_COLOURS = (
+    "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#7F5539", "#6A4C93",
+    "#999999", "#000000", "#8DB600",
+)  # fmt: skip
+_STYLES = ("-", "--", ":")
+_AGAINST = "R-ResNet"
+
+
+def figures(table: NetworkTable) -> dict[str, Figure]:
+    """Figures by file name."""
+    drawn = {
+        "ate_parameters.png": _ate_against_parameters(table),
+        "distributions.png": _distributions(table),
+        "pde.png": _pde_boxes(table),
+    }
+    if table.samples:
+        colours = {name: _colour(k) for k, name in enumerate(table.parameters)}
+        drawn["trajectories.png"] = _trajectories(table.samples, colours)
+    return drawn
+
+
+def _ate_against_parameters(table: NetworkTable) -> Figure:
+    fig = _figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
+    axes = fig.subplots()
+    for k, (network, parameters) in enumerate(table.parameters.items()):
+        mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
+        axes.errorbar(
+            parameters / 1e6, mean, yerr=spread, fmt="o", ms=9, color=_colour(k), capsize=4
+        )
+        axes.annotate(
+            network, (parameters / 1e6, mean), (8, 6), textcoords="offset points", fontsize=9
+        )
+    axes.set(xlabel="parameters [millions], the paper's convention", ylabel="ATE [m]", xscale="log")
+    ticks = [1, 2, 3, 5, 10, 15]
+    axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
+    axes.set_xticks([], minor=True)
+    counts = [p / 1e6 for p in table.parameters.values()]
+    axes.set_xlim(0.7 * min(counts), 1.9 * max(counts))
+    axes.set_ylim(bottom=0.0)
+    axes.margins(y=0.15)
+    _dress(axes)
+    return fig
+
+
+def _distributions(table: NetworkTable) -> Figure:
+    fig = _figure(11.0, 5.0, "Share of recordings below an error, true attitude")
+    panels = fig.subplots(1, 2, sharey=True)
+    for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
+        for k, network in enumerate(table.parameters):
+            values = table.values(network, "network_true_attitude", metric)
+            at, share = _steps(values[np.isfinite(values)])
+            axes.plot(
+                at, share, _STYLES[k % 3], drawstyle="steps-post", color=_colour(k), lw=1.6,
+                label=network,
+            )  # fmt: skip
+        axes.set(xlabel=title, ylim=(0.0, 1.02))
+        axes.set_xlim(left=0.0)
+        _dress(axes)
+    panels[0].set_ylabel("share of tracks [1]")
+    panels[1].legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return fig
+
+
+def _pde_boxes(table: NetworkTable) -> Figure:
+    fig = _figure(4.0 + 3.0 * len(PROTOCOLS), 5.0, "Position drift at the end, per recording")
+    panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
+    names = list(table.parameters)
+    for axes, (protocol, words) in zip(panels, PROTOCOLS.items(), strict=True):
+        values = [100.0 * table.values(name, protocol, "pde") for name in names]
+        boxes = axes.boxplot(
+            [v[np.isfinite(v)] for v in values], widths=0.6, patch_artist=True, showfliers=False
+        )
+        for k, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
+            box.set(facecolor=_colour(k), alpha=0.35, edgecolor=_colour(k))
+            median.set(color=_INK, lw=1.6)
+            axes.plot(np.full(len(values[k]), k + 1), values[k], ".", color=_colour(k), ms=6)
+        axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
+        axes.set_title(words, loc="left", fontsize=10)
+        axes.set_ylim(bottom=0.0)
+        _dress(axes)
+    panels[0].set_ylabel("PDE [% of the way]")
+    return fig
+
+
+def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
+    """Tracks of StarIO's kind against R-ResNet's, or of the first four networks without it."""
+    columns = min(2, len(samples))
+    rows = math.ceil(len(samples) / columns)
+    fig = _figure(5.5 * columns, 5.2 * rows, "Tracks with true attitude, aligned by the first pose")
+    panels = np.ravel(fig.subplots(rows, columns, squeeze=False))
+    for axes, sample in zip(panels, samples, strict=False):
+        _draw_sample(axes, sample, colours)
+    for axes in panels[len(samples) :]:
+        axes.remove()
+    handles, labels = panels[0].get_legend_handles_labels()
+    fig.legend(
+        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=9
+    )
+    return fig
+
+
+def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
+    way = sample.truth.position_W[sample.truth.valid]
+    axes.plot(way[:, 0], way[:, 1], color="black", lw=2.0, label="truth")
+    names = list(sample.tracks)
+    if _AGAINST in names:
+        ours = [name for name in names if name.startswith("StarIO")]
+        names = [_AGAINST, *(ours or [n for n in names if n != _AGAINST])]
+    for name in names[:4]:
+        track, colour = sample.tracks[name].position_W, colours[name]
+        axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=name)
+        axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
+    axes.plot(*way[0, :2], "o", mfc="white", mec=_INK, ms=8)
+    axes.set_title(sample.recording, loc="left", fontsize=10)
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    _dress(axes)
+
+
+def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of the empirical distribution of some values (N,)."""
+    ordered = np.sort(values)
+    share = np.arange(1, len(ordered) + 1) / max(len(ordered), 1)
+    return np.concatenate([[0.0], ordered]), np.concatenate([[0.0], share])
+
+
+def _figure(width: float, height: float, title: str) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(fig)
+    fig.suptitle(title, fontsize=13, color=_INK, x=0.02, ha="left")
+    return fig
+
+
+def _dress(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(_GREY)
+    axes.tick_params(colors=_INK, labelsize=9)
+    axes.grid(color="#E6E6E6", lw=0.7)
+    axes.set_axisbelow(True)
+
+
+def _colour(index: int) -> str:
+    return _COLOURS[index % len(_COLOURS)]

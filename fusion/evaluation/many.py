@@ -1,0 +1,103 @@
+"""The tracks of many recordings, compared in parallel and past those that cannot be used."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import Comparison, compare
+from stario.fusion.fixes import Fix
+from stario.fusion.navigator import Predictor, Progress
+from stario.network.model import DisplacementModel, load_model
+from stario.sequences.batch import Skipped, each
+from stario.sequences.errors import InputError
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import ImuSequence
+
+
+def compare_recordings(
+    paths: Sequence[Path],
+    model: Predictor | str,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence] = read_recording,
+    jobs: int | None = None,
+    fixes: Sequence[Fix] = (),
+    truth_needed: bool = False,
+    progress: Progress = lambda share: None,
+) -> Iterator[Comparison | Skipped]:
+    """Compare the tracks of each recording, in the order of the paths.
+
+    Comparisons come one by one, so that they need not all be in memory, under names of their own:
+    a second `walk` is `walk-2`.
+
+    Args:
+        paths: recordings.
+        model: the network, or the name of weights, which each process loads once: better than
+            handing over the network with every recording.
+        config: the navigator's settings.
+        read: how a path is read; can be pickled.
+        jobs: processes, as for `stario.sequences.batch.each`.
+        fixes: known to the EKF of every recording.
+        truth_needed: skip recordings without truth.
+        progress: called with the share of the work that is done; within a recording too where
+            one process works.
+    """
+    done = 0
+
+    def within(share: float) -> None:
+        progress((done + share) / len(paths))
+
+    work = partial(
+        _compare,
+        model=model,
+        config=config,
+        read=read,
+        fixes=fixes,
+        truth_needed=truth_needed,
+        progress=within if jobs == 1 else _unseen,
+    )
+    names: set[str] = set()
+    for outcome in each(work, paths, jobs):
+        done += 1
+        within(0.0)
+        if isinstance(outcome, Comparison):
+            name = distinct_name(outcome.sequence.name, names)
+            outcome = replace(outcome, sequence=replace(outcome.sequence, name=name))
+        yield outcome
+
+
+def distinct_name(name: str, taken: set[str]) -> str:
+    """The name, or the first of name-2, name-3, ... that is not taken; it is taken from now on."""
+    names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
+    found = next(name for name in names if name not in taken)
+    taken.add(found)
+    return found
+
+
+def _compare(
+    path: Path,
+    model: Predictor | str,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence],
+    fixes: Sequence[Fix],
+    truth_needed: bool,
+    progress: Progress,
+) -> Comparison:
+    sequence = read(path)
+    if truth_needed and sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+    network = _loaded(model) if isinstance(model, str) else model
+    return compare(network, sequence, config, progress, fixes)
+
+
+@cache
+def _loaded(name: str) -> DisplacementModel:
+    return load_model(name)
+
+
+def _unseen(share: float) -> None:
+    """Progress that another process makes."""

@@ -1,0 +1,159 @@
+"""The folder a run leaves behind: tracks, arrays, metrics, configuration, health and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, Metrics
+from stario.fusion.evaluation.summary import Scores, scores_of
+from stario.fusion.navigator import Backend
+from stario.fusion.state import Innovations, Track
+from stario.sequences.errors import InputError
+from stario.sequences.files import write_json, write_npz, write_tum
+from stario.sequences.plots import error_over_time, innovations, plan_view, save_figure
+from stario.sequences.sequence import Trajectory
+
+
+def write_run(
+    folder: Path,
+    name: str,
+    track: Track,
+    truth: Trajectory | None,
+    aligned: Trajectory,
+    metrics: Metrics,
+    words: dict[str, str],
+    config: NavigatorConfig,
+    backend: Backend = "ekf",
+) -> list[Path]:
+    """Write one fused track; returns the files.
+
+    `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
+    `config.json`, `health.json`, and the figures; the graph's track is called `graph`.
+
+    Raises:
+        InputError: the folder cannot be made.
+    """
+    make_folder(folder)
+    written = _track_files(folder, backend, track)
+    record = {"recording": name, backend: metrics, "conventions": words}
+    for file, content in (
+        ("metrics.json", record),
+        ("config.json", asdict(config)),
+        ("health.json", asdict(track.health) if track.health else None),
+    ):
+        write_json(folder / file, content)
+        written.append(folder / file)
+    return written + _figures(folder, name, {backend: aligned}, truth, track.innovations, config)
+
+
+def write_comparison(
+    folder: Path, comparisons: Sequence[Comparison], config: NavigatorConfig
+) -> list[Path]:
+    """Write `metrics.json`, `config.json` and a sub-folder of tracks and figures per recording.
+
+    Raises:
+        InputError: a folder cannot be made.
+    """
+    written = write_summary(folder, [scores_of(c) for c in comparisons], config)
+    for comparison in comparisons:
+        written += write_recording(folder, comparison, config)
+    return written
+
+
+def write_summary(
+    folder: Path, recordings: Sequence[Scores], config: NavigatorConfig
+) -> list[Path]:
+    """Write `metrics.json` and `config.json` of several recordings.
+
+    Raises:
+        InputError: the folder cannot be made.
+    """
+    make_folder(folder)
+    write_json(folder / "metrics.json", scores_dict(recordings))
+    write_json(folder / "config.json", asdict(config))
+    return [folder / "metrics.json", folder / "config.json"]
+
+
+def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfig) -> list[Path]:
+    """Write tracks and figures of one recording into a sub-folder of its name.
+
+    Raises:
+        InputError: a folder cannot be made.
+    """
+    name = comparison.sequence.name
+    inner = folder / name
+    make_folder(inner)
+    written: list[Path] = []
+    for track_name, track in comparison.tracks.items():
+        written += _track_files(inner, track_name, track)
+    truth = comparison.sequence.truth
+    if truth is not None:
+        write_tum(inner / "truth.tum", truth)
+        written.append(inner / "truth.tum")
+    filtered = comparison.tracks["ekf"].innovations
+    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config)
+
+
+def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
+    """The content of `metrics.json`."""
+    return scores_dict([scores_of(comparison) for comparison in comparisons])
+
+
+def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
+    """The same from the figures alone."""
+    records = {scores.name: scores.record for scores in recordings}
+    # Fixes, which change how tracks are aligned, are those of one recording.
+    words = next((scores.words for scores in recordings), METRIC_WORDS)
+    return {"recordings": records, "conventions": words}
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it.
+
+    Raises:
+        InputError: something else is in the way or it is not allowed.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            str(folder), error.strerror or "an error", "a folder that can be made"
+        ) from error
+
+
+def _track_files(folder: Path, name: str, track: Track) -> list[Path]:
+    tum, npz = folder / f"{name}.tum", folder / f"{name}.npz"
+    write_tum(tum, track.trajectory)
+    write_npz(npz, **track.arrays())
+    return [tum, npz]
+
+
+def _figures(
+    folder: Path,
+    name: str,
+    tracks: dict[str, Trajectory],
+    truth: Trajectory | None,
+    filtered: Innovations | None,
+    config: NavigatorConfig,
+) -> list[Path]:
+    figures = {"plan.png": plan_view(tracks, truth, name)}
+    if truth is not None:
+        shown = {k: v for k, v in tracks.items() if k != "inertial"}
+        figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")
+    if filtered is not None and len(filtered.time):
+        figures["innovations.png"] = innovations(
+            filtered.time,
+            filtered.residual_W,
+            filtered.sigma,
+            filtered.nis,
+            3,
+            filtered.gated,
+            title=f"{name}: innovations",
+            unit="m" if config.filter.measurement == "displacement" else "m/s",
+        )
+    for file, figure in figures.items():
+        save_figure(figure, folder / file)
+    return [folder / file for file in figures]

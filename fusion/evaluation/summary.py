@@ -1,0 +1,90 @@
+"""Summary of many comparisons: one table of recordings by tracks, medians and means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.evaluation.compare import METRIC_WORDS, TRACKS, Comparison, Metrics, metric_words
+from stario.sequences.sequence import FloatArray
+
+_COLUMNS = (
+    ("network_true_attitude", "ate_m", "network, true attitude"),
+    ("network", "ate_m", "network, own attitude"),
+    ("ekf", "ate_m", "EKF"),
+    ("graph", "ate_m", "graph"),
+    ("ekf", "nis", "EKF NIS"),
+    ("ekf", "nees", "EKF NEES"),
+    ("graph", "nees", "graph NEES"),
+)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The figures of one recording: what stays when a comparison's arrays are let go.
+
+    Attributes:
+        name: the recording's.
+        metrics: by track name.
+        record: the recording's entry in `metrics.json`.
+        words: what the figures mean.
+    """
+
+    name: str
+    metrics: dict[str, Metrics]
+    record: dict[str, object]
+    words: dict[str, str]
+
+
+def scores_of(comparison: Comparison) -> Scores:
+    """The figures of a comparison."""
+    words = metric_words(comparison.alignment)
+    return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict(), words)
+
+
+def summary(recordings: Sequence[Scores]) -> dict[str, object]:
+    """Figures of every recording with medians and means over them, as plain values."""
+    records = {scores.name: scores.record for scores in recordings}
+    metrics = ("ate_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+    over = {
+        track: {
+            metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
+            for metric in metrics
+            if len(values := _known(recordings, track, metric))
+        }
+        for track in TRACKS
+    }
+    return {"recordings": records, "over_recordings": over, "conventions": METRIC_WORDS}
+
+
+def summary_table(recordings: Sequence[Scores]) -> str:
+    """The same for a person: horizontal ATE of each track, consistency of the EKF."""
+    width = max([24, *(len(r.name) + 2 for r in recordings)])
+    lines = [f"{'':<{width}}" + "".join(f"{title:>24}" for _, _, title in _COLUMNS)]
+    rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
+    known = [_known(recordings, track, metric) for track, metric, _ in _COLUMNS]
+    for name, over in (("median", np.median), ("mean", np.mean)):
+        rows.append((name, [float(over(values)) if len(values) else None for values in known]))
+    for name, row in rows:
+        lines.append(f"{name:<{width}}" + "".join(f"{_cell(value):>24}" for value in row))
+    lines.append(f"ATE in m: {METRIC_WORDS['ate_m']}; NIS: {METRIC_WORDS['nis']}; ")
+    lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
+    return "\n".join(lines)
+
+
+def _known(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
+    values = [_value(scores, track, metric) for scores in recordings]
+    return np.array([value for value in values if value is not None])
+
+
+def _value(scores: Scores, track: str, metric: str) -> float | None:
+    """A figure, None where it is not known."""
+    value = scores.metrics.get(track, {}).get(metric)
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -1,0 +1,273 @@
+"""Networks side by side over many recordings: the paper's table.
+
+Each network is asked for three tracks of each recording: chained displacements with the true
+attitude (the papers' protocol), the same with the attitude levelled from the IMU, and the EKF's.
+Several weights of one network, trained with different seeds, say, are averaged, with their spread.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.many import distinct_name
+from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
+from stario.fusion.navigator import Navigator
+from stario.network.model import DisplacementModel
+from stario.network.runtime.cost import table_cost
+from stario.sequences.batch import Skipped, each
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_write, write_json
+from stario.sequences.metrics import CONVENTIONS, Convention, align, evaluate_track
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+PROTOCOLS = {
+    "network_true_attitude": "network, true attitude",
+    "network": "network, own attitude",
+    "ekf": "EKF",
+}
+"""Tracks of the table and what a person calls them."""
+
+METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Errors of one track; see `stario.sequences.metrics.CONVENTIONS`.
+
+    Attributes:
+        recording: its name.
+        network: the architecture.
+        weights: the file, or "default".
+        protocol: one of `PROTOCOLS`.
+        ate_m: [m].
+        rte_m: [m].
+        pde: [1].
+    """
+
+    recording: str
+    network: str
+    weights: str
+    protocol: str
+    ate_m: float
+    rte_m: float
+    pde: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Tracks of one recording with the true attitude, aligned with the truth, for a figure."""
+
+    recording: str
+    truth: Trajectory
+    tracks: dict[str, Trajectory]
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTable:
+    """What came out.
+
+    Attributes:
+        convention: how position errors are averaged.
+        parameters: of each network in the table's order, by the paper's convention.
+        entries: of all tracks.
+        samples: some recordings' tracks.
+    """
+
+    convention: Convention
+    parameters: dict[str, int]
+    entries: list[Entry] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+
+    def values(self, network: str, protocol: str, metric: str, weights: str = "") -> FloatArray:
+        """A metric (N,) of a network's tracks, of one weights file or of all."""
+        return np.array(
+            [
+                getattr(entry, metric)
+                for entry in self.entries
+                if (entry.network, entry.protocol) == (network, protocol)
+                and weights in ("", entry.weights)
+            ]
+        )
+
+    def mean_and_spread(
+        self, network: str, protocol: str, metric: str, recording: str = ""
+    ) -> tuple[float, float | None]:
+        """Mean over recordings, or of one, and the deviation of that mean over the weights."""
+        chosen = [
+            e
+            for e in self.entries
+            if (e.network, e.protocol) == (network, protocol) and recording in ("", e.recording)
+        ]
+        by_weights = [
+            np.nanmean([getattr(e, metric) for e in chosen if e.weights == weights])
+            for weights in dict.fromkeys(e.weights for e in chosen)
+        ]
+        spread = float(np.std(by_weights, ddof=1)) if len(by_weights) > 1 else None
+        return float(np.mean(by_weights)), spread
+
+
+Models = Sequence[tuple[str, DisplacementModel]]
+"""Weights, by the name they were asked for."""
+
+
+def compare_networks(
+    paths: Sequence[Path],
+    models: Models,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence] = read_recording,
+    convention: Convention = "rms",
+    jobs: int | None = None,
+    samples: int = 4,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[NetworkTable, list[Skipped]]:
+    """Ask every network for its tracks of every recording.
+
+    Args:
+        paths: recordings with truth.
+        models: weights under distinct names.
+        config: of the filter.
+        read: how a path is read; can be pickled.
+        convention: how position errors are averaged.
+        jobs: processes, as for `stario.sequences.batch.each`.
+        samples: recordings whose tracks are kept for a figure.
+        progress: called with the share of the work done.
+
+    Returns:
+        The table, and what could not be used.
+    """
+    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
+    table, skipped = NetworkTable(convention, parameters), []
+    names: set[str] = set()
+    work = partial(_tracks, models=models, config=config, read=read, convention=convention)
+    for done, outcome in enumerate(each(work, paths, jobs), 1):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            entries, sample = outcome
+            name = distinct_name(sample.recording, names)
+            table.entries.extend(replace(entry, recording=name) for entry in entries)
+            if len(table.samples) < samples:
+                table.samples.append(replace(sample, recording=name))
+        progress(done / len(paths))
+    return table, skipped
+
+
+def table_text(table: NetworkTable) -> str:
+    """The table for a person: a block for each protocol and metric, recordings by networks."""
+    networks = list(table.parameters)
+    recordings = list(dict.fromkeys(e.recording for e in table.entries))
+    width = max([12, *(len(name) + 2 for name in networks)])
+    first = max([12, *(len(name) + 2 for name in recordings)])
+    lines = []
+    for protocol, words in PROTOCOLS.items():
+        for metric, title in METRICS.items():
+            lines.append(f"{words}: {title}")
+            lines.append(f"{'':<{first}}" + "".join(f"{name:>{width}}" for name in networks))
+            for recording in [*recordings, ""]:
+                cells = [table.mean_and_spread(n, protocol, metric, recording) for n in networks]
+                lines.append(
+                    f"{recording or 'mean':<{first}}"
+                    + "".join(f"{_cell(*cell):>{width}}" for cell in cells)
+                )
+            lines.append("")
+    return "\n".join([*lines, *(f"{name}: {text}." for name, text in _words(table).items())])
+
+
+def table_dict(table: NetworkTable) -> dict[str, object]:
+    """The table as plain values."""
+    over = {
+        network: {
+            protocol: {
+                metric: dict(
+                    zip(
+                        ("mean", "spread"),
+                        table.mean_and_spread(network, protocol, metric),
+                        strict=True,
+                    )
+                )
+                for metric in METRICS
+            }
+            for protocol in PROTOCOLS
+        }
+        for network in table.parameters
+    }
+    return {
+        "networks": table.parameters,
+        "over_recordings": over,
+        "entries": [asdict(entry) for entry in table.entries],
+        "conventions": _words(table),
+    }
+
+
+def write_table(folder: Path, table: NetworkTable) -> list[Path]:
+    """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
+    from stario.fusion.evaluation.figures import figures
+    from stario.sequences.plots import save_figure
+
+    text = io.StringIO()
+    names = list(Entry.__dataclass_fields__)
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(entry) for entry in table.entries)
+    with atomic_write(folder / "networks.csv") as file:
+        file.write(text.getvalue())
+    write_json(folder / "networks.json", table_dict(table))
+    written = [folder / "networks.csv", folder / "networks.json"]
+    for name, figure in figures(table).items():
+        save_figure(figure, folder / name)
+        written.append(folder / name)
+    return written
+
+
+def _words(table: NetworkTable) -> dict[str, str]:
+    keys = ("ate_m", "rte_m", "pde", "alignment", "convention")
+    return {
+        **{key: CONVENTIONS[key] for key in keys},
+        "here": f"horizontal errors, alignment first, convention {table.convention}",
+        "mean": "over recordings, each counting alike; +- deviation over weights of one network",
+    }
+
+
+def _cell(mean: float, spread: float | None) -> str:
+    return f"{mean:.3f}" if spread is None else f"{mean:.3f}+-{spread:.3f}"
+
+
+def _tracks(
+    path: Path,
+    models: Models,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence],
+    convention: Convention,
+) -> tuple[list[Entry], Sample]:
+    sequence = read(path)
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+    entries: list[Entry] = []
+    shown: dict[str, Trajectory] = {}
+    for weights, model in models:
+        for protocol, track in _of_protocols(model, sequence, config):
+            found = evaluate_track(track, sequence.truth, convention=convention)
+            errors = found.ate_m, found.rte_m, found.pde
+            entries.append(Entry(sequence.name, model.name, weights, protocol, *errors))
+            if protocol == "network_true_attitude":
+                shown.setdefault(model.name, align(track, sequence.truth, "first"))
+    return entries, Sample(sequence.name, sequence.truth, shown)
+
+
+def _of_protocols(
+    model: DisplacementModel, sequence: ImuSequence, config: NavigatorConfig
+) -> Iterator[tuple[str, Trajectory]]:
+    navigator = Navigator(model, config)
+    observed = navigator.observe(sequence)
+    yield "network_true_attitude", network_track_true_attitude(model, sequence, config).trajectory
+    yield "network", network_track(observed).trajectory
+    yield "ekf", navigator.track(observed).trajectory

@@ -1,0 +1,163 @@
+"""Tracks to compare with the filter's: the IMU alone, and the network alone.
+
+The network's displacements become a track by taking each window's mean velocity as the velocity
+at its middle and integrating: every overlapping window counts alike.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.lie import exp_so3
+from stario.fusion.navigator import Observed, Predictor
+from stario.fusion.state import Track
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.windows import (
+    WINDOW_RATE,
+    WINDOW_SAMPLES,
+    WINDOW_SECONDS,
+    clean_samples,
+    imu_in_world,
+    runs,
+)
+
+
+def inertial_track(observed: Observed, config: NavigatorConfig) -> Track:
+    """Strapdown integration alone, from the levelled start at rest, biases taken as zero."""
+    began = perf_counter()
+    start = observed.intake.start
+    assert start is not None  # observe() refuses recordings without one
+    zero = np.zeros(3)
+    R, v, p = start.R_WB, zero, zero
+    rows = [(start.time, R, v, p)]
+    for epoch in observed.epochs:
+        if epoch.gap:
+            p = p + v * (epoch.stop - epoch.start)
+        else:
+            segment = preintegrate(
+                epoch.time, epoch.gyro, epoch.accel, zero, zero, config.noise, config.gravity
+            )
+            R, v, p = segment.predict(R, v, p, zero, zero)
+        rows.append((epoch.stop, R, v, p))
+    trajectory = Trajectory(
+        time=np.array([row[0] for row in rows]),
+        position_W=np.array([row[3] for row in rows]),
+        attitude_WB=Rotation.from_matrix(np.array([row[1] for row in rows])),
+        velocity_W=np.array([row[2] for row in rows]),
+    )
+    return Track(trajectory, seconds_filter=perf_counter() - began)
+
+
+def network_track(observed: Observed) -> Track:
+    """Displacements chained along the attitude that is levelled from the IMU, without truth."""
+    began = perf_counter()
+    start = observed.intake.start
+    assert start is not None  # observe() refuses recordings without one
+    time = np.array([start.time, *(e.stop for e in observed.epochs)])
+    attitude = np.stack([start.R_WB, *(e.R_NB for e in observed.epochs)])
+    known = [(e, m[0]) for e, m in zip(observed.epochs, observed.measurements, strict=True) if m]
+    middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in known])
+    velocity = np.array([d for _, d in known]) / WINDOW_SECONDS
+    trajectory = _chained(time, Rotation.from_matrix(attitude), middle, velocity)
+    return Track(
+        trajectory,
+        seconds_network=observed.seconds_network,
+        seconds_filter=observed.seconds_intake + perf_counter() - began,
+    )
+
+
+def network_track_true_attitude(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig
+) -> Track:
+    """The papers' protocol: windows rotated by the true attitude, displacements chained.
+
+    Where the truth has a gap its attitude is carried on by the gyroscope: a track that lacks the
+    displacements of seconds would tell of the gap and not of the network.
+
+    Raises:
+        InputError: the recording has no truth, or no second of it with valid truth.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
+    began = perf_counter()
+    truth = _carried_through_gaps(sequence, sequence.truth)
+    time, windows = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
+    prepared = perf_counter()
+    displacement = _along(model, time, windows, config.filter.window_updates)
+    done = perf_counter()
+    middle = time + 0.5 * WINDOW_SECONDS
+    ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
+    attitude = truth.at(ticks).attitude_WB
+    trajectory = _chained(ticks, attitude, middle, displacement / WINDOW_SECONDS)
+    return Track(
+        trajectory,
+        seconds_network=done - prepared,
+        seconds_filter=prepared - began + perf_counter() - done,
+    )
+
+
+def _along(
+    model: Predictor,
+    time: FloatArray,
+    windows: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
+    updates: int,
+) -> FloatArray:
+    """Displacements (M, 3) of windows that start at `time` (M,), a memory ending at each gap."""
+    network = AlongTrack(model, updates)
+    if not network.remembers:
+        return network.predict(windows)[0]
+    displacements = []
+    for part in np.split(windows, np.flatnonzero(np.diff(time) * updates > 1.5) + 1):
+        displacements.append(network.predict(part)[0])
+        network.restart()
+    return np.concatenate(displacements)
+
+
+def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
+    """Poses at the samples from the first to the last true one, without gaps in the attitude."""
+    time, gyro, _ = clean_samples(sequence)
+    known = np.flatnonzero(truth.covers(time))
+    if len(known) == 0:
+        raise InputError(f"{sequence.name}: truth", "none that is valid", "at least a second of it")
+    inside = slice(known[0], known[-1] + 1)
+    time, gyro = time[inside], gyro[inside]
+    poses = truth.at(time)
+    R_WB = poses.attitude_WB.as_matrix()
+    turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    for start, stop in runs(~truth.covers(time)):
+        for k in range(start, stop):
+            R_WB[k] = R_WB[k - 1] @ exp_so3(turns[k - 1])
+    return Trajectory(time, poses.position_W, Rotation.from_matrix(R_WB))
+
+
+def _true_windows(
+    sequence: ImuSequence, truth: Trajectory, period: float
+) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
+    """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
+    grid, imu_W, usable = imu_in_world(sequence, truth, "true")
+    bad_before = np.concatenate([[0], np.cumsum(~usable)])
+    stride = round(period * WINDOW_RATE)
+    starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)
+    starts = starts[bad_before[starts + WINDOW_SAMPLES] == bad_before[starts]]
+    if len(starts) == 0:
+        raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
+    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
+    return grid[starts], imu_W[rows].transpose(0, 2, 1)
+
+
+def _chained(
+    time: FloatArray, attitude: Rotation, middle: FloatArray, velocity: FloatArray
+) -> Trajectory:
+    """Integrate velocities known at the windows' middles to positions at `time`."""
+    columns = [np.interp(time, middle, velocity[:, k]) for k in range(3)]
+    at_time = np.stack(columns, axis=1)
+    steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return Trajectory(time, position, attitude, velocity_W=at_time)

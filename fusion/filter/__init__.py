@@ -1,0 +1,1 @@
+"""The state-cloning EKF and what surrounds it."""

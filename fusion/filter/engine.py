@@ -1,0 +1,199 @@
+"""Structured algebra on filterpy's `ExtendedKalmanFilter`: an error state, updated in place.
+
+filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
+(core rows against the clones, a symmetric update of the measurement's rank), with the same result;
+`benchmark.DenseEkf` runs filterpy's own algebra for comparison.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.linalg.blas import dgemm
+from scipy.linalg.lapack import dpotrf, dtrtri
+
+from stario.fusion.filter.jacobians import Block
+from stario.fusion.imu.preintegration import CORE
+from stario.fusion.lie import FloatArray
+
+GateMode = Literal["inflate", "reject"]
+
+_FAR_BETTER = 1e9
+"""A measurement of so many times less variance than the state's costs the difference its digits."""
+
+
+class UpdateResult(NamedTuple):
+    """What became of one measurement.
+
+    Attributes:
+        nis: normalised innovation squared under the covariance given, before any inflation;
+            not-a-number where it could not be computed.
+        dof: dimension of the measurement, the expectation of `nis`.
+        accepted: False where the state was left alone.
+        scale: factor by which the measurement covariance was inflated (1: not gated).
+        reason: why the measurement was refused; empty where it was accepted.
+        residual: (m,) measured minus predicted, None where the measurement made no sense.
+        sigma: (m,) standard deviations of the residual under the covariance given, likewise.
+    """
+
+    nis: float
+    dof: int
+    accepted: bool
+    scale: float = 1.0
+    reason: str = ""
+    residual: FloatArray | None = None
+    sigma: FloatArray | None = None
+
+
+class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy is untyped
+    """Covariance of an error state whose mean is zero between steps.
+
+    filterpy's `P`, `R`, `y`, `z`, `S`, `SI`, `K`, `log_likelihood`, `mahalanobis`, `x_post`,
+    `P_prior` and `P_post` describe the last step; `x` is the error's mean. Its `predict` and
+    `update` are the dense engine and not meant to be called from outside.
+
+    Args:
+        dim: size of the error state; the first `CORE` rows are the current state's.
+    """
+
+    def __init__(self, dim: int) -> None:
+        self._last_downdate: FloatArray | None = None
+        super().__init__(dim_x=dim, dim_z=3)
+        self.P = np.zeros((dim, dim))
+        self.Q = np.zeros((dim, dim))
+
+    def update_linear(
+        self,
+        residual: FloatArray,
+        blocks: Sequence[Block],
+        covariance: FloatArray,
+        gate: float | None = None,
+        gate_mode: GateMode = "inflate",
+    ) -> UpdateResult:
+        """Update with any measurement that is linear in the error.
+
+        Args:
+            residual: (m,) measured minus predicted.
+            blocks: Jacobian of the residual by the error (true minus estimate), as blocks
+                (first column, (m, width)); columns in no block are zero.
+            covariance: (m, m).
+            gate: NIS from which the measurement counts as an outlier, None for no gate.
+            gate_mode: "inflate" multiplies an outlier's covariance by NIS / gate, so that a run
+                of outliers can still pull a filter back that is itself wrong; "reject" drops it.
+
+        Returns:
+            What happened. Values that are not finite and covariances that are not positive
+            definite are refused with a reason; the state stays as it was.
+        """
+        m = len(residual)
+        if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
+            return UpdateResult(math.nan, m, False, reason="value that is not finite")
+        if dpotrf(covariance, lower=1)[1] != 0:
+            return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
+        HP = _sum([H @ self.P[first : first + H.shape[1]] for first, H in blocks])
+        HPH = _sum([HP[:, first : first + H.shape[1]] @ H.T for first, H in blocks])
+        whitener = _whitener(HPH + covariance)
+        white = whitener @ residual
+        nis = float(white @ white)
+        sigma = np.sqrt((HPH + covariance).diagonal())
+        scale = 1.0
+        if gate is not None and nis > gate:
+            if gate_mode == "reject":
+                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma)
+            scale = nis / gate
+            covariance = covariance * scale
+            whitener = _whitener(HPH + covariance)
+        if not math.isfinite(nis):
+            return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
+        self._correct(residual, blocks, covariance, HP, HPH, whitener)
+        self._inject()
+        return UpdateResult(nis, m, True, scale, "", residual, sigma)
+
+    def _inject(self) -> None:
+        """Move the error's mean `x` into the state and set it to zero."""
+        raise NotImplementedError
+
+    # --- filterpy's record of the last step ------------------------------------------------------
+
+    @property
+    def P_prior(self) -> FloatArray:
+        """Covariance before the last update; computed when asked, for a copy per step is dear."""
+        if self._last_downdate is None:
+            return np.array(self.P)
+        return np.asarray(self.P + self._last_downdate.T @ self._last_downdate)
+
+    @P_prior.setter
+    def P_prior(self, value: FloatArray) -> None:  # filterpy assigns it
+        pass
+
+    @property
+    def P_post(self) -> FloatArray:
+        """Covariance after the last step."""
+        return np.array(self.P)
+
+    @P_post.setter
+    def P_post(self, value: FloatArray) -> None:  # filterpy assigns it
+        pass
+
+    # --- structured algebra ----------------------------------------------------------------------
+
+    def _propagate_covariance(self, transition: FloatArray, noise: FloatArray) -> None:
+        P = self.P
+        P[:CORE] = transition @ P[:CORE]
+        P[CORE:, :CORE] = P[:CORE, CORE:].T
+        core = P[:CORE, :CORE] @ transition.T + noise
+        P[:CORE, :CORE] = 0.5 * (core + core.T)
+        self._last_downdate = None
+
+    def _correct(
+        self,
+        residual: FloatArray,
+        blocks: Sequence[Block],
+        covariance: FloatArray,
+        HP: FloatArray,
+        HPH: FloatArray,
+        whitener: FloatArray,
+    ) -> None:
+        """P - K S K^T as P - W^T W with W = L^-1 H P: symmetric, of the measurement's rank."""
+        W = whitener @ HP
+        self.R, self.S = covariance, HPH + covariance
+        self.SI = whitener.T @ whitener
+        self.K = (whitener.T @ W).T
+        self.y = self.z = residual[:, None]
+        self.x = self.K @ self.y
+        self.x_post = self.x
+        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
+            self._correct_as_joseph(blocks)
+        else:
+            # P is symmetric: its transpose is the same matrix in the order BLAS updates in place.
+            self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1, overwrite_c=1).T
+        self._last_downdate = W
+        self._log_likelihood = self._likelihood = self._mahalanobis = None
+
+    def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
+        """(I - K H) P (I - K H)^T + K R K^T: dearer, but no difference of large numbers."""
+        A = np.eye(self.dim_x)
+        for first, H in blocks:
+            A[:, first : first + H.shape[1]] -= self.K @ H
+        P = A @ self.P @ A.T + self.K @ self.R @ self.K.T
+        self.P = 0.5 * (P + P.T)
+
+
+def _sum(terms: list[FloatArray]) -> FloatArray:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total
+
+
+def _whitener(covariance: FloatArray) -> FloatArray:
+    """Inverse of the lower Cholesky factor; not-a-number where there is none."""
+    factor, failed = dpotrf(covariance, lower=1)
+    if failed:
+        return np.full_like(covariance, math.nan)
+    inverse: FloatArray = dtrtri(factor, lower=1)[0]
+    return inverse

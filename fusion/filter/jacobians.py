@@ -1,0 +1,124 @@
+"""Jacobians of the filter's measurements by its right-invariant error.
+
+Error state: theta, rho_v, rho_p, d_bg, d_ba of the current state, then theta, rho_p of each clone
+(see `preintegration` for their meaning). A Jacobian is a list of blocks; what is in no block is
+zero. All are derived in FUSION's notation: v = v^ + rho_v - [v^]x theta, likewise for position.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stario.fusion.imu.preintegration import CORE
+from stario.fusion.lie import FloatArray, skew
+
+CLONE = 6
+"""Size of the error state of one clone."""
+
+Block = tuple[int, FloatArray]
+"""First column of the error state a Jacobian block stands at, and the block (m, width)."""
+
+_ACCEL_BIAS = 12
+_EYE = np.eye(3)
+_LAST_EYE = np.eye(3, CLONE, k=3)
+_LAST_MINUS_EYE = -_LAST_EYE
+_LAST_EYE_CORE = np.eye(3, 9, k=6)
+
+
+def displacement_jacobian(
+    p_i_W: FloatArray, p_j_W: FloatArray, slot_i: int, slot_j: int | None
+) -> list[Block]:
+    """Jacobian of the residual of `StateCloningEkf.update_displacement`.
+
+    theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
+    column of the first block equals that of [p_j]x; written so, H times yaw is zero to the bit.
+    """
+    P_i, P_j = skew(np.array((p_i_W, p_j_W)))
+    H_i = _LAST_MINUS_EYE.copy()
+    H_i[:, :2], H_i[:, 2] = P_i[:, :2], P_j[:, 2]
+    H_j = (_LAST_EYE_CORE if slot_j is None else _LAST_EYE).copy()
+    H_j[:, :3] -= P_j
+    first_j = 0 if slot_j is None else CORE + CLONE * slot_j
+    return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
+
+
+def mean_velocity_jacobian(
+    v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
+) -> list[Block]:
+    """Jacobian of the residual of `StateCloningEkf.update_mean_velocity`.
+
+    With the mean m = v - gain and the force's part F of the gain, its errors -[F]x theta and
+    -R T/2 d_ba: theta -[v]x + [F]x - (e3 x m) e3^T, rho_v I, d_ba R T/2. Gravity being vertical,
+    the column of yaw is zero.
+
+    Args:
+        v_W: (3,) velocity now [m/s].
+        force_W: (3,) F [m/s].
+        R_WB: (3, 3) attitude.
+        seconds: length T of the window [s].
+    """
+    H = np.zeros((3, CLONE))
+    H[:, :2], H[:, 3:] = skew(force_W - v_W)[:, :2], _EYE
+    return [(0, H), (_ACCEL_BIAS, 0.5 * seconds * R_WB)]
+
+
+def position_jacobian(p_W: FloatArray) -> list[Block]:
+    """Jacobian of a position: theta -[p]x, rho_p I."""
+    H = _LAST_EYE_CORE.copy()
+    H[:, :3] = -skew(p_W)
+    return [(0, H)]
+
+
+def velocity_jacobian(v_W: FloatArray) -> list[Block]:
+    """Jacobian of a velocity in the true world: theta -[v]x, rho_v I."""
+    H = _LAST_EYE.copy()
+    H[:, :3] = -skew(v_W)
+    return [(0, H)]
+
+
+def heading_jacobian(R_WB: FloatArray) -> list[Block]:
+    """Jacobian (1, 3) of `yaw_twist` by theta.
+
+    With s = R10 - R01, c = R00 + R11 and R = (I + [theta]x) R^:
+    d yaw = theta_z + (theta_x (s R21 - c R20) - theta_y (c R21 + s R20)) / (s^2 + c^2).
+    """
+    s, c = _twist(R_WB)
+    r20, r21 = float(R_WB[2, 0]), float(R_WB[2, 1])
+    n = s * s + c * c
+    return [(0, np.array([[(s * r21 - c * r20) / n, -(c * r21 + s * r20) / n, 1.0]]))]
+
+
+def yaw_twist(R_WB: FloatArray) -> float:
+    """Yaw [rad] of the twist about the vertical, as `sequences.rotations.yaw_of`.
+
+    It stays defined when a device stands upright; not-a-number close to upside down, where it is
+    not defined.
+    """
+    s, c = _twist(R_WB)
+    return math.atan2(s, c) if s * s + c * c > _UPSIDE_DOWN else math.nan
+
+
+def in_plain_terms(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
+    """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
+
+    Args:
+        P: (..., n, n) of theta, then a rho for each vector, then whatever does not change.
+        vectors_W: (..., k, 3) velocity and position, or one of them.
+    """
+    A = skew(vectors_W).reshape(*vectors_W.shape[:-2], -1, 3)
+    stop = 3 + A.shape[-2]
+    plain = P.copy()
+    plain[..., 3:stop, :] -= A @ P[..., :3, :]
+    plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
+    # Far from the origin the products' rounding would leave it asymmetric.
+    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
+
+
+_UPSIDE_DOWN = 0.01
+"""s^2 + c^2 = (1 + cos tilt)^2 below which yaw means nothing: within 26 degrees of upside down."""
+
+
+def _twist(R: FloatArray) -> tuple[float, float]:
+    return float(R[1, 0] - R[0, 1]), float(R[0, 0] + R[1, 1])

@@ -1,0 +1,1 @@
+"""The factor graph: keyframes, factors, batch and fixed lag."""

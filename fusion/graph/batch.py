@@ -1,0 +1,145 @@
+"""The whole track at once: keyframes optimised together, the states between them filled in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.map_frame import UNKNOWN_YAW, WorldChange
+from stario.fusion.graph.builder import GraphBuilder, Taken
+from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.imu.preintegration import Segment
+from stario.fusion.lie import FloatArray, exp_so3, log_so3
+from stario.fusion.state import NavState
+
+_UNKNOWN_POSITION = 1e4
+"""Standard deviation of a position that only fixes tell [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A smoothed track.
+
+    Attributes:
+        states: as many as were given, at the same times.
+        note: one line on how it went, for the health report.
+        fell_back: whether the states are the filter's.
+    """
+
+    states: list[NavState]
+    note: str
+    fell_back: bool = False
+
+
+def smooth(
+    filtered: Sequence[NavState],
+    prior: NavState,
+    taken: Sequence[Taken],
+    changes: Sequence[WorldChange],
+    config: NavigatorConfig,
+    gyro_covariance: FloatArray | None = None,
+) -> Smoothed:
+    """Optimise a filtered track as a whole.
+
+    Args:
+        filtered: the filter's states in one world: the start and one for each epoch.
+        prior: the start before any fix moved or turned the world.
+        taken: what the filter took in, epoch by epoch.
+        changes: how fixes moved and turned the world since the start.
+        config: noise, filter and graph settings.
+        gyro_covariance: (3, 3) to which the gyroscope's bias is taken for zero beside the prior
+            (`gyro_prior`), None for not at all.
+
+    Returns:
+        The graph's states with their marginal covariances; those given where the graph does not
+        determine one.
+    """
+    origin = filtered[0].p_W  # near the track: see `StateCloningEkf`
+    local = [state.shifted(-origin) for state in filtered]
+    builder = GraphBuilder(config, _loosened(local[0], prior, changes))
+    for (epoch, measurement, fixes, held, segment), state in zip(taken, local[1:], strict=True):
+        near = [fix.shifted(-origin) for fix in fixes]
+        builder.step(epoch, measurement, near, held, state, segment)
+    builder.close(local[-1])
+    if gyro_covariance is not None:
+        builder.expect_gyro_bias(gyro_covariance)
+    try:
+        solution = builder.graph.solve()
+    except IndeterminateError as error:
+        return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
+    solved = {state.time: state for state in filled(builder.graph, builder.segments)}
+    states = [
+        replace(solved[f.time], in_gap=f.in_gap, world=f.world).shifted(origin) for f in filtered
+    ]
+    note = (
+        f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
+        f"{solution.weighed_down} measurements weighed down"
+    )
+    return Smoothed(states, note)
+
+
+def _loosened(first: NavState, prior: NavState, changes: Sequence[WorldChange]) -> NavState:
+    """The prior in the last world: what fixes told of position and yaw is theirs to tell again."""
+    changes = [change for change in changes if change.since <= first.time]
+    if not changes:
+        return replace(first, covariance=prior.covariance)
+    turn = first.R_WB @ prior.R_WB.T
+    to_last = np.kron(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), turn)
+    to_last[9:, 9:] = np.eye(6)
+    covariance = to_last @ prior.covariance @ to_last.T
+    if any(change.placed for change in changes):
+        covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
+    if not all(change.placed for change in changes):
+        covariance[2, 2] += UNKNOWN_YAW**2
+    return replace(first, covariance=covariance)
+
+
+def filled(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:
+    """The keyframes of a solved graph and the states at the ends of the segments between them."""
+    keyframes = graph.keyframes
+    states = [graph.state(keyframes[0])]
+    for i in keyframes[:-1]:
+        start, end = states[-1], graph.state(i + 1)
+        if len(segments[i]) > 1:
+            states += _between(start, end, segments[i])
+        states.append(end)
+    return states
+
+
+def _between(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
+    """The states inside an interval, by the IMU from its start, bent to meet its end.
+
+    What is missing at the end comes from white noise all along: the angle grows with time, the
+    position along the cubic that leaves with no error and arrives with both (Hermite).
+    """
+    R, v, p = start.R_WB, start.v_W, start.p_W
+    rows = []
+    for segment in segments:
+        R, v, p = segment.predict(R, v, p, start.b_g, start.b_a)
+        rows.append((segment.stop, R, v, p))
+    duration = end.time - start.time
+    turn, dv, dp = log_so3(end.R_WB @ R.T), end.v_W - v, end.p_W - p
+    states = []
+    for time, R, v, p in rows[:-1]:
+        s = (time - start.time) / duration
+        along = s * s * (3.0 - 2.0 * s) * dp + duration * s * s * (s - 1.0) * dv
+        speed = 6.0 * s * (1.0 - s) / duration * dp + s * (3.0 * s - 2.0) * dv
+        states.append(
+            NavState(
+                time,
+                exp_so3(s * turn) @ R,
+                v + speed,
+                p + along,
+                _mix(start.b_g, end.b_g, s),
+                _mix(start.b_a, end.b_a, s),
+                _mix(start.covariance, end.covariance, s),
+            )
+        )
+    return states
+
+
+def _mix(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
+    return np.asarray((1.0 - s) * a + s * b)

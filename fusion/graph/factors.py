@@ -1,0 +1,326 @@
+"""What the graph's keyframes are measured by, each linearised by hand.
+
+Every term gives its residual (measured minus predicted) and the Jacobians of what it predicts; the
+graph whitens them, weighs down what may be an outlier and hands gtsam a `JacobianFactor` in C++,
+anew in every round of the optimisation. gtsam's own factors would do for position and velocity
+alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt.
+
+Tangent of a keyframe, as gtsam's: pose R exp(w), p + R dp in the order w, dp; velocity additive;
+biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from stario.fusion.filter.estimator import yaw_between
+from stario.fusion.imu.preintegration import CORE
+from stario.fusion.lie import FloatArray, log_se23, skew
+
+_EYE = np.eye(3)
+
+
+class Linearised(NamedTuple):
+    """Residual (m,) of a term and the Jacobian blocks (key, (m, width)) of its prediction."""
+
+    residual: FloatArray
+    blocks: list[tuple[int, FloatArray]]
+
+
+class Term(Protocol):
+    """A measurement of one keyframe or several."""
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Numbers of the keyframes it measures, in order."""
+        ...
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(m, m), in the axes of the residual."""
+        ...
+
+    def linearise(self, values: Any) -> Linearised:
+        """At gtsam `Values`."""
+        ...
+
+
+class KeyframeState(NamedTuple):
+    """A keyframe's state."""
+
+    R_WB: FloatArray
+    """(3, 3)."""
+    v_W: FloatArray
+    """(3,) [m/s]."""
+    p_W: FloatArray
+    """(3,) [m]."""
+    b_g: FloatArray
+    """(3,) [rad/s]."""
+    b_a: FloatArray
+    """(3,) [m/s^2]."""
+
+    @classmethod
+    def of(cls, values: Any, k: int) -> KeyframeState:
+        """Keyframe k in gtsam `Values`."""
+        pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
+        return cls(
+            pose.rotation().matrix(),
+            values.atVector(V(k)),
+            pose.translation(),
+            bias.gyroscope(),
+            bias.accelerometer(),
+        )
+
+    def insert_into(self, values: Any, k: int) -> None:
+        """Make this keyframe k of gtsam `Values`."""
+        values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
+        values.insert(V(k), self.v_W)
+        values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
+
+    def error_from(self, other: KeyframeState) -> FloatArray:
+        """Right-invariant error (15,) about another: theta, rho_v, rho_p, b_g, b_a."""
+        R = self.R_WB @ other.R_WB.T
+        pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
+        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
+
+    def invariant_from_local(self) -> FloatArray:
+        """(15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
+        matrix = np.zeros((CORE, CORE))
+        matrix[0:3, 0:3] = self.R_WB
+        matrix[3:6, 0:3] = skew(self.v_W) @ self.R_WB
+        matrix[3:6, 6:9] = _EYE
+        matrix[6:9, 0:3] = skew(self.p_W) @ self.R_WB
+        matrix[6:9, 3:6] = self.R_WB
+        matrix[9:12, 12:15] = _EYE
+        matrix[12:15, 9:12] = _EYE
+        return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of successive keyframes together: root error = offset, white with a norm of 1.
+
+    The error is right-invariant, so that a turn about the vertical and a shift are the same
+    directions wherever the keyframes have moved since: what was marginalised cannot come to know
+    yaw by being linearised elsewhere than the rest of the graph. In gtsam's own tangent it does,
+    and a stream's yaw then is reported twice as certain as it is.
+
+    Attributes:
+        k: the first of the keyframes.
+        about: n states, of keyframe k and those behind it, that the error is counted from.
+        root: (m, 15 n).
+        offset: (m,).
+    """
+
+    k: int
+    about: tuple[KeyframeState, ...]
+    root: FloatArray
+    offset: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """All of them."""
+        return tuple(range(self.k, self.k + len(self.about)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """It is white already."""
+        return np.eye(len(self.offset))
+
+    def linearise(self, values: Any) -> Linearised:
+        """In the rows of the root."""
+        residual, blocks = self.offset, []
+        for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
+            root = self.root[:, CORE * n : CORE * (n + 1)]
+            state = KeyframeState.of(values, k)
+            residual = residual - root @ state.error_from(about)
+            H = root @ state.invariant_from_local()
+            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
+        return Linearised(residual, blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """The network's displacement from keyframe i to keyframe j.
+
+    The network saw the window in a levelled frame N, whose yaw against the world is that of
+    R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
+    pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also learn
+    tilt from it, which on some recordings doubles the error.
+
+    Attributes:
+        i: keyframe at the window's start.
+        j: keyframe at its end.
+        d_N: (3,) [m].
+        R_NB: (3, 3) levelled attitude at the window's start.
+        covariance: (3, 3) [m^2] in N.
+    """
+
+    i: int
+    j: int
+    d_N: FloatArray
+    R_NB: FloatArray
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Start and end of the window."""
+        return self.i, self.j
+
+    def linearise(self, values: Any) -> Linearised:
+        """In the axes of N."""
+        (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
+        R_NW = yaw_between(R_i, self.R_NB).T
+        way = p_j - p_i
+        H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
+        sideways = np.array([-way[1], way[0], 0.0])  # e3 x (p_j - p_i)
+        H_i[:, :3] = -np.outer(R_NW @ sideways, R_i[2])
+        H_i[:, 3:] = -R_NW @ R_i
+        H_j[:, 3:] = R_NW @ R_j
+        return Linearised(self.d_N - R_NW @ way, [(X(self.i), H_i), (X(self.j), H_j)])
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """A position some time after a keyframe: p_k + dt v_k + shift_W.
+
+    Attributes:
+        k: keyframe before the measurement.
+        p_W: (3,) [m].
+        covariance: (3, 3) [m^2].
+        dt: time since the keyframe [s].
+        shift_W: (3,) what the IMU adds to p_k + dt v_k until then [m].
+    """
+
+    k: int
+    p_W: FloatArray
+    covariance: FloatArray
+    dt: float
+    shift_W: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The one before."""
+        return (self.k,)
+
+    def linearise(self, values: Any) -> Linearised:
+        """In W."""
+        R, p = _pose(values, self.k)
+        predicted = p + self.dt * values.atVector(V(self.k)) + self.shift_W
+        H = np.zeros((3, 6))
+        H[:, 3:] = R
+        return Linearised(self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)])
+
+
+@dataclass(frozen=True, eq=False)
+class Velocity:
+    """A velocity some time after a keyframe: v_k + gain_W.
+
+    Attributes:
+        k: keyframe before the measurement.
+        v_W: (3,) [m/s].
+        covariance: (3, 3) [m^2/s^2].
+        gain_W: (3,) what the IMU adds until then [m/s].
+    """
+
+    k: int
+    v_W: FloatArray
+    covariance: FloatArray
+    gain_W: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The one before."""
+        return (self.k,)
+
+    def linearise(self, values: Any) -> Linearised:
+        """In W."""
+        predicted = values.atVector(V(self.k)) + self.gain_W
+        return Linearised(self.v_W - predicted, [(V(self.k), _EYE)])
+
+
+@dataclass(frozen=True, eq=False)
+class Heading:
+    """A yaw some time after a keyframe, at any attitude of the device.
+
+    Attributes:
+        k: keyframe before the measurement.
+        R_WB: (3, 3) attitude of the keyframe that explains the measurement: the one estimated,
+            turned about the vertical by measured minus estimated yaw.
+        covariance: (1, 1) [rad^2].
+    """
+
+    k: int
+    R_WB: FloatArray
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The one before."""
+        return (self.k,)
+
+    def linearise(self, values: Any) -> Linearised:
+        """About the vertical."""
+        R, _ = _pose(values, self.k)
+        turn = self.R_WB @ R.T
+        residual = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        H = np.zeros((1, 6))
+        H[0, :3] = R[2]
+        return Linearised(np.array([residual]), [(X(self.k), H)])
+
+
+@dataclass(frozen=True, eq=False)
+class GyroBias:
+    """The gyroscope's bias, read while the device rests.
+
+    Attributes:
+        k: keyframe.
+        b_g: (3,) [rad/s].
+        covariance: (3, 3) [rad^2/s^2].
+    """
+
+    k: int
+    b_g: FloatArray
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The one."""
+        return (self.k,)
+
+    def linearise(self, values: Any) -> Linearised:
+        """In B."""
+        residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
+        return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
+
+
+_KINDS: dict[str, Any] = {
+    kind.__name__: kind for kind in (Prior, Displacement, Position, Velocity, Heading, GyroBias)
+}
+
+
+def dumped(term: Term) -> tuple[str, dict[str, Any]]:
+    """A term's kind and fields: arrays, numbers and, for a prior, the list of its states."""
+    values = {n: [list(s) for s in v] if n == "about" else v for n, v in vars(term).items()}
+    return type(term).__name__, values
+
+
+def loaded(kind: str, values: dict[str, Any]) -> Term:
+    """A term from what `dumped` gave."""
+    known = {
+        name: tuple(KeyframeState(*s) for s in v) if name == "about" else v
+        for name, v in values.items()
+    }
+    term: Term = _KINDS[kind](**known)
+    return term
+
+
+def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:
+    pose = values.atPose3(X(k))
+    return pose.rotation().matrix(), pose.translation()

@@ -1,0 +1,1 @@
+"""The front end: raw samples checked, cut into intervals and preintegrated."""

@@ -1,0 +1,130 @@
+"""What the intake hands on: epochs of samples, where they start, and what became of the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.fusion.imu.outliers import FINE, Flags
+from stario.fusion.state import Health
+from stario.sequences.sequence import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the filter begins: the first sample's time, and what `GravityStart` knows of it."""
+
+    time: float
+    R_WB: FloatArray
+    still: bool
+    force: float
+
+
+@dataclass(frozen=True, eq=False)
+class Epoch:
+    """The stretch between two times of the grid.
+
+    Attributes:
+        time: (n + 1,) sample times, first and last are the grid's [s].
+        gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
+        accel: (n + 1, 3) [m/s^2] in B, likewise.
+        gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
+        anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
+        flags: whether samples of either sensor are saturated or were spikes.
+        suspect: whether samples of the window's are.
+        attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
+        R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
+        update: whether windows begin and end at this epoch's end.
+        window: (6, 200) the network's input that ends here, None where there is none.
+        R_NB_window: (3, 3) levelled attitude at the window's start.
+    """
+
+    time: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+    gap: bool
+    attitudes: FloatArray
+    R_NB: FloatArray
+    update: bool = False
+    window: NDArray[np.float32] | None = None
+    R_NB_window: FloatArray | None = None
+    anew: Start | None = None
+    flags: Flags = FINE
+    suspect: bool = False
+
+    def dump(self) -> dict[str, Any]:
+        """What an estimator needs of it, as arrays, numbers and None, for `loaded`."""
+        known = {item.name: getattr(self, item.name) for item in fields(self)}
+        anew = None if self.anew is None else vars(self.anew)
+        dropped = {"attitudes": None, "window": None}
+        return known | {"anew": anew, "flags": list(self.flags)} | dropped
+
+    @staticmethod
+    def loaded(dump: dict[str, Any]) -> Epoch:
+        """The epoch of a `dump`; its window and attitudes, which the network saw, are gone."""
+        anew = None if dump["anew"] is None else Start(**dump["anew"])
+        seen = {"anew": anew, "flags": Flags(*dump["flags"]), "attitudes": np.empty((0, 3, 3))}
+        return Epoch(**(dump | seen))
+
+    @property
+    def start(self) -> float:
+        """Its first time [s]."""
+        return float(self.time[0])
+
+    @property
+    def stop(self) -> float:
+        """Its last time [s]."""
+        return float(self.time[-1])
+
+
+GAPS_LISTED = 100
+"""How many gaps are kept one by one: an endless stream may have any number."""
+
+
+@dataclass
+class IntakeCounts:
+    """What became of the samples.
+
+    Attributes:
+        used: samples taken in.
+        not_finite: dropped for a value that is not a number, infinite or absurdly large.
+        duplicate: dropped for repeating the newest time.
+        out_of_order: dropped for a time before the newest.
+        future: dropped for a time ahead of those that followed.
+        spike: used, but replaced for standing off its neighbours.
+        saturated: used, but at the sensor's limit.
+        gap_count: stretches without samples that were not bridged.
+        longest_gap: of them [s].
+        gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
+    """
+
+    used: int = 0
+    not_finite: int = 0
+    duplicate: int = 0
+    out_of_order: int = 0
+    future: int = 0
+    spike: int = 0
+    saturated: int = 0
+    gap_count: int = 0
+    longest_gap: float = 0.0
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+
+    def add_gap(self, start: float, length: float) -> None:
+        """Count a stretch without samples [s]."""
+        self.gap_count += 1
+        self.longest_gap = max(self.longest_gap, length)
+        self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
+
+    def health(self) -> Health:
+        """The part of the report that tells of the samples."""
+        names = ("used", "not_finite", "duplicate", "out_of_order", "future")
+        return Health(
+            samples={name: getattr(self, name) for name in names},
+            flagged={"spike": self.spike, "saturated": self.saturated},
+            gap_count=self.gap_count,
+            longest_gap=self.longest_gap,
+            gaps=list(self.gaps),
+        )

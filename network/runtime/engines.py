@@ -1,0 +1,129 @@
+"""What computes a network: PyTorch from weights, ONNX Runtime from an exported file.
+
+Both answer windows with displacement and log sigma. A network with a memory (RNIN) also takes the
+state that a window left, and gives the one that the next window takes up.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stario.network.displacement import DisplacementNetwork
+from stario.network.runtime.inference import inference_form
+from stario.sequences.errors import InputError
+
+Float32Array = NDArray[np.float32]
+
+Answer = tuple[Float32Array, Float32Array, Float32Array | None]
+"""Displacement (B, 3) [m], log sigma (B, 3), and the state after these windows."""
+
+_BATCH = 64
+
+
+class Engine(Protocol):
+    """What a model needs of the thing that computes."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the network has a state that goes from window to window."""
+        ...
+
+    @property
+    def training_form(self) -> DisplacementNetwork:
+        """The network with weights that can be trained."""
+        ...
+
+    def first_state(self) -> Float32Array:
+        """The state (2, 1, H) before the first window, of a network that remembers."""
+        ...
+
+    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
+        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        ...
+
+
+class TorchEngine:
+    """PyTorch on the CPU, in the network's fastest form.
+
+    Args:
+        network: with its weights; it is left in evaluation mode.
+    """
+
+    def __init__(self, network: DisplacementNetwork) -> None:
+        self._training_form = network.eval()
+        self._network = inference_form(network)
+
+    @property
+    def training_form(self) -> DisplacementNetwork:
+        """The network with weights that can be trained, in evaluation mode."""
+        return self._training_form
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the network has a state that goes from window to window."""
+        return self._network.remembers
+
+    def first_state(self) -> Float32Array:
+        """The state (2, 1, H) before the first window, of a network that remembers."""
+        return self._network.first_state(1).numpy()
+
+    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
+        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        tensor = torch.from_numpy(windows)
+        with torch.inference_mode():
+            if state is not None:
+                mean, log_sigma, after = self._network.step(tensor, torch.from_numpy(state))
+                return mean.numpy(), log_sigma.numpy(), after.numpy()
+            parts = [self._network(part) for part in torch.split(tensor, _BATCH)]
+        mean = torch.cat([m for m, _ in parts])
+        return mean.numpy(), torch.cat([s for _, s in parts]).numpy(), None
+
+
+class OnnxEngine:
+    """ONNX Runtime on the CPU.
+
+    Args:
+        session: an `onnxruntime.InferenceSession` on a graph that `export_onnx` wrote.
+    """
+
+    def __init__(self, session: Any) -> None:
+        self._session = session
+        shapes = {node.name: node.shape for node in session.get_inputs()}
+        self._state_size = int(shapes["state"][2]) if "state" in shapes else 0
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the network has a state that goes from window to window."""
+        return self._state_size > 0
+
+    def first_state(self) -> Float32Array:
+        """The state (2, 1, H) before the first window, of a network that remembers."""
+        return np.zeros((2, 1, self._state_size), np.float32)
+
+    @property
+    def training_form(self) -> DisplacementNetwork:
+        """There is none.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError("model", "an exported graph", "a safetensors file of weights")
+
+    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
+        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        if state is not None:
+            mean, log_sigma, after = self._session.run(None, {"windows": windows, "state": state})
+            return mean, log_sigma, after
+        parts = []
+        for begin in range(0, len(windows), _BATCH):
+            feed = {"windows": windows[begin : begin + _BATCH]}
+            if self.remembers:
+                shape = (2, len(feed["windows"]), self._state_size)
+                feed["state"] = np.zeros(shape, np.float32)
+            parts.append(self._session.run(["displacement", "log_sigma"], feed))
+        mean, log_sigma = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return mean, log_sigma, None

@@ -1,0 +1,28 @@
+"""The inference form of a network: the same numbers, faster on a CPU."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from stario.network.runtime.fast_stario import FastStarIO
+from stario.network.runtime.folding import folded
+from stario.network.stario import StarIO
+
+if TYPE_CHECKING:
+    from stario.network.displacement import DisplacementNetwork
+
+
+def inference_form(network: DisplacementNetwork) -> DisplacementNetwork:
+    """A copy of a network in evaluation mode, in the form that runs fastest.
+
+    Its outputs agree to 1e-5; weights that change later do not reach it. StarIO becomes
+    `FastStarIO`; others get their batch norms folded into their convolutions.
+
+    Args:
+        network: (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3); it is left in
+            evaluation mode.
+    """
+    inner = network.eval().network
+    fast = FastStarIO(inner) if isinstance(inner, StarIO) else folded(inner)
+    # The same centring and clamping around the faster network.
+    return type(network)(fast).eval()

@@ -1,0 +1,221 @@
+"""Random windows cut from world-frame streams, and what is done to them before a network learns.
+
+Everything works on whole batches: a training step draws start points, a replay speed, a yaw, a
+tilt, biases, noise and a mirror image for each window at once. Sources: yaw, tilt and biases after
+TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics, and so is a device
+that is swung about a point beside it (`stario.network.training.lever_arm`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stario.network.training.lever_arm import draw_swing, swung
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How far windows are varied.
+
+    Attributes:
+        speeds: range of the replay speed; a window replayed s times as fast has angular rates x s,
+            linear accelerations x s^2, and covers s seconds of the recording.
+        replayed: share of windows that are replayed; the others keep speed 1.
+        swung: share of windows in which the device is swung besides.
+        swing_rate: largest angular rate of a swing [rad/s].
+        lever: largest distance of the device from the point it is swung about [m].
+        tilt: largest error of the gravity direction [rad], about a random horizontal axis.
+        gyro_bias: half-width of the uniform bias [rad/s].
+        accel_bias: half-width of the uniform bias [m/s^2].
+        gyro_noise: largest deviation of white noise on the 200 Hz samples [rad/s].
+        accel_noise: largest deviation of white noise on the 200 Hz samples [m/s^2].
+    """
+
+    speeds: tuple[float, float] = (0.6, 1.8)
+    replayed: float = 0.4
+    swung: float = 0.35
+    swing_rate: float = 2.5
+    lever: float = 0.35
+    tilt: float = 0.05
+    gyro_bias: float = 0.03
+    accel_bias: float = 0.15
+    gyro_noise: float = 0.01
+    accel_noise: float = 0.08
+
+    def __post_init__(self) -> None:
+        if not _is_range(self.speeds):
+            raise ConfigError("speeds", repr(self.speeds), "two factors, slow then fast, above 0")
+        for item in fields(self)[1:]:
+            value = getattr(self, item.name)
+            if not (isinstance(value, int | float) and 0.0 <= value < 100.0):
+                raise ConfigError(item.name, repr(value), "a finite number >= 0")
+
+
+def _is_range(speeds: object) -> bool:
+    match speeds:
+        case (int() | float() as slow, int() | float() as fast):
+            return 0.0 < slow <= fast <= 10.0
+    return False
+
+
+def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
+    """Samples that a stream must have for windows in a row at the fastest replay."""
+    # Windows that are not replayed keep speed 1.
+    return math.ceil(successive * WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
+
+
+class WindowSampler:
+    """Draws augmented training batches from streams, each stream weighted.
+
+    Streams may be memory-mapped: a batch reads the stretches it is cut from, nothing is kept.
+
+    Args:
+        streams: at least one, each longer than a window at the fastest replay.
+        weights: relative frequency of each stream per second of it.
+        augmentation: how far windows are varied.
+        seed: of all randomness.
+        successive: windows in a row, one second apart, that are drawn and varied as one.
+
+    Raises:
+        InputError: a stream is too short.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[WorldStream],
+        weights: Sequence[float],
+        augmentation: Augmentation,
+        seed: int,
+        successive: int = 1,
+    ) -> None:
+        self.augmentation = augmentation
+        self._successive = successive
+        reach = reach_of(augmentation, successive)
+        for stream in streams:
+            if len(stream) < reach:
+                found = f"a stretch of {len(stream)} samples"
+                raise InputError(stream.name, found, f"at least {reach}, the fastest replay's")
+        self._streams = streams
+        self._reach = reach
+        self._first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
+        self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
+        share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
+        self._cumulative = (share / share.sum()).cumsum(0)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def batch(self, size: int) -> tuple[Tensor, Tensor]:
+        """Windows (size, 6, 200) and displacements (size, 3) [m], augmented.
+
+        More than one in a row come as (size, K, 6, 200) and (size, K, 3).
+        """
+        uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
+        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._first) - 1)
+        # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
+        offset = (self._uniform(size).double() * self._starts[stream]).floor()
+        speed = self._speeds(size)
+        # Samples count through all streams, as the draws of a seed always have.
+        start = self._first[stream].double() + offset
+        steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
+        at = start[:, None] + steps * speed[:, None].double()
+        imu_W, position_W = self._pieces(stream.tolist(), offset.long().tolist())
+        imu = _lerp(imu_W, start, at[:, :-1])
+        ends = _lerp(position_W, start, at[:, ::WINDOW_SAMPLES])
+        imu, displacement = self._vary(_replayed(imu, speed), ends.diff(dim=1))
+        if self._successive == 1:
+            return imu.transpose(1, 2).contiguous(), displacement.squeeze(1)
+        windows = imu.view(size, self._successive, WINDOW_SAMPLES, 6)
+        return windows.transpose(2, 3).contiguous(), displacement
+
+    def _pieces(self, streams: list[int], offsets: list[int]) -> tuple[Tensor, Tensor]:
+        """Stretches (B, reach, 6) and (B, reach, 3): all that is read from a memory-mapped file."""
+        imu = np.empty((len(streams), self._reach, 6), dtype=np.float32)
+        position = np.empty((len(streams), self._reach, 3), dtype=np.float32)
+        for row, (stream, offset) in enumerate(zip(streams, offsets, strict=True)):
+            imu[row] = self._streams[stream].imu_W[offset : offset + self._reach]
+            position[row] = self._streams[stream].position_W[offset : offset + self._reach]
+        return torch.from_numpy(imu), torch.from_numpy(position)
+
+    def _speeds(self, size: int) -> Tensor:
+        low, high = self.augmentation.speeds
+        speed = low + (high - low) * self._uniform(size)
+        return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
+
+    def _vary(self, imu: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Mirror, turn, tilt, bias and noise of imu (B, 200 K, 6), displacements (B, K, 3)."""
+        a = self.augmentation
+        size = len(imu)
+        mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
+        imu, displacement = _mirrored(imu, displacement, mirror)
+        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
+        imu, displacement = swung(imu, displacement, swings)
+        R_yaw = _about_z(self._symmetric(size) * torch.pi)
+        R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
+        turned = imu.view(size, -1, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)
+        imu = turned.reshape(size, -1, 6)
+        limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
+        deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
+        imu = imu + (self._symmetric(size, 6) * limits).unsqueeze(1)
+        white = torch.randn(imu.shape, generator=self.generator)
+        imu = imu + white * (self._uniform(size)[:, None, None] ** 2 * deviations)
+        return imu, displacement @ R_yaw.mT
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator)
+
+    def _symmetric(self, *shape: int) -> Tensor:
+        return 2.0 * self._uniform(*shape) - 1.0
+
+
+def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
+    """Rates x s; linear accelerations x s^2 with gravity as it is."""
+    s = speed[:, None, None]
+    gravity = torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
+    accel = (imu[..., 3:] - gravity) * s**2 + gravity
+    return torch.cat([imu[..., :3] * s, accel], dim=2)
+
+
+def _mirrored(imu: Tensor, displacement: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
+    """Image in the vertical x-z plane where sign is -1: rates are axial vectors, the rest polar."""
+    one = torch.ones_like(sign)
+    factors = torch.stack([sign, one, sign, one, sign, one], dim=1)
+    return imu * factors.unsqueeze(1), displacement * factors[:, None, 3:]
+
+
+def _about_z(yaw: Tensor) -> Tensor:
+    cos, sin, zero, one = yaw.cos(), yaw.sin(), torch.zeros_like(yaw), torch.ones_like(yaw)
+    rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=1)
+    return rows.view(-1, 3, 3)
+
+
+def _small_tilt(angles: Tensor) -> Tensor:
+    """Rotation by the horizontal rotation vector (B, 2) [rad]."""
+    zero = torch.zeros_like(angles[:, 0])
+    x, y = angles[:, 0], angles[:, 1]
+    skew = torch.stack([zero, zero, y, zero, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
+    R: Tensor = torch.linalg.matrix_exp(skew)
+    return R
+
+
+def _lerp(pieces: Tensor, start: Tensor, at: Tensor) -> Tensor:
+    """Rows of pieces (B, reach, K), which begin at `start` (B,), at indices `at` (B, M).
+
+    Returns:
+        (B, M, K).
+    """
+    size, reach, _ = pieces.shape
+    last = start.long()[:, None] + reach - 2
+    left = at.floor().long().minimum(last)
+    weight = (at - left).float().unsqueeze(-1)
+    local = left - start.long()[:, None] + reach * torch.arange(size)[:, None]
+    rows = pieces.view(size * reach, -1)
+    here, there = (rows.index_select(0, k.flatten()).view(*k.shape, -1) for k in (local, local + 1))
+    return here * (1.0 - weight) + there * weight

@@ -1,0 +1,89 @@
+"""Checkpoints of a training run: one safetensors file, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+from torch import Tensor
+
+from stario.network.training.config import TrainingConfig
+from stario.sequences.errors import ConfigError, ReadError
+from stario.sequences.files import atomic_write
+
+
+def write_checkpoint(
+    path: Path,
+    config: TrainingConfig,
+    material: str,
+    step: int,
+    history: list[dict[str, Any]],
+    tensors: Mapping[str, Tensor],
+) -> None:
+    """Write everything that a run needs to go on.
+
+    Args:
+        path: of the file.
+        config: the run's recipe.
+        material: what tells the recordings it learns from and the weights it began with.
+        step: steps done.
+        history: reports of the epochs so far, as plain values.
+        tensors: by name.
+    """
+    metadata = {
+        "config": json.dumps(asdict(config)),
+        "material": material,
+        "step": str(step),
+        "history": json.dumps(history),
+    }
+    whole = {k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}
+    with atomic_write(path, "wb") as file:
+        file.write(safetensors.torch.save(whole, metadata=metadata))
+
+
+def read_checkpoint(
+    path: Path, config: TrainingConfig, material: str
+) -> tuple[int, list[dict[str, Any]], dict[str, Tensor]]:
+    """The steps done, the history and the tensors of a run with this recipe and material.
+
+    Raises:
+        ConfigError: the file was written by another recipe, or by one that learned from others.
+        ReadError: it cannot be read.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except safetensors.SafetensorError as error:
+        raise ReadError(path, "checkpoint", str(error), "a whole checkpoint") from error
+    if not metadata or "config" not in metadata:
+        raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of this command")
+    _check_same(path, json.loads(metadata["config"]), config)
+    # Checkpoints older than this do not tell.
+    if metadata.get("material", material) != material:
+        raise ConfigError(
+            str(path),
+            "a run on other recordings, or from other first weights",
+            "those of this run",
+            "resume with the same ones or train into another folder (--out)",
+        )
+    return int(metadata["step"]), json.loads(metadata["history"]), tensors
+
+
+def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
+    expected = json.loads(json.dumps(asdict(config)))
+    # Checkpoints older than these settings are of runs without them.
+    found = {"successive": 1, "attitude": "true", **found}
+    for name in expected:
+        if found.get(name) != expected[name]:
+            raise ConfigError(
+                f"{path}: {name}",
+                repr(found.get(name)),
+                f"{expected[name]!r} as in this run",
+                "resume with the same settings or train into another folder",
+            )

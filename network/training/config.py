@@ -1,0 +1,168 @@
+"""The training recipe: one for every network, its loss and its schedule.
+
+The mean is learned by squared error from first to last. Sigma joins later, by the Gaussian
+likelihood e^2 / (2 sigma^2) + log sigma of the mean's error as it stands (detached): the joint
+likelihood, also weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
+sigma is large, and it is the large errors that a track is made of.
+
+The rate warms up and falls along a cosine as a function of the step alone, so a run that is killed
+and resumed follows the same schedule.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+import torch
+from torch import Tensor
+
+from stario.network.architectures import ARCHITECTURES
+from stario.network.training.augment import Augmentation
+from stario.sequences.errors import ConfigError
+from stario.sequences.windows import Attitude
+
+NETWORK_SETTINGS: dict[str, dict[str, object]] = {
+    # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 walks of ten seconds.
+    "RNIN": {"successive": 10, "batch": 250},
+}
+"""Settings that a network's own paper asks for, over the recipe's defaults."""
+
+SIGMA_WEIGHT = 0.05
+"""Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
+
+_RANGES = (
+    ("rate", 1e-8, 1.0),
+    ("warm_up", 0.0, 1.0),
+    ("weight_decay", 0.0, 1.0),
+    ("likelihood_from", 0.0, 1.0),
+    ("clip", 1e-6, 1e6),
+    ("average", 0.0, 1.0),
+)
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The recipe.
+
+    Attributes:
+        architecture: name of the network.
+        epochs: passes of `epoch_windows` windows.
+        epoch_windows: windows drawn between two validations.
+        batch: windows per step.
+        rate: peak learning rate (Adam with decoupled weight decay).
+        warm_up: share of the steps with a rising rate.
+        weight_decay: decoupled.
+        dropout: share of the head's features that is silenced; None leaves it to the network.
+        likelihood_from: share of the steps after which sigma is learned too.
+        clip: largest norm of the gradient.
+        average: decay of the running average of the weights per step.
+        patience: epochs without a better validation error after which training stops.
+        precision: "float32" or "bfloat16" (mixed; nearly twice as fast where there is support).
+        device: "auto", "cpu" or "cuda".
+        attitude: by which windows are turned into the world: "levelled" by the IMU, as in use, or
+            "true", the papers' protocol.
+        successive: windows in a row, one second apart, that a step draws from one place; more than
+            one only for a network that remembers earlier windows.
+        seed: of initial weights, draws and dropout.
+        augmentation: how windows are varied.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    architecture: str = "StarIO"
+    epochs: int = 60
+    epoch_windows: int = 43_008
+    batch: int = 256
+    rate: float = 1e-3
+    warm_up: float = 0.05
+    weight_decay: float = 1e-4
+    dropout: float | None = None
+    likelihood_from: float = 0.6
+    clip: float = 1.0
+    average: float = 0.998
+    patience: int = 20
+    precision: str = "float32"
+    device: str = "auto"
+    attitude: Attitude = "levelled"
+    successive: int = 1
+    seed: int = 0
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "epoch_windows", "batch", "patience", "successive"):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= 1):
+                raise ConfigError(name, repr(value), "a count of at least 1")
+        for name, low, high in _RANGES:
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and low <= value <= high):
+                raise ConfigError(name, repr(value), f"a number from {low} to {high}")
+        if self.architecture not in ARCHITECTURES:
+            known = f"one of {', '.join(ARCHITECTURES)}"
+            raise ConfigError("architecture", repr(self.architecture), known)
+        if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
+            raise ConfigError("seed", repr(self.seed), "a count from 0 to below 2^31")
+        dropout = 0.0 if self.dropout is None else self.dropout
+        if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
+            raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ConfigError("precision", repr(self.precision), "float32 or bfloat16")
+        if self.batch % self.successive:
+            raise ConfigError(
+                "batch", str(self.batch), f"a multiple of successive={self.successive}"
+            )
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ConfigError("device", repr(self.device), "auto, cpu or cuda")
+        if self.attitude not in ("levelled", "true"):
+            raise ConfigError("attitude", repr(self.attitude), "levelled or true")
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Steps between two validations."""
+        return max(1, self.epoch_windows // self.batch)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the whole run."""
+        return self.epochs * self.steps_per_epoch
+
+
+def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
+    """Squared errors (B, 3) [m^2] and the likelihood of sigma given them, side by side."""
+    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
+    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
+
+
+def learning_rate(config: TrainingConfig, step: int) -> float:
+    """Linear warm-up, then a cosine down to a hundredth of the peak."""
+    warm = config.warm_up * config.steps
+    if step < warm:
+        return config.rate * (step + 1) / max(warm, 1.0)
+    progress = (step - warm) / max(config.steps - warm, 1.0)
+    return config.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * progress)))
+
+
+def training_config(values: dict[str, object]) -> TrainingConfig:
+    """A recipe from plain values (a parsed JSON file), unknown keys refused.
+
+    Raises:
+        ConfigError: a key is unknown or a value out of range.
+    """
+    known = {f.name for f in fields(TrainingConfig)}
+    for name in values:
+        if name not in known:
+            raise ConfigError(name, "unknown key", f"one of {', '.join(sorted(known))}")
+    architecture = values.get("architecture", TrainingConfig.architecture)
+    values = {**NETWORK_SETTINGS.get(str(architecture), {}), **values}
+    augmentation = values.pop("augmentation", {})
+    if not isinstance(augmentation, dict):
+        raise ConfigError("augmentation", repr(augmentation), "a table of values")
+    allowed = {f.name for f in fields(Augmentation)}
+    for name in augmentation:
+        if name not in allowed:
+            raise ConfigError(f"augmentation.{name}", "unknown key", f"one of {sorted(allowed)}")
+    if isinstance(augmentation.get("speeds"), list):
+        augmentation = {**augmentation, "speeds": tuple(augmentation["speeds"])}
+    return TrainingConfig(augmentation=Augmentation(**augmentation), **values)  # type: ignore[arg-type]

@@ -1,0 +1,339 @@
+"""Training: on CPU or GPU, in one process or several, resumable from its checkpoint.
+
+What is evaluated and saved is the running average of the weights.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from stario.network.architectures import architecture, build_network
+from stario.network.card import Calibration, Card
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import DisplacementModel, save_model
+from stario.network.training.augment import WindowSampler, reach_of
+from stario.network.training.calibrate import calibrate
+from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
+from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
+from stario.network.training.parallel import Workers, workers
+from stario.network.training.validation import ValidationSet
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.files import atomic_write
+from stario.sequences.windows import WorldStream
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class EpochReport:
+    """What one epoch ended with; errors are mean squared displacement errors [m^2]."""
+
+    epoch: int
+    training_error: float
+    validation_error: float
+    validation_by_recording: dict[str, float]
+
+
+def train(
+    config: TrainingConfig,
+    streams: Sequence[WorldStream],
+    weights: Sequence[float],
+    validation: Sequence[WorldStream],
+    folder: Path,
+    on_step: Callable[[int, float], None] = lambda step, loss: None,
+    on_epoch: Callable[[EpochReport], None] = lambda report: None,
+    trained_on: Sequence[str] = (),
+    start_from: DisplacementModel | None = None,
+    keep_calibration: bool = False,
+) -> Path:
+    """Train a network, continuing from the folder's checkpoint where there is one.
+
+    Args:
+        config: the recipe; a checkpoint made with another one is refused.
+        streams: training stretches.
+        weights: relative frequency of each stretch per second of it.
+        validation: stretches that choose the weights and calibrate the covariance.
+        folder: receives `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
+        on_step: called after each step with the step and its loss, for a progress bar.
+        on_epoch: called after each validation.
+        trained_on: words for the card.
+        start_from: a model whose weights are the first ones.
+        keep_calibration: keep that model's calibration, for a last stage that learns from the
+            validation recordings as well: their errors then say nothing any more.
+
+    Returns:
+        Path of the model's weights.
+
+    Raises:
+        InputError: no stretch to learn from or to validate on, or the loss of a step is not
+            finite. The folder then holds the last epoch's checkpoint, as it was.
+        ConfigError: the checkpoint belongs to another recipe or other recordings, or the batch
+            cannot be shared out to the processes that the launcher started.
+    """
+    if not streams or not validation:
+        raise InputError("streams", "none", "stretches of at least 2 s with truth")
+    with workers(config.device, config.batch // config.successive) as these:
+        sampler = _sampler(config, streams, weights)
+        material = _material([streams, validation], weights, start_from)
+        run = _Run(config, sampler, material, folder, these)
+        if start_from is not None:
+            run.start_from(start_from)
+        run.resume()
+        if run.step >= config.steps:
+            log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
+        held_out = ValidationSet(validation, run.device)
+        while run.step < config.steps and run.epochs_since_best() < config.patience:
+            report = run.report(run.epoch(on_step), held_out)
+            run.record(report)
+            if these.leads:
+                on_epoch(report)
+        calibration = start_from.card.calibration if start_from and keep_calibration else None
+        return run.finish(held_out, list(trained_on), calibration)
+
+
+class _Run:
+    """State of a training run: network, optimiser, averaged weights, history."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        sampler: WindowSampler,
+        material: str,
+        folder: Path,
+        workers: Workers,
+    ) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.sampler, self.folder = config, sampler, folder
+        self.workers, self.device, self._material = workers, workers.device, material
+        self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
+        self._checkpoint = folder / "checkpoint.safetensors"
+        if config.dropout is not None:
+            _set_dropout(self.network, config.dropout)
+        self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
+        self.averaged.load_state_dict(self.network.state_dict())
+        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), config.rate, weight_decay=config.weight_decay
+        )
+        self._shared = workers.wrapped(
+            self.network, idle=architecture(config.architecture).heads > 1
+        )
+        if not workers.leads:
+            torch.manual_seed(config.seed + workers.rank)  # dropout of its own
+        self.step = 0
+        self.history: list[EpochReport] = []
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def start_from(self, model: DisplacementModel) -> None:
+        """Begin with a model's weights.
+
+        Raises:
+            ConfigError: it is of another architecture.
+        """
+        if model.card.architecture != self.config.architecture:
+            raise ConfigError(
+                "architecture", model.card.architecture, f"{self.config.architecture} as trained"
+            )
+        state = model.training_form.state_dict()
+        self.network.load_state_dict(state)
+        self.averaged.load_state_dict(state)
+        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+
+    def epoch(self, on_step: Callable[[int, float], None]) -> float:
+        """One epoch; returns the mean squared error on its (augmented) windows."""
+        self.network.train()
+        errors = []
+        for _ in range(self.config.steps_per_epoch):
+            errors.append(self._one_step())
+            on_step(self.step, errors[-1])
+        return self.workers.mean(float(np.mean(errors)))
+
+    def _one_step(self) -> float:
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.config, self.step)
+        drawn = self.sampler.batch(self.config.batch // self.config.successive)
+        windows, target = (self.workers.share(part).to(self.device) for part in drawn)
+        if not self.network.remembers:
+            windows = windows.flatten(0, -3)
+        mixed = self.config.precision == "bfloat16"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
+            mean, log_sigma = (part.flatten(0, -2) for part in self._shared(windows))
+        squared = (mean - target.flatten(0, -2)) ** 2
+        likelihood = self.step >= self.config.likelihood_from * self.config.steps
+        loss = loss_with_sigma(squared, log_sigma) if likelihood else squared.sum(1).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        self._check_finite(float(loss.detach()), float(norm))
+        self.optimiser.step()
+        self.step += 1
+        self._average()
+        return float(squared.detach().sum(1).mean())
+
+    def _check_finite(self, loss: float, norm: float) -> None:
+        """Stop before a step that would spoil every weight.
+
+        The gradient's norm is looked at as well: it is infinite one step before the loss is, and
+        the processes have it in common, so that all of them stop.
+        """
+        if math.isfinite(loss) and math.isfinite(norm):
+            return
+        raise InputError(
+            "loss",
+            f"{loss:g} with a gradient of norm {norm:g} in step {self.step + 1}",
+            "finite numbers",
+            f"train in another folder with a `rate` below {self.config.rate:g}",
+        )
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        decay = min(self.config.average, (1 + self.step) / (10 + self.step))
+        current = self.network.state_dict()
+        for name, value in self.averaged.state_dict().items():
+            if value.is_floating_point():
+                value.lerp_(current[name], 1.0 - decay)
+            else:
+                value.copy_(current[name])
+
+    def epochs_since_best(self) -> int:
+        """Epochs since the smallest validation error; one that is not finite is never smaller.
+
+        Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
+        with it count.
+        """
+        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
+        errors = [_or_infinite(r.validation_error) for r in self.history]
+        if len(errors) >= first:
+            errors = errors[first - 1 :]
+        return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
+
+    def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
+        """Validate an epoch: the leading process alone, the others are told."""
+        errors = held_out.errors(self.averaged) if self.workers.leads else {}
+        return EpochReport(
+            epoch=self.step // self.config.steps_per_epoch,
+            training_error=training_error,
+            validation_error=self.workers.agreed(float(np.mean(list(errors.values()) or [0.0]))),
+            validation_by_recording=errors,
+        )
+
+    def record(self, report: EpochReport) -> None:
+        """Keep the best weights and write checkpoint and log."""
+        self.history.append(report)
+        if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
+            self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+        if not self.workers.leads:
+            return
+        self._write_checkpoint()
+        with atomic_write(self.folder / "log.json") as file:
+            file.write(json.dumps([asdict(r) for r in self.history], indent=1))
+
+    def _write_checkpoint(self) -> None:
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
+        tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
+        tensors |= {f"best.{k}": v for k, v in self.best.items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{index}.{k}": v for k, v in state.items()}
+        tensors["random.sampler"] = self.sampler.generator.get_state()
+        tensors["random.torch"] = torch.get_rng_state()
+        history = [asdict(r) for r in self.history]
+        write_checkpoint(self._checkpoint, self.config, self._material, self.step, history, tensors)
+
+    def resume(self) -> None:
+        """Continue from the folder's checkpoint, if there is one.
+
+        Raises:
+            ConfigError: it was written by another recipe, or learned from other recordings.
+            ReadError: it cannot be read.
+        """
+        if not self._checkpoint.exists():
+            return
+        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
+        self.history = [EpochReport(**report) for report in history]
+        self._restore(tensors)
+        log.info("resumed %s at step %d", self._checkpoint, self.step)
+
+    def _restore(self, tensors: dict[str, Tensor]) -> None:
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+
+        self.network.load_state_dict(part("network."))
+        self.averaged.load_state_dict(part("averaged."))
+        self.best = {k: v.to(self.device) for k, v in part("best.").items()}
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in part("optimiser.").items():
+            index, key = name.split(".", 1)
+            state.setdefault(int(index), {})[key] = value
+        whole = self.optimiser.state_dict()
+        self.optimiser.load_state_dict({**whole, "state": state})
+        self.sampler.generator.set_state(tensors["random.sampler"])
+        if self.workers.leads:
+            torch.set_rng_state(tensors["random.torch"])
+        else:
+            torch.manual_seed(self.config.seed + self.workers.rank + self.step)
+
+    def finish(
+        self, held_out: ValidationSet, trained_on: list[str], kept: Calibration | None
+    ) -> Path:
+        """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
+        path = self.folder / "model.safetensors"
+        if not self.workers.leads:
+            return path
+        self.averaged.load_state_dict(self.best)
+        card = Card(
+            architecture=self.config.architecture,
+            calibration=kept or calibrate(*held_out.residuals(self.averaged)),
+            trained_on=trained_on,
+            recipe=json.loads(json.dumps(asdict(self.config))),
+            figures={"validation_mse_m2": held_out.errors(self.averaged)},
+        )
+        save_model(path, self.averaged, card)
+        return path
+
+
+def _sampler(
+    config: TrainingConfig, streams: Sequence[WorldStream], weights: Sequence[float]
+) -> WindowSampler:
+    """Of the streams that are long enough for as many windows in a row as the recipe draws."""
+    reach = reach_of(config.augmentation, config.successive)
+    if config.successive > 1:
+        pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= reach]
+        if not pairs:
+            raise InputError("streams", "none long enough", f"one of {reach} samples at 200 Hz")
+        streams, weights = [s for s, _ in pairs], [w for _, w in pairs]
+    return WindowSampler(streams, weights, config.augmentation, config.seed, config.successive)
+
+
+def _material(
+    streams: Sequence[Sequence[WorldStream]],
+    weights: Sequence[float],
+    start_from: DisplacementModel | None,
+) -> str:
+    """Digest of what a run learns from, is validated on and begins with."""
+    told = [
+        [[(stream.name, len(stream)) for stream in part] for part in streams],
+        [f"{weight:.6g}" for weight in weights],
+        start_from.card.sha256 if start_from else "",
+    ]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+
+def _or_infinite(error: float) -> float:
+    """NumPy takes what is not a number for the smallest."""
+    return error if math.isfinite(error) else math.inf
+
+
+def _set_dropout(network: nn.Module, share: float) -> None:
+    for module in network.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = share

@@ -1,0 +1,1 @@
+"""Simulated walks and the IMU that would have been carried along them."""

@@ -1,0 +1,275 @@
+"""How a walking person carries a device: its motion against the person, in the heading frame H.
+
+H has x forward, y left, z up and its origin on the floor below the person. Every carry gives the
+device's offset in H [m] and its turn against a neutral attitude as a rotation vector in H [rad].
+A gait repeats with the stride (two steps); with phase phi the step's angle, so that phi / 2 is
+the stride's, the trunk rises and falls with phi, sways with phi / 2, surges with phi, and each
+heel strike rings at 5 to 12 Hz through the body.
+
+The phases between these are those of people, with some spread, never arbitrary: they are what
+tells forward from backward. The trunk is highest at mid-stance (phi = 0), slowest there as well
+(kinetic energy has become potential), and every heel strike brakes it (Cavagna et al., 1976).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.sequence import FloatArray
+from stario.sequences.simulation.routes import band_noise, drift, smoothed
+
+_STRIKE_HARMONICS = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Gait:
+    """What the carries see of the walk.
+
+    Attributes:
+        rng: source of every draw.
+        rate: of the samples [Hz].
+        phase: (N,) the step's angle [rad], 2 pi per step.
+        step_rate: (N,) [Hz].
+        effort: (N,) 0 standing to about 1 at a brisk walk of 1.4 m/s.
+        speed: (N,) over the floor [m/s].
+        height: of the person [m].
+        vigor: of the person: 1 is common, arms swing and heels strike in proportion.
+    """
+
+    rng: np.random.Generator
+    rate: float
+    phase: FloatArray
+    step_rate: FloatArray
+    effort: FloatArray
+    speed: FloatArray
+    height: float
+    vigor: float
+
+    def __len__(self) -> int:
+        return len(self.phase)
+
+
+@dataclass(frozen=True, eq=False)
+class CarryMotion:
+    """Offset in H (N, 3) [m] and turn against the neutral attitude in H (N, 3) [rad]."""
+
+    offset_H: FloatArray
+    turn_H: FloatArray
+
+
+def trunk(gait: Gait) -> FloatArray:
+    """Motion (N, 3) of the trunk in H [m]: bounce at the step rate, sway at half of it, surge.
+
+    The bounce follows the inverted pendulum: a step of length L on legs of length l lifts the
+    trunk by L^2 / (8 l), of which knees and ankles take about a third (Zijlstra & Hof, 2003).
+    """
+    rng, phi = gait.rng, gait.phase
+    bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
+    rise = 0.5 * bounce * gait.effort * step_length(gait) ** 2 / (8.0 * 0.53 * gait.height)
+    shift = rng.uniform(-np.pi, np.pi, 4)
+    shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest where highest
+    z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
+    y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
+    x = 0.012 * surge * gait.effort * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
+    return np.stack([x, y, z], axis=1)
+
+
+def step_length(gait: Gait) -> FloatArray:
+    """Length (N,) of a step [m]: speed over step rate."""
+    return gait.speed / gait.step_rate
+
+
+def heel_strikes(gait: Gait, strength: float) -> FloatArray:
+    """Displacement (N, 3) in H [m] of the ringing that heel strikes excite in what is carried.
+
+    An oscillator with its resonance at 5 to 9 Hz, kicked once a step: harmonic n of the step
+    gets the oscillator's response at n times the step rate. `strength` [m/s^2] is about the
+    deviation of the vertical acceleration at effort 1.
+    """
+    rng = gait.rng
+    resonance, damping = rng.uniform([4.5, 0.15], [9.0, 0.45])
+    tilt = np.array([rng.normal(-0.4, 0.15), rng.normal(0.0, 0.2), 1.0])  # strikes brake
+    typical = float(np.median(gait.step_rate))
+    n = np.arange(2, _STRIKE_HARMONICS + 1)
+    ratio = n * typical / resonance
+    response = 1.0 / (1.0 - ratio**2 + 2j * damping * ratio)
+    response *= np.exp(-((n * typical / 14.0) ** 2))
+    response *= np.sqrt(2.0) * strength / np.sqrt(np.sum(np.abs(response) ** 2))
+    ring = np.zeros((len(gait), 3))
+    for k, gain in zip(n, response, strict=True):
+        amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
+        # The strike comes half a step after mid-stance.
+        angle = k * (gait.phase - np.pi) + np.angle(gain)
+        stray = rng.uniform(-0.4, 0.4, 3)
+        ring += (amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray) * tilt
+    return gait.vigor * ring
+
+
+def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMotion:
+    """Shared by what is held steady: trunk and strikes, wobble with the gait, tremor of the hand.
+
+    `tremor` [rad/s] is the rate of the turning tremor, `wobble` [rad] the turn with the gait.
+    """
+    rng, n = gait.rng, len(gait)
+    offset = trunk(gait) + heel_strikes(gait, strength)
+    offset += 0.012 * drift(rng, n, gait.rate, 0.6, 3)
+    turn = 0.08 * drift(rng, n, gait.rate, 0.7, 3)
+    turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
+    turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
+    shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
+    for k, order in enumerate((0.5, 1.0)):
+        swing = np.cos(order * gait.phase[:, None] + shift[k]) * size[k]
+        turn += wobble * gait.effort[:, None] * swing
+    # The hand shakes the device about its wrist as well: a tremor of a tenth of m/s^2.
+    offset += 0.12 / (2.0 * np.pi * 8.0) ** 2 * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
+    return CarryMotion(offset, turn)
+
+
+def _handheld(gait: Gait) -> CarryMotion:
+    rng = gait.rng
+    strength = 0.2 * np.exp(rng.uniform(0.0, 2.0))
+    motion = _held(gait, strength, rng.uniform(0.08, 0.25), rng.uniform(0.01, 0.03))
+    place = np.array([rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height])
+    return CarryMotion(motion.offset_H + place, motion.turn_H)
+
+
+def _call(gait: Gait) -> CarryMotion:
+    rng, n = gait.rng, len(gait)
+    motion = _held(gait, rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.15), rng.uniform(0.01, 0.03))
+    head = 0.35 * drift(rng, n, gait.rate, 1.0)
+    arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
+    offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
+    turn = motion.turn_H + np.stack([0 * head, 0 * head, head], axis=1)
+    return CarryMotion(offset, turn)
+
+
+def _swinging(gait: Gait) -> CarryMotion:
+    rng, n = gait.rng, len(gait)
+    amplitude = np.radians(rng.uniform(12.0, 30.0)) * np.sqrt(gait.vigor)
+    forward = np.radians(rng.uniform(0.0, 12.0))
+    angle = _pendulum(gait, amplitude, forward, harmonic=0.12)
+    side = rng.choice([-1.0, 1.0])
+    arm = np.array([0.0, 0.0, -0.38 * gait.height])
+    shoulder = np.array([0.0, side * 0.13 * gait.height, 0.81 * gait.height])
+    offset = shoulder + _about(1, -angle, arm) + trunk(gait)
+    offset += heel_strikes(gait, rng.uniform(0.4, 1.2)) + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
+    twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
+    roll = 0.08 * drift(rng, n, gait.rate, 0.7)
+    turn = np.stack([roll, -angle, twist], axis=1)
+    turn += 0.15 / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
+    return CarryMotion(offset, turn)
+
+
+def _pocket(gait: Gait) -> CarryMotion:
+    rng, n = gait.rng, len(gait)
+    amplitude = np.radians(rng.uniform(14.0, 24.0)) * np.sqrt(gait.vigor)
+    angle = _pendulum(gait, amplitude, np.radians(rng.uniform(0.0, 12.0)), harmonic=0.3)
+    thigh = np.array([0.08, 0.0, -rng.uniform(0.08, 0.16) * gait.height])
+    hip = np.array([0.0, rng.choice([-1.0, 1.0]) * 0.1, 0.52 * gait.height])
+    offset = hip + _about(1, -angle, thigh) + trunk(gait)
+    offset += heel_strikes(gait, rng.uniform(1.0, 2.2))
+    shift = rng.uniform(-0.7, 0.7, 2)
+    yaw = 0.1 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
+    roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
+    turn = np.stack([roll, -angle, yaw], axis=1)
+    turn += _slap(gait, rng.uniform(0.15, 0.5))
+    return CarryMotion(offset, turn)
+
+
+def _bag(gait: Gait) -> CarryMotion:
+    rng, n = gait.rng, len(gait)
+    hang, sway = rng.uniform([0.0, 0.02], [0.4, 0.1])
+    shift = rng.uniform(-0.7, 0.7, 3)
+    stride = np.cos(gait.phase[:, None] / 2.0 + shift)
+    turn = sway * gait.effort[:, None] * stride * np.array([1.0, 0.5, 0.8])
+    turn += 0.02 * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
+    turn += 0.04 * drift(rng, n, gait.rate, 1.0, 3) + _slap(gait, rng.uniform(0.05, 0.3))
+    body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
+    strap = np.array([0.0, 0.0, -hang])
+    offset = body + np.cross(turn, strap) + strap + trunk(gait)
+    return CarryMotion(offset + heel_strikes(gait, rng.uniform(0.3, 1.2)), turn)
+
+
+def _trolley(gait: Gait) -> CarryMotion:
+    """No gait: wheels rumble on the floor, with the speed, at 10 to 30 Hz."""
+    rng, n = gait.rng, len(gait)
+    rolling = np.clip(gait.speed / 0.8, 0.0, 2.0)[:, None]
+    centre = min(rng.uniform(12.0, 22.0), 0.25 * gait.rate)
+    strength = rng.uniform(0.2, 0.6)
+    rumble = band_noise(rng, n, gait.rate, 0.75 * centre, 1.3 * centre, 6)
+    rough = 1.0 + 0.3 * drift(rng, n, gait.rate, 0.5, 1)
+    rumble = rumble * rolling * rough * strength
+    axes = np.array([0.5, 0.5, 1.0])
+    offset = rumble[:, :3] * axes / (2.0 * np.pi * centre) ** 2
+    turn = 0.06 * rumble[:, 3:] / (2.0 * np.pi * centre)
+    turn += 0.004 * drift(rng, n, gait.rate, 0.8, 3)
+    place = np.array([0.6, 0.0, rng.uniform(0.4, 1.0)])
+    # The push pulses a little with the steps of whoever walks behind.
+    offset[:, 0] += 0.003 * gait.effort * np.cos(gait.phase)
+    return CarryMotion(offset + place, turn)
+
+
+def _rig(gait: Gait) -> CarryMotion:
+    """Looked around with: quick turns to random directions, arms waved by up to their length."""
+    rng, n = gait.rng, len(gait)
+    motion = _held(gait, rng.uniform(0.2, 0.6), rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
+    reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
+    waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)
+    lively = 0.5 * (1.0 + np.tanh(1.5 + 1.5 * drift(rng, n, gait.rate, 3.0, 1)))
+    looks = _looks(gait, np.array([0.5, 0.5, 0.9]) * rng.uniform(0.5, 1.2))
+    offset = np.array([0.3, 0.0, 0.75 * gait.height]) + reach * np.tanh(waved) * lively
+    return CarryMotion(motion.offset_H + offset, motion.turn_H + looks)
+
+
+CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
+    "handheld": _handheld,
+    "call": _call,
+    "swinging": _swinging,
+    "pocket": _pocket,
+    "bag": _bag,
+    "trolley": _trolley,
+    "rig": _rig,
+}
+"""Every way to carry, by name."""
+
+
+def _looks(gait: Gait, spread: FloatArray) -> FloatArray:
+    """Rotation vectors (N, 3) that rest at random directions and turn to the next ones."""
+    rng, n = gait.rng, len(gait)
+    pause = rng.uniform(0.5, 1.6)
+    targets = rng.normal(0.0, 1.0, (int(n / gait.rate / 0.25) + 2, 3)) * spread
+    targets = np.clip(targets, -1.8 * spread, 1.8 * spread)
+    rests = np.cumsum(rng.exponential(pause, len(targets)) + 0.25)
+    held = targets[np.minimum(np.searchsorted(rests, np.arange(n) / gait.rate), len(targets) - 1)]
+    return smoothed(held, gait.rate, rng.uniform(0.18, 0.3))
+
+
+def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> FloatArray:
+    """Angle (N,) [rad] of a limb that swings with the stride about a resting angle `forward`."""
+    rng, n = gait.rng, len(gait)
+    size = amplitude * np.minimum(gait.effort, 1.2) * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
+    stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
+    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-0.5, 0.5))
+    restless = 0.03 * drift(rng, n, gait.rate, 0.6)
+    return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
+
+
+def _slap(gait: Gait, rate_deviation: float) -> FloatArray:
+    """Turns (N, 3) [rad] of a loose device at a step's harmonics, of about so many rad/s."""
+    turn = np.zeros((len(gait), 3))
+    for k in range(2, 6):
+        shift = gait.rng.uniform(-np.pi, np.pi, 3)
+        size = rate_deviation * np.sqrt(0.5) * gait.rng.uniform(0.3, 1.0, 3)
+        amplitude = (gait.effort / (2.0 * np.pi * k * gait.step_rate))[:, None]
+        turn += amplitude * size * np.cos(k * gait.phase[:, None] + shift)
+    return turn
+
+
+def _about(axis: int, angle: FloatArray, lever: FloatArray) -> FloatArray:
+    """The vector `lever` (3,) turned by `angle` (N,) about an axis of H: (N, 3)."""
+    e = np.eye(3)[axis]
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return np.asarray(c * lever + s * np.cross(e, lever) + (1.0 - c) * e * np.dot(e, lever))

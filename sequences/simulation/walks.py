@@ -1,0 +1,181 @@
+"""Generated walks of a person with a device, to drive the simulator; every walk from a seed.
+
+A walk is a route (where the person goes), a gait tied to its speed, and a way to carry the device
+(how it moves against the person). Speed v, step length L and step rate f hang together as in
+people: L grows in proportion to f, so v = f L = k h f^2 with the height h, and one of them
+follows from another.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.simulation.carrying import CARRIES, CarryMotion, Gait
+from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
+
+CARRY_WAYS = tuple(CARRIES)
+"""Names of the ways to carry a device."""
+
+_SLOWEST_STEP_RATE = 0.8
+"""Steps per second of a person who barely moves [Hz]."""
+
+_BRISK = 1.4
+"""Speed [m/s] at which the gait has its full strength."""
+
+_CHANGE = 0.6
+"""Deviation of the Gaussian step from one way to carry to the next [s]."""
+
+
+@dataclass(frozen=True)
+class WalkStyle:
+    """Who walks, and how the device is carried.
+
+    Attributes:
+        carry: one of `CARRY_WAYS`.
+        next_carry: the way to carry after a change within the walk; empty for none.
+        height: of the person [m].
+        step_constant: k of speed = k height step_rate^2 [s]: who takes long steps has a large k.
+        preferred_speed: [m/s].
+        vigor: strength of arm swing and heel strike, 1 is common.
+        mount_rotvec: rotation of the device against its neutral attitude [rad], any.
+
+    Raises:
+        InputError: a way to carry is unknown or a value is out of range.
+    """
+
+    carry: str = "handheld"
+    next_carry: str = ""
+    height: float = 1.75
+    step_constant: float = 0.225
+    preferred_speed: float = 1.2
+    vigor: float = 1.0
+    mount_rotvec: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, known in (("carry", CARRY_WAYS), ("next_carry", (*CARRY_WAYS, ""))):
+            if getattr(self, name) not in known:
+                raise InputError(name, repr(getattr(self, name)), f"one of {', '.join(CARRY_WAYS)}")
+        for name, low, high in _RANGES:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(name, repr(value), f"a value from {low} to {high}")
+        if len(self.mount_rotvec) != 3 or not all(map(math.isfinite, self.mount_rotvec)):
+            raise InputError("mount_rotvec", repr(self.mount_rotvec), "three finite angles [rad]")
+
+    @staticmethod
+    def random(rng: np.random.Generator) -> WalkStyle:
+        """Draw a person, a way to carry (every third walk changes it) and a mount."""
+        carry = str(rng.choice(CARRY_WAYS, p=_ODDS))
+        # Nobody puts the device onto wheels, or off them, within a step or two.
+        others = [way for way in CARRY_WAYS if way not in (carry, "trolley")]
+        changes = carry != "trolley" and rng.random() < 1.0 / 3.0
+        x, y, z = Rotation.random(rng=rng).as_rotvec()
+        return WalkStyle(
+            carry=carry,
+            next_carry=str(rng.choice(others)) if changes else "",
+            height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
+            step_constant=float(np.clip(rng.normal(0.225, 0.02), 0.17, 0.28)),
+            preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
+            vigor=float(rng.uniform(0.6, 1.5)),
+            mount_rotvec=(float(x), float(y), float(z)),
+        )
+
+
+_RANGES = (
+    ("height", 1.0, 2.5),
+    ("step_constant", 0.1, 0.4),
+    ("preferred_speed", 0.3, 2.2),
+    ("vigor", 0.0, 3.0),
+)
+
+_ODDS = (0.28, 0.09, 0.15, 0.14, 0.1, 0.1, 0.14)
+"""How often each way to carry is drawn, in the order of `CARRY_WAYS`."""
+
+
+def generate_walk(
+    seed: int, duration: float = 60.0, rate: float = 100.0, style: WalkStyle | None = None
+) -> Trajectory:
+    """Generate the trajectory of a carried device.
+
+    Args:
+        seed: of every draw; the same seed gives the same walk.
+        duration: [s], at least 1.
+        rate: of the poses [Hz], at least 50, so that heel strikes are drawn and not aliased.
+        style: of the person and the carry; None draws one.
+
+    Returns:
+        Poses of the device in a world whose origin is the start on the floor.
+
+    Raises:
+        InputError: duration or rate out of range.
+    """
+    if not (math.isfinite(duration) and duration >= 1.0):
+        raise InputError("duration", repr(duration), "a finite duration of at least 1 s")
+    if not (math.isfinite(rate) and rate >= 50.0):
+        raise InputError("rate", repr(rate), "a finite rate of at least 50 Hz")
+    rng = np.random.default_rng(seed)
+    style = WalkStyle.random(rng) if style is None else style
+    count = round(duration * rate) + 1
+    wheels = style.carry == "trolley"
+    route = random_route(rng, count, rate, style.preferred_speed, wheels)
+    gait = _gait(rng, rate, route, style)
+    motion = _carried(gait, style)
+    R_WH = about_z(route.heading)
+    R_HD = Rotation.from_rotvec(motion.turn_H) * Rotation.from_rotvec(style.mount_rotvec)
+    return Trajectory(
+        time=np.arange(count) / rate,
+        position_W=route.position_W + R_WH.apply(motion.offset_H),
+        attitude_WB=R_WH * R_HD,
+    )
+
+
+def step_rate(speed: FloatArray, style: WalkStyle) -> FloatArray:
+    """Step rate (N,) [Hz] at a speed (N,) [m/s]."""
+    return np.sqrt(speed / (style.step_constant * style.height))
+
+
+def _gait(rng: np.random.Generator, rate: float, route: Route, style: WalkStyle) -> Gait:
+    n = len(route.heading)
+    # Turning on the spot takes steps as well: a person's feet move on a circle of 0.3 m.
+    moving = np.hypot(route.speed, 0.3 * route.turn_rate)
+    uneven = 1.0 + 0.025 * drift(rng, n, rate, 0.4)
+    stairs = np.abs(route.climb) / RISER
+    wanted = np.stack([step_rate(moving, style), stairs, np.full(n, _SLOWEST_STEP_RATE)])
+    steps = uneven * np.sum(wanted**8, axis=0) ** 0.125  # the largest of the three, smoothly
+    strength = 1.0 + 0.1 * drift(rng, n, rate, 0.5)
+    # Below 0.2 m/s a person shuffles: the gait fades out towards standing.
+    pace = np.hypot(moving, 0.8 * stairs)
+    fade = np.square(pace) / (np.square(pace) + 0.1**2)
+    return Gait(
+        rng=rng,
+        rate=rate,
+        phase=rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * integral(steps, rate),
+        step_rate=steps,
+        effort=fade * (0.35 + 0.65 * pace / _BRISK) * strength,
+        speed=route.speed,
+        height=style.height,
+        vigor=style.vigor,
+    )
+
+
+def _carried(gait: Gait, style: WalkStyle) -> CarryMotion:
+    first = CARRIES[style.carry](gait)
+    if not style.next_carry:
+        return first
+    second = CARRIES[style.next_carry](gait)
+    n, rng = len(gait), gait.rng
+    after = np.arange(n) > n * rng.uniform(0.25, 0.75)
+    weight = smoothed(after.astype(np.float64), gait.rate, _CHANGE)[:, None]
+    axis = rng.standard_normal(3)
+    regrip = rng.uniform(0.2, 2.0) * axis / np.linalg.norm(axis)
+    turn = Rotation.from_rotvec((1.0 - weight) * first.turn_H + weight * second.turn_H)
+    turn = turn * Rotation.from_rotvec(weight * regrip)
+    offset = (1.0 - weight) * first.offset_H + weight * second.offset_H
+    return CarryMotion(offset, turn.as_rotvec())

@@ -1,0 +1,1 @@
+"""How a recording's truth fits its IMU: clocks, axes, mounts."""

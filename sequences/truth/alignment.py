@@ -1,0 +1,361 @@
+"""Time offset and mount between an IMU and the body that a motion-capture system tracks.
+
+Frames: V is the tracked body (markers), B the IMU, W the capture system's world. The IMU sits in
+the tracked body with a constant rotation R_VB (the mount) and its clock is off by a constant lag.
+Over any short interval both see the same rotation, in their own axes:
+
+    R_VB  dR_B  =  dR_V  R_VB      so that      phi_V = R_VB phi_B
+
+for the rotation vectors phi; a tracked body that the system mistakes for its mirror image (a flip
+by 170-180 degrees) shows as a jump of dR_V that the gyroscope has not seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import tilt_aligning
+from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.truth.mount_heading import heading_turn
+
+_STRIDES_S = (0.03, 0.1, 0.25, 0.5)
+_FLIP_RAD = np.deg2rad(15.0)
+_GLITCH_RAD = np.deg2rad(6.0)
+_SAME_MOUNT_RAD = np.deg2rad(30.0)
+_MIN_PIECE_S = 1.0
+_MIN_FIT_S = 10.0
+_LAG_STEP_S = 0.0025
+_LEFT_LAG_S = 0.04
+_CORRELATED_S = 0.1
+
+
+@dataclass(frozen=True)
+class BodyAlignment:
+    """Outcome of `align_tracked_body`.
+
+    Attributes:
+        lag: to be added to the truth's time [s].
+        correlation: between the gyroscope and the attitude's rate, both over 0.1 s, in B.
+        attitude_WB: the IMU's attitude at the truth's samples, level and mount applied.
+        leveling_WW: the rotation that made the world level, to be applied to positions.
+        valid: truth samples whose attitude agrees with the gyroscope.
+        mounts: R_VB of each piece between flips, with the piece's first and last time [s].
+    """
+
+    lag: float
+    correlation: float
+    attitude_WB: Rotation
+    leveling_WW: Rotation
+    valid: BoolArray
+    mounts: tuple[tuple[float, float, Rotation], ...]
+
+
+def align_tracked_body(
+    imu_time: FloatArray,
+    gyro: FloatArray,
+    accel: FloatArray,
+    truth_time: FloatArray,
+    attitude_WV: Rotation,
+    valid: BoolArray,
+    position_WV: FloatArray | None = None,
+    max_lag: float = 0.15,
+) -> BodyAlignment:
+    """Estimate lag, mount (anew after every flip) and the world's tilt.
+
+    Args:
+        imu_time: (N,) [s].
+        gyro: (N, 3) angular rate in B [rad/s].
+        accel: (N, 3) specific force in B [m/s^2].
+        truth_time: (M,) [s], evenly sampled, on the IMU's clock but for the lag.
+        attitude_WV: M rotations of the tracked body.
+        valid: (M,) samples to be trusted at all.
+        position_WV: (M, 3) of the tracked body [m]; with it the accelerometer helps to find the
+            mount's turn about the vertical, which the gyroscope misses on wheels.
+        max_lag: largest lag looked for, either way [s].
+
+    Raises:
+        InputError: less than 10 s without a break in which both saw the same rotations.
+    """
+    _check_length("recording", imu_time)
+    _check_length("capture", truth_time[valid])
+    gyro_B = _GyroIntegral(imu_time, gyro)
+    lag = _lag(gyro_B, truth_time, attitude_WV, valid, max_lag)
+    time = truth_time + lag
+    attitude_B = gyro_B.attitude(time)
+    valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
+    pieces = _pieces(time, attitude_WV, attitude_B, valid)
+    start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
+    _check_length("capture that agrees with the gyroscope", time[start:stop])
+    mounts = _mounts(time, attitude_WV, attitude_B, pieces)
+    kept = np.zeros_like(valid)
+    for start, stop in pieces:
+        kept[start:stop] = valid[start:stop]
+    lag += _lag_by_axes(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept)
+    time = truth_time + lag
+    mounts = _mounts(time, attitude_WV, gyro_B.attitude(time), pieces)
+    force_B, rate_B = _sampled(time, imu_time, accel), _sampled(time, imu_time, gyro)
+    attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
+    if position_WV is not None:
+        inside = kept & (time >= imu_time[0]) & (time <= imu_time[-1])
+        turn = heading_turn(time, rate_B, force_B, leveling.apply(position_WV), attitude_WB, inside)
+        mounts = [mount * turn for mount in mounts]
+        attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
+    # With the mount known, glitches about another axis than the motion's show as well.
+    drift = attitude_WB * gyro_B.attitude(time).inv()
+    kept &= ~_disagreeing(time, drift, Rotation.identity(len(drift)))
+    return BodyAlignment(
+        lag=lag,
+        correlation=_correlation(time, attitude_WB, gyro_B, kept),
+        attitude_WB=attitude_WB,
+        leveling_WW=leveling,
+        valid=kept,
+        mounts=tuple(
+            (float(time[start]), float(time[stop - 1]), mount)
+            for (start, stop), mount in zip(pieces, mounts, strict=True)
+        ),
+    )
+
+
+def _sampled(time: FloatArray, imu_time: FloatArray, values: FloatArray) -> FloatArray:
+    return np.stack([np.interp(time, imu_time, values[:, k]) for k in range(3)], axis=1)
+
+
+def _mounted(
+    attitude_WV: Rotation, pieces: list[tuple[int, int]], mounts: list[Rotation]
+) -> Rotation:
+    """The IMU's attitude in the capture's world, each piece with its mount."""
+    quat_WB = attitude_WV.as_quat()
+    for (start, stop), mount in zip(pieces, mounts, strict=True):
+        quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
+    return Rotation.from_quat(quat_WB)
+
+
+def _level(
+    attitude_WB: Rotation, force_B: FloatArray, kept: BoolArray
+) -> tuple[Rotation, Rotation]:
+    """The attitude in a world whose mean force points up, and the rotation that made it so."""
+    leveling = tilt_aligning(attitude_WB[kept].apply(force_B[kept]).mean(axis=0))
+    return leveling * attitude_WB, leveling
+
+
+def _check_length(what: str, time: FloatArray) -> None:
+    length = float(time[-1] - time[0]) if len(time) else 0.0
+    if length < _MIN_FIT_S:
+        raise InputError(what, f"{length:.1f} s", f"{_MIN_FIT_S:.0f} s to find the mount in")
+
+
+class _GyroIntegral:
+    """Attitude from integrating the gyroscope, sampled at any time, and its running integral."""
+
+    def __init__(self, time: FloatArray, gyro: FloatArray) -> None:
+        self.time = time
+        steps = np.diff(time)[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
+        self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._quat = cumulative_rotations(Rotation.from_rotvec(steps))
+        self._rate = gyro
+
+    def attitude(self, time: FloatArray) -> Rotation:
+        """Attitude of B against its start at times inside the recording (held outside)."""
+        clipped = np.clip(time, self.time[0], self.time[-1])
+        left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
+        tau = clipped - self.time[left]
+        return Rotation.from_quat(self._quat[left]) * Rotation.from_rotvec(
+            self._rate[left] * tau[:, None]
+        )
+
+    def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
+        """Mean rate [rad/s] from each of M times to the one `stride` later (M - stride, 3)."""
+        angle = _sampled(time, self.time, self.angle)
+        lengths = time[stride:] - time[:-stride]
+        return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
+
+
+def cumulative_rotations(steps: Rotation) -> FloatArray:
+    """Products q_0 q_1 ... q_k as (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
+    count = len(steps) + 1
+    width = int(np.ceil(np.sqrt(count)))
+    padded = np.tile([0.0, 0.0, 0.0, 1.0], (width * width, 1))
+    padded[1:count] = steps.as_quat()
+    blocks = padded.reshape(width, width, 4)
+    for k in range(1, width):
+        blocks[:, k] = _product(blocks[:, k - 1], blocks[:, k])
+    starts = blocks[:, -1].copy()
+    for k in range(1, width):
+        starts[k] = _product(starts[k - 1], starts[k])
+    blocks[1:] = _product(starts[:-1, None], blocks[1:])
+    products = blocks.reshape(-1, 4)[:count]
+    return np.asarray(products / np.linalg.norm(products, axis=1)[:, None], dtype=np.float64)
+
+
+def _product(p: FloatArray, q: FloatArray) -> FloatArray:
+    """Products of quaternions (..., 4), xyzw; SciPy's composition costs far more than this."""
+    a, b = p[..., :3], q[..., :3]
+    vector = p[..., 3:] * b + q[..., 3:] * a + np.cross(a, b)
+    scalar = p[..., 3] * q[..., 3] - np.sum(a * b, axis=-1)
+    return np.concatenate([vector, scalar[..., None]], axis=-1)
+
+
+def _rates(
+    time: FloatArray, attitude: Rotation, valid: BoolArray, stride: int
+) -> tuple[FloatArray, BoolArray]:
+    rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    rates = rates / (time[stride:] - time[:-stride])[:, None]
+    return rates, valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)
+
+
+def _lag(
+    gyro_B: _GyroIntegral,
+    time: FloatArray,
+    attitude_WV: Rotation,
+    valid: BoolArray,
+    max_lag: float,
+) -> float:
+    """Lag at which the magnitudes of both rates correlate best: no mount is needed for it."""
+    stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
+    rates_V, good = _rates(time, attitude_WV, valid, stride)
+    speed_V = np.linalg.norm(rates_V, axis=1)
+
+    def score(lag: float) -> float:
+        speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
+        # Glitches are rare but huge: compare where the two do not contradict each other grossly.
+        use = good & (np.abs(speed_V - speed_B) < 3.0)
+        return float(np.corrcoef(speed_V[use], speed_B[use])[0, 1]) if use.sum() > 2 else 0.0
+
+    return _best_lag(score, max_lag)
+
+
+def _lag_by_axes(
+    gyro_B: _GyroIntegral, time: FloatArray, attitude_WB: Rotation, valid: BoolArray
+) -> float:
+    """What is left of the lag, by the rates' axes as well, once the mount is known.
+
+    Magnitudes lose to the capture's noise where little is turned: up to 12 ms on a trolley.
+    """
+    stride = max(1, round(0.06 / float(np.median(np.diff(time)))))
+    rates, good = _rates(time, attitude_WB, valid, stride)
+
+    def score(lag: float) -> float:
+        measured = gyro_B.mean_rate(time + lag, stride)
+        use = good & (np.linalg.norm(rates - measured, axis=1) < 3.0)
+        x, y = rates[use].ravel(), measured[use].ravel()
+        return float(np.corrcoef(x, y)[0, 1]) if len(x) > 2 else 0.0
+
+    return _best_lag(score, _LEFT_LAG_S)
+
+
+def _best_lag(score: Callable[[float], float], reach: float) -> float:
+    """Lag of the highest score within reach, coarsely first, by a parabola at last."""
+    coarse = np.arange(-reach, reach + 1e-9, 4 * _LAG_STEP_S)
+    centre = coarse[int(np.argmax([score(lag) for lag in coarse]))]
+    lags = centre + _LAG_STEP_S * np.arange(-4, 5)
+    scores = [score(lag) for lag in lags]
+    best = int(np.clip(np.argmax(scores), 1, len(lags) - 2))
+    before, peak, after = scores[best - 1 : best + 2]
+    curvature = before - 2 * peak + after
+    offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return float(lags[best] + np.clip(offset, -1, 1) * _LAG_STEP_S)
+
+
+def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
+    """Samples whose rotation to most neighbours, before and after, contradicts the gyroscope."""
+    n = len(time)
+    dt = float(np.median(np.diff(time)))
+    ahead, behind = np.zeros(n), np.zeros(n)
+    for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
+        error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
+        ahead[: n - stride] += error
+        behind[stride:] += error
+    enough = len(_STRIDES_S) / 2
+    return (ahead > enough) & (behind > enough)
+
+
+def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
+    """Difference of the rotation angles over `stride` samples, which no mount changes."""
+    half_V, half_B = (
+        np.arccos(np.clip(np.abs(np.sum(quat[:-stride] * quat[stride:], axis=1)), 0.0, 1.0))
+        for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
+    )
+    return np.asarray(2.0 * np.abs(half_V - half_B), dtype=np.float64)
+
+
+def _pieces(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
+) -> list[tuple[int, int]]:
+    """Runs of samples [start, stop) between attitude jumps, long enough to be of use."""
+    known = np.flatnonzero(valid)
+    if len(known) < 2:
+        return []
+    jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
+    edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
+    runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
+    return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
+
+
+def _mounts(
+    time: FloatArray,
+    attitude_WV: Rotation,
+    attitude_B: Rotation,
+    pieces: list[tuple[int, int]],
+) -> list[Rotation]:
+    """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not."""
+    fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
+    longest = int(np.argmax([stop - start for start, stop in pieces]))
+    mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
+    order = [(k, k - 1) for k in range(longest + 1, len(pieces))]
+    order += [(k, k + 1) for k in range(longest - 1, -1, -1)]
+    for k, neighbour in order:
+        here, there = _facing_ends(pieces[k], pieces[neighbour])
+        across = attitude_B[there].inv() * attitude_B[here]
+        carried = attitude_WV[here].inv() * attitude_WV[there] * mounts[neighbour] * across
+        same = (mounts[neighbour].inv() * carried).magnitude() < _SAME_MOUNT_RAD
+        fit = fitted[k]
+        agrees = fit is not None and (fit.inv() * carried).magnitude() < _SAME_MOUNT_RAD
+        mounts[k] = mounts[neighbour] if same else (fit if agrees and fit else carried)
+    return [mounts[k] for k in range(len(pieces))]
+
+
+def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[int, int]:
+    if piece[0] >= neighbour[1]:
+        return piece[0], neighbour[1] - 1
+    return piece[1] - 1, neighbour[0]
+
+
+def _fit(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, piece: tuple[int, int]
+) -> Rotation | None:
+    """R_VB that best takes the rotation vectors of B to those of V, outliers weighted down."""
+    start, stop = piece
+    if time[stop - 1] - time[start] < _MIN_FIT_S:
+        return None
+    stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
+    # Rotations that overlap by more than two thirds say little new.
+    before = np.arange(start, stop - stride, max(1, stride // 3))
+    phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
+    phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
+    weights = np.ones(len(phi_V))
+    mount = Rotation.identity()
+    for _ in range(5):
+        mount, _residual = Rotation.align_vectors(phi_V, phi_B, weights=weights)
+        residual = np.linalg.norm(phi_V - mount.apply(phi_B), axis=1)
+        scale = max(float(np.median(residual)), 1e-4)
+        weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
+    return mount
+
+
+def _correlation(
+    time: FloatArray, attitude_WB: Rotation, gyro_B: _GyroIntegral, valid: BoolArray
+) -> float:
+    """Correlation of both rates over 0.1 s; below, the capture's noise drowns a trolley's turns."""
+    stride = max(1, round(_CORRELATED_S / float(np.median(np.diff(time)))))
+    rates, good = _rates(time, attitude_WB, valid, stride)
+    measured = gyro_B.mean_rate(time, stride)
+    good &= np.linalg.norm(rates - measured, axis=1) < 3.0
+    if good.sum() < 2:
+        return 0.0
+    return float(np.corrcoef(rates[good].ravel(), measured[good].ravel())[0, 1])

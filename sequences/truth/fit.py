@@ -1,0 +1,146 @@
+"""How a recording's truth fits its IMU: time offset, turned axes, a world that is not level.
+
+Both see the same rotations, so the gyroscope and the differentiated attitude tell the offset of
+their clocks and the constant rotation between their axes (`stario.sequences.truth.alignment`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import correlate
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.windows import MAX_IMU_GAP, clean_samples
+
+LONGEST_S = 600.0
+"""What is looked at of a longer recording [s], from its middle: the cost does not grow with it."""
+
+MAX_OFFSET_S = 5.0
+"""Largest time offset looked for, either way [s]."""
+
+_RATE = 100.0
+_NEAR_RAD = np.deg2rad(20.0)
+_GLITCH_RAD_S = 12.0
+"""A truth that turns faster has jumped."""
+
+_ALIKE = 0.7
+"""Correlation below which gyroscope and truth have not seen the same rotations."""
+
+
+@dataclass(frozen=True, eq=False)
+class TruthFit:
+    """Outcome of `fit_truth`.
+
+    Attributes:
+        time_offset: to be added to the truth's time [s].
+        correlation: between gyroscope and differentiated attitude after all corrections.
+        R_TB: takes the IMU's axes to those whose attitude the truth gives.
+        tilt: of the truth's world against the vertical [rad].
+        agreeing: share of the truth's samples that the gyroscope agrees with.
+        jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
+        times: (M,) [s] on the IMU's clock, for a figure.
+        speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
+    """
+
+    time_offset: float
+    correlation: float
+    R_TB: Rotation
+    tilt: float
+    agreeing: float
+    jumps: int
+    times: FloatArray
+    speed: FloatArray
+
+    @property
+    def misalignment(self) -> float:
+        """Angle between the IMU's axes and the truth's [rad]."""
+        return float(self.R_TB.magnitude())
+
+    def axes(self) -> str | None:
+        """The `--axes` that turns the IMU to the truth's; None where none is needed or fits."""
+        text = axes_named(self.R_TB.as_matrix())
+        left = Rotation.from_matrix(axes_matrix(text)).inv() * self.R_TB
+        alike = self.correlation > _ALIKE and left.magnitude() < _NEAR_RAD
+        return text if alike and text != SAME_AXES else None
+
+
+def fit_truth(sequence: ImuSequence) -> TruthFit:
+    """Compare gyroscope and true attitude over up to 10 minutes.
+
+    Raises:
+        InputError: there is no truth, or less than 10 s in which both saw the same rotations.
+    """
+    if sequence.truth is None or sequence.truth.valid.sum() < 2:
+        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
+    time, gyro, accel = clean_samples(_middle(sequence))
+    truth = sequence.truth
+    coarse = _coarse_offset(time, gyro, truth)
+    truth = replace(truth, time=truth.time + coarse)
+    grid = _grid(max(time[0], truth.time[0]), min(time[-1], truth.time[-1]))
+    pose = truth.at(grid)
+    gaps = np.flatnonzero(np.diff(time) > MAX_IMU_GAP)
+    valid = pose.valid & ~np.isin(np.searchsorted(time, grid) - 1, gaps)
+    aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, valid)
+    mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2]
+    return TruthFit(
+        time_offset=coarse + aligned.lag,
+        correlation=aligned.correlation,
+        R_TB=mount,
+        tilt=float(aligned.leveling_WW.magnitude()),
+        agreeing=float(aligned.valid.sum() / max(valid.sum(), 1)),
+        jumps=sum(
+            not ((time[gaps] > before - 1.0) & (time[gaps] < after)).any()
+            for (_, before, _), (after, _, _) in pairwise(aligned.mounts)
+        ),
+        times=grid + aligned.lag,
+        speed=_speed(pose.attitude_WB, pose.valid),
+    )
+
+
+def _middle(sequence: ImuSequence) -> ImuSequence:
+    if sequence.duration <= LONGEST_S:
+        return sequence
+    middle = float(np.nanmedian(sequence.time))
+    keep = np.abs(sequence.time - middle) <= LONGEST_S / 2
+    return ImuSequence(
+        sequence.name, sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
+    )
+
+
+def _grid(start: float, stop: float) -> FloatArray:
+    return np.arange(start, max(stop, start + 2.0 / _RATE), 1.0 / _RATE)
+
+
+def _speed(attitude: Rotation, valid: BoolArray, stride: int = 4) -> FloatArray:
+    """Angular rate [rad/s] around each sample of an even grid, NaN where it is not known."""
+    speed = np.full(len(valid), np.nan)
+    if len(valid) > stride:
+        half = stride // 2
+        angle = (attitude[:-stride].inv() * attitude[stride:]).magnitude()
+        known = valid[:-stride] & valid[stride:]
+        speed[half : half + len(angle)] = np.where(known, angle * _RATE / stride, np.nan)
+    return speed
+
+
+def _coarse_offset(time: FloatArray, gyro: FloatArray, truth: Trajectory) -> float:
+    """Offset at which both speeds of rotation correlate best, to a hundredth of a second."""
+    grid = _grid(time[0] - MAX_OFFSET_S, time[-1] + MAX_OFFSET_S)
+    pose = truth.at(grid)
+    speed_T = _speed(pose.attitude_WB, pose.valid)
+    known = speed_T < _GLITCH_RAD_S
+    if not known.any():
+        return 0.0
+    turning = np.where(known, speed_T - speed_T[known].mean(), 0.0)
+    speed = np.interp(grid, time, np.linalg.norm(gyro, axis=1))
+    speed = np.where((grid < time[0]) | (grid > time[-1]), 0.0, speed - speed.mean())
+    score = correlate(speed, turning, mode="full", method="fft")
+    lags = np.arange(-len(grid) + 1, len(grid)) / _RATE
+    near = np.abs(lags) <= MAX_OFFSET_S
+    return float(lags[near][np.argmax(score[near])])

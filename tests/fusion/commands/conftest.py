@@ -1,0 +1,69 @@
+"""Calls of the `stario` command and a recording to call it with."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from stario.fusion.commands.cli import app, main
+
+
+class Done:
+    """What a call of the command left."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    def assert_one_line_error(self, *words: str) -> None:
+        assert self.code == 1
+        assert self.out == ""
+        lines = self.err.strip().splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("stario: ")
+        for word in words:
+            assert word in lines[0]
+
+
+@pytest.fixture
+def stario(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Calls `stario` with arguments, in this process and in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+    def call(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["stario", *map(str, arguments)])
+        capsys.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as leaving:
+            code = int(leaving.code or 0)
+        captured = capsys.readouterr()
+        return Done(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures, which take most of the time, where a test does not look at them."""
+    monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda *arguments: [])
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A walk of twelve seconds, which no test writes to."""
+    path = tmp_path_factory.mktemp("recordings") / "walk.csv"
+    result = CliRunner().invoke(
+        app, ["simulate", str(path), "--seconds", "12", "--carry", "handheld", "--rate", "100"]
+    )
+    assert result.exit_code == 0, result.output
+    return path

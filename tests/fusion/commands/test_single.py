@@ -1,0 +1,411 @@
+"""The `stario` command as a user meets it: output, files, exit codes, one-line errors."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from stario.fusion.commands.cli import app
+from stario.fusion.config import read_config
+from stario.network.architectures import build_network
+from stario.network.card import Card
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import save_model
+from stario.sequences.conventions import with_axes
+from stario.sequences.files import read_tum
+from stario.sequences.readers.own_csv import read_own_csv, write_csv
+from stario.sequences.sequence import Trajectory
+
+COMMANDS = (
+    "run",
+    "compare",
+    "evaluate",
+    "simulate",
+    "convert",
+    "inspect",
+    "train",
+    "models",
+    "export",
+    "benchmark",
+    "backends",
+    "faults",
+    "consistency",
+)
+
+
+# --- help and usage ----------------------------------------------------------------------------
+
+
+def test_help_names_every_command() -> None:
+    result = CliRunner().invoke(app, ["--help"])
+    assert result.exit_code == 0
+    for command in COMMANDS:
+        assert command in result.output
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str) -> None:
+    result = CliRunner().invoke(app, [command, "--help"], terminal_width=200)
+    assert result.exit_code == 0
+    assert f"stario {command}" in result.output.replace("root", "stario")
+    assert " . " not in result.output  # a word in brackets that the formatter swallowed
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nosuch"],
+        ["run"],
+        ["run", "a.csv", "--nosuch"],
+        ["simulate", "a.csv", "--seconds", "long"],
+        ["simulate", "a.csv", "--seed", "-1"],
+        ["train", "--epochs", "0"],
+    ],
+)
+def test_wrong_usage_leaves_with_two(stario, arguments: list[str]) -> None:
+    done = stario(*arguments)
+    assert done.code == 2
+    assert "Usage" in done.err
+
+
+def test_the_installed_command_keeps_these_codes(tmp_path: Path) -> None:
+    command = Path(sys.executable).with_name("stario")
+    if not command.exists():
+        pytest.skip("stario is not installed beside this Python")
+
+    def code(*arguments: str) -> int:
+        return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
+
+    assert [code("--help"), code("run", "missing.csv"), code("nosuch")] == [0, 1, 2]
+
+
+def test_a_bug_is_not_dressed_up_as_an_error_of_the_user(
+    stario, monkeypatch: pytest.MonkeyPatch, recording: Path
+) -> None:
+    def broken(path: Path, format: str) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("stario.sequences.readers.read_recording", broken)
+    with pytest.raises(ZeroDivisionError):
+        stario("run", recording)
+
+
+# --- simulate and run --------------------------------------------------------------------------
+
+
+def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
+    done = stario("simulate", "w.csv", "--seconds", 5, "--rate", 50, "--seed", 7, "--json")
+    assert done.code == 0
+    figures = json.loads(done.out)
+    sequence = read_own_csv(tmp_path / "w.csv")
+    assert figures["samples"] == len(sequence) == 251
+    assert figures["duration_s"] == pytest.approx(5.0)
+    assert sequence.truth is not None
+    stario("simulate", "again.csv", "--seconds", 5, "--rate", 50, "--seed", 7)
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
+
+
+def test_run_leaves_a_track_and_says_so(stario, recording: Path, tmp_path: Path) -> None:
+    done = stario("run", recording, "--out", "out")
+    assert done.code == 0
+    assert done.err == ""
+    for words in ("walk: 12.0 s", "ATE [m]", "samples used 1201", "updates", "8 files in out"):
+        assert words in done.out
+    track = read_tum(tmp_path / "out" / "ekf.tum")
+    assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
+    assert len(list((tmp_path / "out").iterdir())) == 8
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_run_speaks_json(stario, recording: Path, tmp_path: Path) -> None:
+    done = stario("run", recording, "--json")
+    figures = json.loads(done.out)
+    assert figures["recording"] == "walk"
+    assert figures["ekf"]["ate_m"] > 0.0
+    assert (tmp_path / figures["folder"] / "metrics.json").exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_run_needs_no_truth_and_the_track_is_the_same(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    assert stario("run", recording, "--out", "seen").code == 0
+    done = stario("run", "blind.csv", "--out", "blind", "--json")
+    assert json.loads(done.out)["ekf"]["ate_m"] is None
+    seen, blind = ((tmp_path / name / "ekf.tum").read_bytes() for name in ("seen", "blind"))
+    assert seen == blind
+
+
+def write_fixes(path: Path, truth: Trajectory, turn: float = 0.0, late: float = 0.0) -> Path:
+    """The true position of every second, in a world that is turned and on a clock that is late."""
+    R = Rotation.from_rotvec([0.0, 0.0, turn])
+    rows = ["t,kind,x,y,z,sx,sy,sz"]
+    for t in np.arange(truth.time[0] + 0.5, truth.time[-1], 1.0):
+        x, y, z = R.apply(truth.at(np.array([t])).position_W[0])
+        rows.append(f"{t + late},position,{x},{y},{z},0.05,,")
+    path.write_text("\ufeff" + "\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    truth = read_own_csv(recording).truth
+    assert truth is not None
+    for turn in (0.0, 1.0):
+        fixes = write_fixes(tmp_path / "fixes.csv", truth, turn)
+        done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
+        assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
+    words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
+    assert "least squared" in words["alignment"]
+    done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
+    compared = json.loads(done.out)
+    assert compared["conventions"] == words
+    assert compared["recordings"]["walk"]["tracks"]["ekf"]["ate_m"] < 0.3
+
+
+def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
+    truth = read_own_csv(recording).truth
+    assert truth is not None
+    fixes = write_fixes(tmp_path / "fixes.csv", truth, late=1.7e9)
+    done = stario("run", recording, "--fixes", fixes)
+    done.assert_one_line_error("fixes", "1.7e+09", "first sample")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_one_row_of_truth_is_none(stario, recording: Path, tmp_path: Path) -> None:
+    lines = recording.read_text().splitlines()
+    kept = len(lines) // 2
+    for k, line in enumerate(lines):
+        if k not in (0, kept):
+            lines[k] = ",".join(line.split(",")[:7]) + "," * (lines[0].count(",") - 6)
+    path = tmp_path / "one.csv"
+    path.write_text("\n".join(lines) + "\n")
+    done = stario("run", path, "--out", "one", "--json")
+    assert done.code == 0
+    assert json.loads(done.out)["ekf"]["ate_m"] is None
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_settings_come_from_a_file_and_are_kept(stario, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "slow.toml").write_text("[filter]\nupdate_rate = 2\n")
+    assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0
+    assert read_config(tmp_path / "a/config.json") == read_config(tmp_path / "slow.toml")
+    assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_run_takes_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "all").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
+    done = stario("run", "all", "--out", "out", "--json")
+    assert done.code == 0
+    assert [record["recording"] for record in json.loads(done.out)] == ["a", "b"]
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"a", "b"}
+    (tmp_path / "list.txt").write_text("all/b.csv\nall/c.csv\n")
+    done = stario("run", "list.txt", "--out", "alone")
+    assert done.code == 1
+    assert "skipped" in done.err
+    assert "all/c.csv" in done.err
+    assert (tmp_path / "alone/ekf.tum").exists()
+
+
+# --- convert -----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_converted_recording_gives_the_same_track(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    assert stario("convert", recording, "there").code == 0
+    done = stario("convert", "there", "back.csv")
+    assert done.code == 0
+    assert "there: 1201 samples, 12.0 s\nback.csv" in done.out
+    for path, out in ((recording, "a"), ("back.csv", "b")):
+        assert stario("run", path, "--out", out).code == 0
+    a, b = (read_tum(tmp_path / out / "ekf.tum") for out in "ab")
+    np.testing.assert_allclose(a.position_W, b.position_W, atol=0.01)  # times by whole ns
+    stario("convert", recording, "there").assert_one_line_error("there", "exists")
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
+def test_what_the_numbers_mean_can_be_told_to_every_command(
+    stario, recording: Path, tmp_path: Path, command: str
+) -> None:
+    """Rates in degrees, Apple's user acceleration in g, axes turned against the truth's."""
+    walk = with_axes(read_own_csv(recording), "-y,x,z")
+    upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
+    linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
+    write_csv(
+        tmp_path / "odd.csv", replace(walk, gyro=np.degrees(walk.gyro), accel=linear / -9.80665)
+    )
+    target = ["out.csv"] if command == "convert" else []
+    stario(command, "odd.csv", *target).assert_one_line_error()
+    words = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
+    done = stario(command, "odd.csv", *target, *words)
+    assert done.code == 0, done.err
+
+
+# --- inspect -----------------------------------------------------------------------------------
+
+
+def test_inspect_names_what_mends_a_recording(stario, recording: Path, tmp_path: Path) -> None:
+    walk = read_own_csv(recording)
+    write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
+    done = stario("inspect", "g.csv", "--out", "out")
+    assert done.code == 0
+    assert "--accel-unit g" in done.out
+    assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
+    mended = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
+    assert mended["problems"] == []
+    assert mended == json.loads((tmp_path / "runs/g/inspection.json").read_text())
+    assert mended["rate_hz"] == pytest.approx(100.0)
+
+
+# --- export ------------------------------------------------------------------------------------
+
+
+def test_export_takes_a_networks_name(stario, tmp_path: Path) -> None:
+    """That of its run; StarIO without one is the default, another is told how to train."""
+    pytest.importorskip("onnx")
+    done = stario("export", "--model", "StarIO")
+    assert (done.code, done.out) == (0, "StarIO.onnx\n")
+    stario("export", "--model", "R-ResNet").assert_one_line_error(
+        "runs/R-ResNet/model.safetensors", "stario train --model 'R-ResNet'"
+    )
+    torch.manual_seed(0)
+    network = DisplacementNetwork(build_network("R-ResNet"))
+    save_model(tmp_path / "mine/R-ResNet/model.safetensors", network, Card(architecture="R-ResNet"))
+    done = stario("export", "--model", "R-ResNet", "--runs", "mine", "--out", "r.onnx")
+    assert done.code == 0, done.err
+    assert (tmp_path / "r.onnx").exists()
+
+
+# --- wrong input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.usefixtures("undrawn")
+def test_degrees_are_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path, truth: bool
+) -> None:
+    sequence = read_own_csv(recording)
+    sequence = sequence if truth else sequence.without_truth()
+    write_csv(tmp_path / "deg.csv", replace(sequence, gyro=np.degrees(sequence.gyro)))
+    done = stario("run", "deg.csv", "--out", "out")
+    done.assert_one_line_error("--gyro-unit deg/s", "deg")
+    assert not (tmp_path / "out").exists()
+    if truth:
+        assert stario("run", "deg.csv", "--out", "out", "--gyro-unit", "deg/s").code == 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
+    sequence = read_own_csv(recording)
+    write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
+    stario("run", "g.csv").assert_one_line_error("--accel-unit g")
+    assert stario("run", "g.csv", "--accel-unit", "g").code == 0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_gravitys_sign_is_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    sequence = read_own_csv(recording)
+    write_csv(tmp_path / "apple.csv", replace(sequence, accel=-sequence.accel))
+    stario("run", "apple.csv").assert_one_line_error("--accel-unit=-m/s^2")
+    assert stario("run", "apple.csv", "--accel-unit=-m/s^2").code == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ["broken.csv"]),
+        (b"t,gx,gy,gz,ax,ay,az\n", ["broken.csv", "rows"]),
+        (b"t,gx,gy,gz,ax,ay\n0,0,0,0,0,0\n", ["broken.csv"]),
+        (b"t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n0.01,0,0\n", ["line 3", "cut short"]),
+        (b"t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n", ["broken", "at least"]),
+        (b"\x89PNG\r\n\x1a\n\x00\x00", ["broken.csv"]),
+    ],
+)
+def test_a_broken_file_is_named_in_one_line(
+    stario, tmp_path: Path, content: bytes, words: list[str]
+) -> None:
+    (tmp_path / "broken.csv").write_bytes(content)
+    stario("run", "broken.csv").assert_one_line_error(*words)
+    assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
+
+
+def test_a_recording_cut_within_a_line_is_named(stario, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.csv").write_bytes(recording.read_bytes()[:50_020])
+    stario("run", "cut.csv").assert_one_line_error("cut.csv", "line ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "missing.csv"], ["missing.csv", "nothing there"]),
+        (["compare", "missing"], ["missing", "nothing there"]),
+        (["evaluate", "--data", "missing"], ["missing", "--data"]),
+        (["evaluate", "--split", "practice"], ["split", "practice"]),
+        (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
+        (["run", "RECORDING", "--gyro-unit", "rpm"], ["gyro_unit", "rpm"]),
+        (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
+        (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
+        (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
+        (["convert", "missing.csv", "a.csv"], ["missing.csv", "nothing there"]),
+        (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
+        (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
+        (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
+        (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
+        (["simulate", "no/such/folder.csv"], ["folder"]),
+        (["simulate", ".", "--seconds", "2"], ["folder"]),
+        (["simulate", "a.csv", "--seconds", "0"], ["duration"]),
+        (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
+        (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
+        (["simulate", "a.csv", "--rate", "0"], ["rate"]),
+        (["train", "--generated", "0"], ["streams"]),
+        (["train", "--config", "missing.json"], ["missing.json"]),
+        (["train", "--out", "RECORDING"], ["folder"]),
+        (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(
+    stario, recording: Path, arguments: list[str], words: list[str]
+) -> None:
+    done = stario(*(recording if word == "RECORDING" else word for word in arguments))
+    done.assert_one_line_error(*words)
+
+
+@pytest.mark.parametrize(
+    ("command", "content", "named"),
+    [
+        ("run", '{"filter": {"speed": 1}}', "filter.speed"),
+        ("run", '{"noise": {"gyro_noise": "low"}}', "noise.gyro_noise"),
+        ("compare", '{"filter": {"update_rate": 3}}', "filter.update_rate"),
+        ("evaluate", '{"gravity": 1.62}', "gravity"),
+        ("run", "{", "settings.json"),
+        ("train", '{"speed": 1}', "speed"),
+        ("train", "[1]", "settings.json"),
+        ("train", '{"epochs": "three"}', "epochs"),
+        ("train", '{"augmentation": {"magic": 1}}', "augmentation.magic"),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_named_in_one_line(
+    stario, recording: Path, tmp_path: Path, command: str, content: str, named: str
+) -> None:
+    (tmp_path / "settings.json").write_text(content)
+    stario(command, recording, "--config", "settings.json").assert_one_line_error(named)

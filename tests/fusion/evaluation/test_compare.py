@@ -1,0 +1,228 @@
+"""Comparison of tracks and the files it leaves."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
+from stario.fusion.evaluation import compare as compare_module
+from stario.fusion.evaluation.compare import (
+    METRIC_WORDS,
+    TRACKS,
+    Comparison,
+    compare,
+    demonstration,
+)
+from stario.fusion.evaluation.results import write_comparison, write_run
+from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+from stario.sequences.errors import StarioError
+from stario.sequences.files import read_tum
+from stario.sequences.metrics import align, evaluate_track
+from stario.sequences.sequence import ImuSequence
+
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
+KEYS = {"ate_m", "rte_m", "pde", "aye_rad", "nees", "nis", "seconds_network", "seconds_filter"}
+
+Make = Callable[..., Any]
+
+
+class Anything:
+    """The oracle where it knows a window; elsewhere a metre in some direction."""
+
+    def __init__(self, oracle: Any) -> None:
+        self.oracle = oracle
+
+    def predict(self, windows):
+        try:
+            return self.oracle.predict(windows)
+        except KeyError:
+            n = len(windows)
+            return np.tile([1.0, 0.0, 0.0], (n, 1)), np.tile(0.01 * np.eye(3), (n, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def model(walk: ImuSequence, make_oracle: Make) -> Anything:
+    return Anything(make_oracle(walk, walk.truth, CONFIG))
+
+
+@pytest.fixture(scope="module")
+def compared(walk: ImuSequence, model: Anything) -> Comparison:
+    return compare(model, walk, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def blind(walk: ImuSequence, model: Anything) -> Comparison:
+    return compare(model, replace(walk.without_truth(), name="blind"), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def folder(
+    compared: Comparison, blind: Comparison, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    path = tmp_path_factory.mktemp("compare") / "deep" / "out"
+    written = write_comparison(path, [compared, blind], CONFIG)
+    assert sorted(written) == sorted(p for p in path.rglob("*") if p.is_file())
+    return path
+
+
+def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> None:
+    content = json.loads((folder / "metrics.json").read_text())
+    assert set(content) == {"recordings", "conventions"}
+    assert set(content["recordings"]) == {walk.name, "blind"}
+    for entry in content["recordings"].values():
+        assert set(entry) == {"duration_s", "path_m", "tracks"}
+        assert set(entry["tracks"]) == {
+            "inertial",
+            "network",
+            "network_true_attitude",
+            "ekf",
+            "graph",
+        }
+        for figures in entry["tracks"].values():
+            assert set(figures) == KEYS
+    entry = content["recordings"][walk.name]
+    assert entry["duration_s"] == pytest.approx(20.0)
+    assert entry["path_m"] == pytest.approx(walk.truth.path_length())
+    assert set(content["conventions"]) >= KEYS
+
+
+def test_figures_are_null_where_nobody_can_know_them(folder: Path, walk: ImuSequence) -> None:
+    content = json.loads((folder / "metrics.json").read_text())["recordings"]
+    blind = content["blind"]
+    assert blind["path_m"] is None
+    for figures in blind["tracks"].values():
+        assert all(figures[k] is None for k in KEYS - {"nis", "seconds_network", "seconds_filter"})
+    assert all(v is None for v in blind["tracks"]["network_true_attitude"].values())
+    assert blind["tracks"]["ekf"]["nis"] == content[walk.name]["tracks"]["ekf"]["nis"]
+    seen = content[walk.name]["tracks"]
+    assert all(v is not None for v in seen["ekf"].values())
+    for name in ("inertial", "network", "network_true_attitude"):
+        unknown = {k for k, v in seen[name].items() if v is None}
+        assert unknown == {"nees", "nis"}
+
+
+def test_truth_changes_no_track(compared: Comparison, blind: Comparison) -> None:
+    for name in ("inertial", "network", "ekf"):
+        ours, theirs = compared.tracks[name].trajectory, blind.tracks[name].trajectory
+        np.testing.assert_array_equal(ours.position_W, theirs.position_W)
+
+
+def test_figures_are_those_of_the_tracks_written(folder: Path, walk: ImuSequence) -> None:
+    tracks = json.loads((folder / "metrics.json").read_text())["recordings"][walk.name]["tracks"]
+    for name in TRACKS:
+        track = read_tum(folder / walk.name / f"{name}.tum")
+        again = evaluate_track(track, walk.truth)
+        assert again.ate_m == pytest.approx(tracks[name]["ate_m"], rel=1e-4, abs=1e-6)
+        assert again.aye_rad == pytest.approx(tracks[name]["aye_rad"], rel=1e-4, abs=1e-6)
+    assert tracks["ekf"]["ate_m"] < 0.1 * tracks["inertial"]["ate_m"]
+
+
+def test_arrays_hold_what_tum_cannot(folder: Path, compared: Comparison) -> None:
+    with np.load(folder / compared.sequence.name / "ekf.npz", allow_pickle=False) as arrays:
+        n = len(arrays["time"])
+        assert arrays["covariance"].shape == (n, 15, 15)
+        for name in ("velocity_W", "gyro_bias_B", "accel_bias_B"):
+            assert arrays[name].shape == (n, 3)
+        np.testing.assert_array_equal(arrays["time"], compared.tracks["ekf"].time)
+
+
+def test_figures_are_pictures(folder: Path, walk: ImuSequence) -> None:
+    names = {p.name for p in (folder / walk.name).glob("*.png")}
+    assert names == {"plan.png", "error.png", "innovations.png"}
+    assert {p.name for p in (folder / "blind").glob("*.png")} == {"plan.png", "innovations.png"}
+    for path in folder.rglob("*.png"):
+        content = path.read_bytes()
+        assert content.startswith(b"\x89PNG")
+        assert len(content) > 10_000
+
+
+def test_the_configuration_written_can_be_given_to_the_next_run(folder: Path) -> None:
+    assert read_config(folder / "config.json") == CONFIG
+
+
+def test_a_run_leaves_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
+    track = compared.tracks["ekf"]
+    aligned = align(track.trajectory, walk.truth, "first")
+    files = write_run(
+        tmp_path / "run", walk.name, track, walk.truth, aligned, compared.metrics["ekf"],
+        METRIC_WORDS, CONFIG,
+    )  # fmt: skip
+    assert {p.name for p in files} == {
+        "ekf.tum", "ekf.npz", "metrics.json", "config.json", "health.json",
+        "plan.png", "error.png", "innovations.png",
+    }  # fmt: skip
+    assert sorted(files) == sorted((tmp_path / "run").iterdir())
+    health = json.loads((tmp_path / "run/health.json").read_text())
+    assert health == json.loads(json.dumps(asdict(track.health)))
+
+
+def test_a_folder_that_cannot_be_made_is_a_known_error(
+    tmp_path: Path, compared: Comparison
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StarioError, match="file"):
+        write_comparison(tmp_path / "file" / "out", [compared], CONFIG)
+
+
+def test_truth_that_ends_early_is_compared_as_far_as_it_goes(
+    walk: ImuSequence, model: Anything, compared: Comparison
+) -> None:
+    half = replace(walk, truth=walk.truth.slice(0.0, 10.0))
+    result = compare(model, half, CONFIG)
+    assert result.metrics["ekf"]["ate_m"] is not None
+    np.testing.assert_array_equal(
+        result.tracks["ekf"].trajectory.position_W,
+        compared.tracks["ekf"].trajectory.position_W,
+    )
+
+
+def test_truth_too_scarce_for_a_window_costs_one_track_only(
+    walk: ImuSequence, model: Anything, caplog: pytest.LogCaptureFixture
+) -> None:
+    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
+    result = compare(model, scarce, CONFIG)
+    assert set(result.tracks) == {"inertial", "network", "ekf", "graph"}
+    assert "no track with true attitude" in caplog.text
+
+
+def test_summary_has_median_and_mean_over_recordings(
+    compared: Comparison, walk: ImuSequence
+) -> None:
+    worse = replace(compared, metrics={**compared.metrics, "ekf": {
+        **compared.metrics["ekf"], "ate_m": 3.0}})  # fmt: skip
+    worst = replace(compared, metrics={**compared.metrics, "ekf": {
+        **compared.metrics["ekf"], "ate_m": 8.0}})  # fmt: skip
+    ate = compared.metrics["ekf"]["ate_m"]
+    scores = [scores_of(comparison) for comparison in (compared, worse, worst)]
+    over = summary(scores)["over_recordings"]["ekf"]["ate_m"]
+    assert over["median"] == pytest.approx(3.0)
+    assert over["mean"] == pytest.approx((ate + 11.0) / 3.0)
+    table = summary_table(scores)
+    lines = table.splitlines()
+    assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
+    assert "3.00" in lines[4]
+
+
+def test_the_table_of_a_recording_without_one_of_the_tracks_has_no_number_there(
+    walk: ImuSequence, model: Anything
+) -> None:
+    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
+    comparison = compare(model, scarce, CONFIG)
+    scores = [scores_of(comparison)]
+    assert "nan" not in summary_table(scores)
+    assert "network_true_attitude" not in {
+        k for k, v in summary(scores)["over_recordings"].items() if v
+    }
+
+
+def test_the_demonstration_is_the_same_every_time_and_training_cannot_have_seen_it() -> None:
+    first, second = demonstration(), demonstration()
+    np.testing.assert_array_equal(first.gyro, second.gyro)
+    np.testing.assert_array_equal(first.truth.position_W, second.truth.position_W)
+    assert compare_module.DEMONSTRATION_SEED >= 2**31
+    assert first.duration == pytest.approx(120.0)

@@ -1,0 +1,138 @@
+"""Networks side by side: what the table says of tracks whose errors are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.tables import (
+    METRICS,
+    PROTOCOLS,
+    compare_networks,
+    table_dict,
+    table_text,
+    write_table,
+)
+from stario.network.model import weights_named
+from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.metrics import check_convention
+
+
+class Scaled:
+    """Says of every window that it moved by a share of what its name's network would."""
+
+    def __init__(self, name: str, drift: float) -> None:
+        self.name, self.drift = name, drift
+
+    def predict(self, windows):
+        mean = np.tile([self.drift, 0.0, 0.0], (len(windows), 1))
+        return mean, np.tile(0.01 * np.eye(3), (len(windows), 1, 1))
+
+
+MODELS = [
+    ("a", Scaled("StarIO", 0.1)),
+    ("b", Scaled("StarIO", 0.3)),
+    ("c", Scaled("R-ResNet", 1.0)),
+]
+
+
+@pytest.fixture(scope="module")
+def read(make_walk):
+    def read(path: Path):
+        walk = make_walk(seed=int(path.stem), seconds=12.0)
+        if path.suffix == ".blind":
+            from dataclasses import replace
+
+            return replace(walk, truth=None)
+        return walk
+
+    return read
+
+
+@pytest.fixture(scope="module")
+def table(read):
+    paths = [Path("1.walk"), Path("2.walk"), Path("3.blind")]
+    table, skipped = compare_networks(paths, MODELS, NavigatorConfig(), read, jobs=1)
+    assert [s.item for s in skipped] == ["3.blind"]
+    return table
+
+
+def test_every_network_has_every_track_of_every_recording(table) -> None:
+    assert list(table.parameters) == ["StarIO", "R-ResNet"]
+    assert table.parameters["R-ResNet"] == 4_634_882
+    assert len(table.entries) == 2 * 3 * 3
+    for protocol in PROTOCOLS:
+        assert table.values("StarIO", protocol, "ate_m").shape == (4,)
+        assert table.values("StarIO", protocol, "ate_m", weights="a").shape == (2,)
+
+
+def test_recordings_of_the_same_name_are_told_apart(read) -> None:
+    twice, _ = compare_networks(
+        [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
+    )
+    assert {entry.recording for entry in twice.entries} == {"walk-1", "walk-1-2"}
+    assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
+
+
+def test_mean_and_spread_are_over_weights_of_means_over_recordings(table) -> None:
+    a, b = (table.values("StarIO", "network", "ate_m", weights=w).mean() for w in "ab")
+    mean, spread = table.mean_and_spread("StarIO", "network", "ate_m")
+    assert mean == pytest.approx((a + b) / 2)
+    assert spread == pytest.approx(abs(a - b) / np.sqrt(2))
+    alone, none = table.mean_and_spread("R-ResNet", "network", "ate_m")
+    assert none is None
+    assert alone == pytest.approx(table.values("R-ResNet", "network", "ate_m").mean())
+
+
+def test_ronins_convention_is_smaller_by_the_root_of_two(table, read) -> None:
+    ronin, _ = compare_networks(
+        [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
+    )
+    ours = table.values("R-ResNet", "network", "ate_m")[0]
+    assert ronin.values("R-ResNet", "network", "ate_m")[0] == pytest.approx(ours / np.sqrt(2))
+    assert "convention ronin" in table_text(ronin)
+    with pytest.raises(InputError, match="convention"):
+        check_convention("tlio")
+
+
+def test_text_names_networks_recordings_and_what_is_meant(table) -> None:
+    text = table_text(table)
+    for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
+        assert word in text
+
+
+def test_files_hold_the_same_figures(table, tmp_path: Path) -> None:
+    written = write_table(tmp_path, table)
+    assert {path.name for path in written} == {
+        "networks.csv",
+        "networks.json",
+        "ate_parameters.png",
+        "distributions.png",
+        "pde.png",
+        "trajectories.png",
+    }
+    with (tmp_path / "networks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    content = json.loads((tmp_path / "networks.json").read_text())
+    assert content == json.loads(json.dumps(table_dict(table)))
+    for row, entry in zip(rows, content["entries"], strict=True):
+        assert row["recording"] == entry["recording"]
+        for metric in METRICS:
+            assert float(row[metric]) == pytest.approx(entry[metric])
+    for path in written[2:]:
+        assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_network_is_found_by_its_name_in_the_folder_of_runs(tmp_path: Path) -> None:
+    assert weights_named("StarIO", tmp_path) == "default"
+    assert weights_named("some/file.onnx", tmp_path) == "some/file.onnx"
+    with pytest.raises(WeightsError, match=r"stario train --model 'RNIN'"):
+        weights_named("RNIN", tmp_path)
+    (tmp_path / "RNIN").mkdir()
+    (tmp_path / "RNIN" / "model.safetensors").touch()
+    assert weights_named("RNIN", tmp_path) == tmp_path / "RNIN" / "model.safetensors"

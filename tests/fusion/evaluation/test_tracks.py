@@ -1,0 +1,136 @@
+"""Tracks without a filter: the IMU alone, and displacements chained."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_interp_spline
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.tracks import (
+    inertial_track,
+    network_track,
+    network_track_true_attitude,
+)
+from stario.fusion.navigator import Navigator
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import align, pose_errors
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.windows import WINDOW_SECONDS, clean_samples
+
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
+
+Make = Callable[..., Any]
+
+
+class TrueAttitudeOracle:
+    """Answers the windows of the true-attitude track, which come in order, ten a second."""
+
+    def __init__(self, sequence: ImuSequence) -> None:
+        self.truth, self.start = sequence.truth, clean_samples(sequence)[0][0]
+
+    def predict(self, windows):
+        n = len(windows)
+        time = self.start + 0.1 * np.arange(n)
+        first, last = self.truth.at(time), self.truth.at(time + WINDOW_SECONDS)
+        return last.position_W - first.position_W, np.tile(1e-4 * np.eye(3), (n, 1, 1))
+
+
+def horizontal_errors(trajectory, sequence: ImuSequence) -> np.ndarray:
+    errors = pose_errors(align(trajectory, sequence.truth, "first"), sequence.truth)
+    return np.linalg.norm(errors.position_W[:, :2], axis=1)
+
+
+@pytest.fixture(scope="module")
+def from_rest() -> ImuSequence:
+    """A perfect IMU on a walk that begins at rest: its clock is slowed to a stop there."""
+    walk = generate_walk(2, 12.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.4, -0.7, 1.1)))
+    time = np.arange(0.0, 12.0, 0.005)
+    share = np.clip((time - 1.3) / 2.0, 0.0, 1.0)
+    pace = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    warped = walk.at(0.01 + np.cumsum(pace) * 0.005 + 1e-9 * np.arange(len(time)))
+    position = make_interp_spline(walk.time, walk.position_W, 5)(warped.time)
+    return simulate_imu(Trajectory(time, position, warped.attitude_WB), 200.0, PERFECT_IMU)
+
+
+def test_inertial_is_strapdown_from_rest(from_rest: ImuSequence, still_model: Any) -> None:
+    track = inertial_track(Navigator(still_model).observe(from_rest), CONFIG)
+    aligned = align(track.trajectory, from_rest.truth, "first")
+    errors = pose_errors(aligned, from_rest.truth)
+    assert from_rest.truth.path_length() > 5.0
+    assert np.linalg.norm(errors.position_W, axis=1).max() < 0.05
+    turn = errors.estimate.attitude_WB * errors.truth.attitude_WB.inv()
+    assert turn.magnitude().max() < 1e-3
+
+
+def test_chained_displacements_follow_the_truth_to_centimetres(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """What is lost is what a mean over a second does to a path: its bends get cut."""
+    walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
+    observed = Navigator(make_oracle(walk, walk.truth, CONFIG)).observe(walk)
+    errors = horizontal_errors(network_track(observed).trajectory, walk)
+    assert np.median(errors) < 0.15
+    assert errors.max() < 0.4
+
+
+def test_with_true_attitude_chained_displacements_are_the_truth(make_walk: Make) -> None:
+    walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
+    track = network_track_true_attitude(TrueAttitudeOracle(walk), walk, CONFIG)
+    errors = horizontal_errors(track.trajectory, walk)
+    # The first half second is held at the first window's mean speed: its error stays.
+    assert np.median(errors) < 0.1
+    steps = np.diff(track.trajectory.position_W[::10], axis=0)
+    true = np.diff(walk.truth.at(track.time[::10]).position_W, axis=0)
+    assert np.linalg.norm(steps - true, axis=1)[1:-1].mean() < 0.05
+
+
+def test_the_track_with_true_attitude_needs_truth(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="truth"):
+        network_track_true_attitude(still_model, walk.without_truth(), CONFIG)
+    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.5))
+    with pytest.raises(InputError, match="no second without gaps"):
+        network_track_true_attitude(still_model, scarce, CONFIG)
+
+
+def test_gaps_of_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None:
+    walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
+    valid = (walk.truth.time < 8.0) | (walk.truth.time > 14.0)
+    holed = replace(walk, truth=replace(walk.truth, valid=valid))
+    seen: list[Any] = []
+
+    class Recorder:
+        def predict(self, windows: Any) -> Any:
+            seen.append(windows)
+            return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
+
+    tracks = [network_track_true_attitude(Recorder(), w, CONFIG) for w in (walk, holed)]
+    np.testing.assert_allclose(tracks[1].time, tracks[0].time)
+    assert np.abs(seen[1] - seen[0]).max() < 0.02
+    turn = tracks[1].trajectory.attitude_WB * tracks[0].trajectory.attitude_WB.inv()
+    assert turn.magnitude().max() < 2e-3
+
+
+def test_tracks_without_a_filter_claim_no_uncertainty(walk: ImuSequence, still_model: Any) -> None:
+    observed = Navigator(still_model).observe(walk)
+    for track in (inertial_track(observed, CONFIG), network_track(observed)):
+        assert track.covariance is None
+        assert track.nis is None
+        assert set(track.arrays()) == {
+            "time", "position_W", "quat_xyzw_WB", "velocity_W", "valid",
+        }  # fmt: skip
+
+
+def test_every_track_passes_through_gaps_of_the_imu(
+    walk: ImuSequence, make_oracle: Make, without: Make
+) -> None:
+    holed = without(walk, (walk.time > 8.0) & (walk.time < 10.0))
+    observed = Navigator(make_oracle(holed, walk.truth, CONFIG)).observe(holed)
+    for track in (inertial_track(observed, CONFIG), network_track(observed)):
+        assert np.isfinite(track.trajectory.position_W).all()
+        assert (np.diff(track.time) > 0).all()
+        assert track.time[-1] > 19.9

@@ -1,0 +1,425 @@
+import numpy as np
+import pytest
+
+from stario.fusion.evaluation.benchmark import DenseEkf, filter_speed
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.estimate import settled
+from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
+from stario.fusion.imu.preintegration import Segment, preintegrate
+from stario.fusion.lie import exp_se23, exp_so3, log_so3, skew
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY
+
+NOISE = ImuNoise()
+YAW = np.array([0.0, 0.0, 1.0])
+
+
+def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> StateCloningEkf:
+    sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
+    ekf = engine(slots)
+    ekf.initialise(
+        10.0,
+        exp_so3(np.array([0.5, -0.7, 2.0])),
+        np.array([1.0, -0.5, 0.1]),
+        np.array([30.0, -20.0, 1.0]),
+        np.array([0.001, 0.002, -0.001]),
+        np.array([0.02, -0.01, 0.03]),
+        np.diag(sigma**2),
+    )
+    return ekf
+
+
+def segments(count: int, seed: int = 0) -> list[Segment]:
+    """A device that is turned and shaken at random, 50 ms each."""
+    rng = np.random.default_rng(seed)
+    t = 10.0 + np.arange(10 * count + 1) / 200.0
+    gyro = np.cumsum(rng.normal(0.0, 0.1, (len(t), 3)), axis=0) * 0.3
+    accel = rng.normal([0.0, 0.0, STANDARD_GRAVITY], 1.0, (len(t), 3))
+    parts = [slice(10 * k, 10 * k + 11) for k in range(count)]
+    zero = np.zeros(3)
+    return [
+        preintegrate(t[s], gyro[s], accel[s], zero, zero, NOISE, STANDARD_GRAVITY) for s in parts
+    ]
+
+
+def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> list[float]:
+    """Propagate, clone, measure and release as a navigator does; returns every NIS."""
+    rng = np.random.default_rng(seed)
+    held, nis = [ekf.clone(ekf.time)], []
+    for k, segment in enumerate(segments(count, seed)):
+        ekf.propagate(segment)
+        d = rng.normal(0.0, 0.3, 3)
+        if len(held) == window:
+            result = ekf.update_displacement(held[0], None, d, 0.04 * np.eye(3), gate=7.8)
+            ekf.release(held.pop(0))
+            nis.append(result.nis)
+        if k % 10 == 9:
+            ekf.update_mean_velocity(ekf.v_W + 0.3 * d, 0.1 * np.eye(3), gate=7.8)
+            ekf.update_position_W(ekf.p_W + d, 0.25 * np.eye(3))
+        held.append(ekf.clone(ekf.time))
+    return nis
+
+
+def turned_by(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
+    """What turning the world does to the filter's error state."""
+    return np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
+
+
+@pytest.fixture
+def driven() -> StateCloningEkf:
+    ekf = initialised(6)
+    drive(ekf, 20)
+    return ekf
+
+
+# --- Jacobians -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slot_j", [1, None])
+def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None) -> None:
+    p_i, p_j = np.array([30.0, -20.0, 1.0]), np.array([31.0, -19.4, 1.2])
+    dim, step = 27, 1e-6
+    columns = {0: (0, 6), 1: (15, 18), 2: (21, 24)}
+    pose_j = 0 if slot_j is None else 2
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        """The displacement a network sees that is turned by the estimate's yaw error."""
+        ends = []
+        for pose, p in ((1, p_i), (pose_j, p_j)):
+            theta, rho = (error[c : c + 3] for c in columns[pose])
+            R, _, shift = exp_se23(np.concatenate([theta, np.zeros(3), rho]))
+            ends.append(R @ p + shift)
+        yaw = error[columns[1][0] + 2]
+        return exp_so3(-yaw * YAW) @ (ends[1] - ends[0])
+
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(dim)], axis=1
+    )
+    H = np.zeros((3, dim))
+    for first, block in displacement_jacobian(p_i, p_j, 0, slot_j):
+        H[:, first : first + block.shape[1]] += block
+    np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
+    """The mean is the velocity now less what the force, and gravity, have added since."""
+    v, force, step = np.array([1.0, -0.5, 0.2]), np.array([0.4, -0.3, 5.1]), 1e-6
+    R_WB, seconds = exp_so3(np.array([0.5, -0.2, 1.0])), 0.8
+    fall = 0.5 * seconds * STANDARD_GRAVITY * YAW
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        R, shift, _ = exp_se23(error[:9])
+        by_bias = -0.5 * seconds * R @ R_WB @ error[12:]
+        mean = R @ v + shift - (R @ force + by_bias - fall)
+        return exp_so3(-error[2] * YAW) @ mean
+
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(15)], axis=1
+    )
+    H = np.zeros((3, 15))
+    for first, block in mean_velocity_jacobian(v, force, R_WB, seconds):
+        H[:, first : first + block.shape[1]] += block
+    np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+def test_measurements_do_not_see_yaw(driven: StateCloningEkf) -> None:
+    yaw = np.zeros(driven.dim_x)
+    yaw[2] = 1.0
+    yaw[15 + 2 :: 6] = 1.0
+    p_i, p_j = driven.clone_pose(0)[1], driven.p_W
+    v, R, force = driven.v_W, driven.R_WB, np.array([0.4, -0.3, 5.1])
+    by_velocity = mean_velocity_jacobian(v, force, R, 1.0)
+    for blocks in (displacement_jacobian(p_i, p_j, 0, None), by_velocity):
+        turned = sum(H @ yaw[first : first + H.shape[1]] for first, H in blocks)
+        np.testing.assert_array_equal(turned, 0.0)
+
+
+def injected(dx: np.ndarray) -> StateCloningEkf:
+    """A filter that was told its error exactly: an identity measurement without noise."""
+    ekf = initialised(1)
+    ekf.clone(10.0)
+    ekf.P = np.eye(ekf.dim_x)
+    ekf.update_linear(dx, [(0, np.eye(ekf.dim_x))], 1e-14 * np.eye(ekf.dim_x))
+    return ekf
+
+
+def test_retraction_agrees_with_its_first_order_meaning() -> None:
+    before, step = injected(np.zeros(21)), 1e-5
+    for k in range(21):
+        d = step * np.eye(21)[k]
+        plus, minus = injected(d), injected(-d)
+        clone = [ekf.clone_pose(0) for ekf in (plus, minus, before)]
+        e = np.eye(21)[k]
+        for theta, rotations, rho, positions, position in (
+            (e[0:3], (plus.R_WB, minus.R_WB), e[6:9], (plus.p_W, minus.p_W), before.p_W),
+            (e[0:3], (plus.R_WB, minus.R_WB), e[3:6], (plus.v_W, minus.v_W), before.v_W),
+            (
+                e[15:18],
+                (clone[0][0], clone[1][0]),
+                e[18:21],
+                (clone[0][1], clone[1][1]),
+                clone[2][1],
+            ),
+        ):
+            rotation = log_so3(rotations[0] @ rotations[1].T) / (2 * step)
+            np.testing.assert_allclose(rotation, theta, atol=1e-6)
+            shift = (positions[0] - positions[1]) / (2 * step)
+            np.testing.assert_allclose(shift, rho - skew(position) @ theta, atol=1e-6)
+        np.testing.assert_allclose((plus.b_g - minus.b_g) / (2 * step), e[9:12], atol=1e-6)
+        np.testing.assert_allclose((plus.b_a - minus.b_a) / (2 * step), e[12:15], atol=1e-6)
+
+
+def test_large_corrections_follow_the_exponential_map() -> None:
+    dx = np.random.default_rng(0).normal(size=21)
+    before, after = injected(np.zeros(21)), injected(dx)
+    R, v, p = exp_se23(dx[:9])
+    np.testing.assert_allclose(after.R_WB, R @ before.R_WB, atol=1e-9)
+    np.testing.assert_allclose(after.v_W, R @ before.v_W + v, atol=1e-9)
+    np.testing.assert_allclose(after.p_W, R @ before.p_W + p, atol=1e-9)
+
+
+# --- algebra -------------------------------------------------------------------------------------
+
+
+def test_structured_algebra_equals_filterpy() -> None:
+    ekf, dense = initialised(6), initialised(6, DenseEkf)
+    nis, nis_dense = drive(ekf, 200), drive(dense, 200)
+    assert max(nis) > 7.8 > min(nis), "the gate must act in a part of the updates"
+    np.testing.assert_allclose(nis, nis_dense, rtol=1e-9)
+    for name in ("R_WB", "v_W", "p_W", "b_g", "b_a", "P", "K", "S", "SI", "y", "R", "x_post"):
+        ours, theirs = getattr(ekf, name), getattr(dense, name)
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
+    assert ekf.log_likelihood == pytest.approx(dense.log_likelihood, rel=1e-9)
+    assert ekf.mahalanobis == pytest.approx(dense.mahalanobis, rel=1e-9)
+    assert ekf.mahalanobis**2 == pytest.approx((ekf.y.T @ ekf.SI @ ekf.y).item())
+
+
+def test_structured_algebra_is_much_faster_than_filterpy() -> None:
+    speed = filter_speed(duration=2.0, runs=3)
+    assert speed.states == 141
+    assert speed.ratio > 2.5, "about 4 is usual; less leaves room for a busy machine"
+
+
+def test_filterpy_interface_describes_the_last_step(driven: StateCloningEkf) -> None:
+    prior = driven.P.copy()
+    driven.update_position_W(driven.p_W + 0.1, np.eye(3))
+    np.testing.assert_allclose(driven.P_prior, prior, rtol=0, atol=1e-12 * prior.max())
+    np.testing.assert_array_equal(driven.P_post, driven.P)
+    np.testing.assert_array_equal(driven.x, 0.0)
+    assert driven.x.shape == driven.x_post.shape == (driven.dim_x, 1)
+    np.testing.assert_allclose(driven.K @ driven.y, driven.x_post)
+
+
+def assert_symmetric_and_positive(ekf: StateCloningEkf, held: int) -> None:
+    P = ekf.P[: 15 + 6 * held, : 15 + 6 * held]
+    np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-14 * P.max())
+    sigma = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(sigma, sigma)).min() > -1e-9
+    assert np.linalg.eigvalsh(ekf.world_covariance()).min() > 0.0
+
+
+def test_covariance_stays_symmetric_and_positive() -> None:
+    ekf = initialised(6)
+    drive(ekf, 400)
+    assert_symmetric_and_positive(ekf, 6)
+    np.testing.assert_allclose(ekf.R_WB @ ekf.R_WB.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_covariance_stays_positive_over_half_an_hour() -> None:
+    ekf = initialised(20)
+    for part in range(30):
+        drive(ekf, 1200, window=20, seed=part)
+        assert_symmetric_and_positive(ekf, 20)
+        for slot in range(20):
+            ekf.release(slot)
+    np.testing.assert_allclose(ekf.R_WB @ ekf.R_WB.T, np.eye(3), atol=1e-10)
+
+
+def clone_position(ekf: StateCloningEkf, slot: int) -> np.ndarray:
+    """Covariance (3, 3) of a clone's position [m^2]."""
+    return settled([ekf.clone_estimate(slot)], None).plain_covariance[0, 3:, 3:]
+
+
+def test_a_millimetre_is_taken_in_where_kilometres_were_unknown(driven: StateCloningEkf) -> None:
+    """The covariance keeps the digits of a measurement far better than what was known."""
+    fresh = initialised(6)
+    held = [fresh.clone(10.0)]
+    fresh.propagate(segments(1)[0])
+    between = clone_position(fresh, held[0])
+    fresh.loosen_position(1e5)
+    fresh.update_position_W(fresh.p_W, 1e-8 * np.eye(3))
+    sigma = np.sqrt(np.diag(fresh.world_covariance()))
+    assert np.linalg.eigvalsh(fresh.world_covariance() / np.outer(sigma, sigma)).min() > -1e-6
+    np.testing.assert_allclose(sigma[6:9], 1e-4, rtol=1e-3)
+    assert np.trace(clone_position(fresh, held[0])) < np.trace(between) + 1.0
+
+
+def test_a_clone_is_the_current_pose(driven: StateCloningEkf) -> None:
+    driven.release(0)
+    slot = driven.clone(driven.time)
+    assert slot == 0
+    np.testing.assert_array_equal(driven.clone_pose(0)[0], driven.R_WB)
+    np.testing.assert_array_equal(driven.clone_pose(0)[1], driven.p_W)
+    pose = np.r_[0:3, 6:9]
+    np.testing.assert_array_equal(driven.P[15:21], driven.P[pose])
+    np.testing.assert_array_equal(driven.P[:, 15:21], driven.P[:, pose])
+
+
+def test_a_released_slot_is_empty(driven: StateCloningEkf) -> None:
+    driven.release(2)
+    with pytest.raises(InputError, match="slot"):
+        driven.clone_estimate(2)
+    first = 15 + 6 * 2
+    assert not driven.P[first : first + 6].any()
+    assert not driven.P[:, first : first + 6].any()
+    with pytest.raises(InputError, match="slot"):
+        driven.update_displacement(2, None, np.zeros(3), np.eye(3))
+    with pytest.raises(InputError, match="slot"):
+        driven.release(2)
+
+
+def test_no_free_slot_is_an_error(driven: StateCloningEkf) -> None:
+    with pytest.raises(InputError, match="release"):
+        driven.clone(driven.time)
+
+
+# --- invariance and meaning ----------------------------------------------------------------------
+
+
+def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
+    yaw = 1.1
+    Z = exp_so3(yaw * YAW)
+    ekf, turned = initialised(6), initialised(6)
+    turned.initialise(
+        10.0, Z @ ekf.R_WB, Z @ ekf.v_W, Z @ ekf.p_W, ekf.b_g, ekf.b_a, ekf.world_covariance()
+    )
+    rng = np.random.default_rng(2)
+    slots = [(ekf.clone(10.0), turned.clone(10.0))]
+    for segment in segments(60):
+        for filter_ in (ekf, turned):
+            filter_.propagate(segment)
+        slots.append((ekf.clone(ekf.time), turned.clone(turned.time)))
+        if len(slots) == 6:
+            d = rng.normal(0.0, 0.2, 3)
+            covariance = np.diag([0.02, 0.05, 0.01])
+            i, j = slots[0], slots[-1]
+            first = ekf.update_displacement(i[0], j[0], d, covariance, gate=7.8)
+            second = turned.update_displacement(i[1], j[1], Z @ d, Z @ covariance @ Z.T, gate=7.8)
+            assert first.nis == pytest.approx(second.nis, rel=1e-9)
+            ekf.release(i[0])
+            turned.release(i[1])
+            slots.pop(0)
+    np.testing.assert_allclose(turned.R_WB, Z @ ekf.R_WB, atol=1e-9)
+    np.testing.assert_allclose(turned.v_W, Z @ ekf.v_W, atol=1e-9)
+    np.testing.assert_allclose(turned.p_W, Z @ ekf.p_W, atol=1e-8)
+    np.testing.assert_allclose(turned.b_g, ekf.b_g, atol=1e-9)
+    T = turned_by(yaw, ekf)
+    T[9:15, 9:15] = np.eye(6)
+    np.testing.assert_allclose(turned.P, T @ ekf.P @ T.T, atol=1e-9 * ekf.P.max())
+
+
+def test_displacements_carry_no_information_about_yaw_and_position(
+    driven: StateCloningEkf,
+) -> None:
+    """Information N^T P^-1 N about turning or shifting all poses together does not change."""
+    newest = max(range(6), key=lambda slot: driven.clone_estimate(slot).time)
+    driven.release(newest)  # it equals the current pose, P has no inverse with it
+    held = np.flatnonzero(np.diag(driven.P))
+    N = np.zeros((driven.dim_x, 4))
+    for first, rho in ((0, 6), *((k, k + 3) for k in range(15, driven.dim_x, 6))):
+        N[first + 2, 0] = 1.0
+        N[rho : rho + 3, 1:] = np.eye(3)
+    N = N[held]
+
+    def information() -> np.ndarray:
+        P = driven.P[np.ix_(held, held)]
+        return N.T @ np.linalg.solve(P, N)
+
+    before, P_before = information(), driven.P.copy()
+    slots = [slot for slot in range(6) if slot != newest]
+    for slot in slots[1:]:
+        driven.update_displacement(slots[0], slot, np.array([2.0, 1.0, 0.0]), 1e-3 * np.eye(3))
+    driven.update_mean_velocity(driven.v_W, 1e-3 * np.eye(3))
+    assert np.trace(driven.P) < 0.9 * np.trace(P_before), "the measurements must weigh something"
+    np.testing.assert_allclose(information(), before, rtol=1e-3, atol=1e-3 * before.max())
+
+
+def test_covariance_is_given_and_read_in_plain_terms() -> None:
+    ekf = initialised(0)
+    A = np.random.default_rng(0).normal(size=(15, 15))
+    covariance = A @ A.T
+    ekf.initialise(0.0, ekf.R_WB, ekf.v_W, ekf.p_W, ekf.b_g, ekf.b_a, covariance)
+    np.testing.assert_allclose(ekf.world_covariance(), covariance, rtol=1e-9, atol=1e-9)
+
+
+def test_a_sharp_displacement_sets_the_way_between_the_poses() -> None:
+    ekf = initialised(1)
+    slot = ekf.clone(ekf.time)
+    for segment in segments(20):
+        ekf.propagate(segment)
+    p_before = ekf.p_W
+    way = p_before - ekf.clone_pose(slot)[1] + np.array([0.0, 0.0, 1.0])
+    ekf.update_displacement(slot, None, way, 1e-6 * np.eye(3))
+    np.testing.assert_allclose(ekf.p_W - ekf.clone_pose(slot)[1], way, atol=0.05)
+
+
+# --- gate and refusals ---------------------------------------------------------------------------
+
+
+def test_outliers_are_inflated_by_their_nis(driven: StateCloningEkf) -> None:
+    before = driven.p_W
+    result = driven.update_displacement(0, None, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8)
+    assert result.accepted
+    assert result.scale == pytest.approx(result.nis / 7.8)
+    assert result.dof == 3
+    np.testing.assert_allclose(driven.R, 0.01 * result.scale * np.eye(3))
+    assert np.linalg.norm(driven.p_W - before) < 3.0
+
+
+def test_outliers_can_be_dropped(driven: StateCloningEkf) -> None:
+    P, p = driven.P.copy(), driven.p_W
+    result = driven.update_displacement(
+        0, None, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, gate_mode="reject"
+    )
+    assert not result.accepted
+    assert result.reason == "gated"
+    assert result.nis > 7.8
+    np.testing.assert_array_equal(driven.P, P)
+    np.testing.assert_array_equal(driven.p_W, p)
+
+
+@pytest.mark.parametrize(
+    ("d", "covariance", "reason"),
+    [
+        ([np.nan, 0, 0], np.eye(3), "finite"),
+        ([np.inf, 0, 0], np.eye(3), "finite"),
+        ([0, 0, 0], np.full((3, 3), np.nan), "finite"),
+        ([0, 0, 0], np.diag([1.0, -1.0, 1.0]), "positive definite"),
+        ([0, 0, 0], np.zeros((3, 3)), "positive definite"),
+        ([0, 0, 0], np.ones((3, 3)), "positive definite"),
+    ],
+)
+def test_values_that_cannot_be_used_are_refused(
+    driven: StateCloningEkf, d: list[float], covariance: np.ndarray, reason: str
+) -> None:
+    P, p = driven.P.copy(), driven.p_W
+    result = driven.update_displacement(0, None, np.array(d), covariance, gate=7.8)
+    assert not result.accepted
+    assert reason in result.reason
+    np.testing.assert_array_equal(driven.P, P)
+    np.testing.assert_array_equal(driven.p_W, p)
+
+
+def test_initial_values_that_do_not_fit_are_named() -> None:
+    zero, eye = np.zeros(3), np.eye(3)
+    ekf = StateCloningEkf(2)
+    with pytest.raises(InputError, match="R_WB"):
+        ekf.initialise(0.0, 2 * eye, zero, zero, zero, zero, np.eye(15))
+    with pytest.raises(InputError, match="v_W"):
+        ekf.initialise(0.0, eye, np.full(3, np.nan), zero, zero, zero, np.eye(15))
+    with pytest.raises(InputError, match="covariance"):
+        ekf.initialise(0.0, eye, zero, zero, zero, zero, -np.eye(15))
+    with pytest.raises(InputError, match="slots"):
+        StateCloningEkf(-1)

@@ -1,0 +1,356 @@
+"""The fixed-lag graph of a stream: against the filter and the batch, fixes, faults, memory."""
+
+from __future__ import annotations
+
+import gc
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import GRAPH as CONFIG
+from support import stream
+
+from stario.fusion import Navigator, NavState
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.estimator import PriorPose
+from stario.fusion.filter.jacobians import yaw_twist
+from stario.fusion.graph.fixed_lag import GraphRecipe
+from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.lie import exp_so3
+from stario.fusion.navigator import Observed
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+
+
+def lagged(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
+    return Navigator(model, config, backend="graph", **more)
+
+
+def true_start(walk: ImuSequence) -> PriorPose:
+    truth = walk.truth
+    return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
+
+
+def errors(states: list[NavState], walk: ImuSequence) -> np.ndarray:
+    time = np.array([s.time for s in states])
+    position = np.array([s.p_W for s in states])
+    return np.linalg.norm(position - walk.truth.at(time).position_W, axis=1)
+
+
+def assert_sound(state: NavState) -> None:
+    for value in (state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a, state.covariance):
+        assert np.isfinite(value).all()
+    assert np.linalg.eigvalsh(state.covariance).min() > -1e-9
+    np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-9)
+
+
+def test_a_stream_knows_what_the_filter_knows(make_walk: Make, make_oracle: Make) -> None:
+    """Same times; errors and sigmas alike, yaw's above all, which only fixes can tell."""
+    walk = make_walk(5, 40.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    ours, theirs = (
+        stream(Navigator(oracle, CONFIG, true_start(walk), backend), walk)
+        for backend in ("graph", "ekf")
+    )
+    assert [s.time for s in ours] == [s.time for s in theirs]
+    assert errors(ours, walk).mean() < 1.3 * errors(theirs, walk).mean() + 0.02
+    sigma, expected = (np.sqrt(np.diag(states[-1].covariance)) for states in (ours, theirs))
+    np.testing.assert_allclose(sigma[:9], expected[:9], rtol=0.1)
+    assert 0.95 < sigma[2] / expected[2] < 1.05
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.2, 0.3])
+def test_a_start_askew_leads_a_stream_no_further_astray_than_the_filter(
+    tilt: float, make_walk: Make, make_oracle: Make
+) -> None:
+    """Starts in motion are up to 0.2 rad off level, and then right displacements look false."""
+    walk = make_walk(5, 20.0)
+    config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=1))
+    oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    askew = replace(start, R_WB=exp_so3(np.array([tilt, 0.0, 0.0])) @ start.R_WB, tilt_sigma=0.05)
+    ours, theirs = (
+        stream(Navigator(oracle, config, askew, backend), walk) for backend in ("graph", "ekf")
+    )
+    assert errors(ours, walk).max() < 1.1 * errors(theirs, walk).max() + 0.1
+
+
+def spoilt_track(
+    observed: Observed, config: NavigatorConfig, metres: float, epochs: range
+) -> tuple[np.ndarray, int]:
+    """A stream's positions until 3 s behind epochs whose windows are off, and how many it gated."""
+    start = observed.intake.start
+    assert start is not None
+    recipe, positions = GraphRecipe(config, start), []
+    for k in range(epochs.stop + 3 * config.filter.output_rate):
+        measurement = observed.measurements[k]
+        if measurement is not None and k in epochs:
+            measurement = (measurement[0] + [metres, 0.0, 0.0], measurement[1])
+        recipe.step(observed.epochs[k], measurement)
+        positions.append(recipe.state().p_W)
+    return np.array(positions), recipe.health(observed.intake.counts).gated
+
+
+def test_a_stream_takes_displacements_as_its_filter_judges_them(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """Two windows that are 5 m off are left out by both."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    observed = Navigator(oracle, CONFIG).observe(walk)
+    right, none = spoilt_track(observed, CONFIG, 0.0, range(40, 50))
+    spoilt, two = spoilt_track(observed, CONFIG, 5.0, range(40, 50))
+    assert (none, two) == (0, 2)
+    assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.1
+
+
+def test_what_the_filter_weighs_otherwise_a_stream_judges_itself(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """At 20 updates a second it takes one window in ten: a false one pulls harder."""
+    config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=20))
+    oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
+    observed = Navigator(oracle, config).observe(walk)
+    at = next(k for k, epoch in enumerate(observed.epochs) if epoch.stop > walk.time[0] + 9.99)
+    right, _ = spoilt_track(observed, config, 0.0, range(at, at + 1))
+    spoilt, _ = spoilt_track(observed, config, 1.2, range(at, at + 1))
+    assert np.linalg.norm(spoilt - right, axis=1).max() < 0.35
+
+
+def test_a_heading_far_from_what_was_thought_turns_a_stream_as_its_filter(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Taken as the filter inflated it; to a loss of the graph's own it was 60 sigmas off."""
+    walk = make_walk(5, 16.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    turn = about_z(0.6).as_matrix()
+    askew = replace(start, R_WB=turn @ start.R_WB, v_W=turn @ start.v_W, yaw_sigma=0.5)
+    R_WB = walk.truth.at(np.array([10.25])).attitude_WB.as_matrix()[0]
+    ends = []
+    for backend in ("graph", "ekf"):
+        navigator = Navigator(oracle, CONFIG, askew, backend)
+        navigator.update_heading(10.25, yaw_twist(R_WB), 0.01)
+        ends.append(errors(stream(navigator, walk), walk)[-1])
+    assert ends[0] < 1.2 * ends[1] + 0.1
+
+
+def test_a_late_fix_that_changes_what_was_judged_leads_a_stream_to_its_filter(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """A start 4 m/s off makes right displacements look false, until the speed is told."""
+    walk = make_walk(5, 6.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    fast = replace(start, v_W=start.v_W + np.array([4.0, 0.0, 0.0]), velocity_sigma=0.5)
+    v_W = walk.truth.at(np.array([0.3])).velocity_W[0]
+    late: list[np.ndarray] = []
+    for backend in ("graph", "ekf"):
+        navigator = Navigator(oracle, CONFIG, fast, backend)
+        states = []
+        for time, gyro, accel in zip(walk.time, walk.gyro, walk.accel, strict=True):
+            states.append(navigator.push(time, gyro, accel))
+            if abs(time - 1.15) < 1e-6:
+                navigator.update_velocity(0.3, v_W, 1e-4 * np.eye(3))
+        late.append(errors([s for s in states if s is not None and s.time > 1.2], walk))
+    assert late[1].max() < 0.5
+    assert late[0].max() < late[1].max() + 0.1
+
+
+def test_at_first_a_stream_is_the_batch(walk: ImuSequence, make_oracle: Make) -> None:
+    """Until something has left the lag both hold all of it, one window a second or two."""
+    short = walk.slice(0.0, 4.0)
+    oracle = make_oracle(short, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    track, states = lagged(oracle).run(short), stream(lagged(oracle), short)
+    at = int(np.argmin(np.abs(track.time - 3.0)))
+    newest = next(s for s in states if abs(s.time - 3.0) < 1e-6)
+    # The batch sees a second more.
+    assert np.linalg.norm(newest.p_W - track.trajectory.position_W[at]) < 0.1
+
+
+def test_a_longer_lag_than_the_walk_changes_little(walk: ImuSequence, make_oracle: Make) -> None:
+    """What is marginalised still counts."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    ends = [
+        stream(lagged(oracle, replace(CONFIG, graph=replace(CONFIG.graph, lag=lag))), walk)[-1]
+        for lag in (3.0, 60.0)
+    ]
+    assert np.linalg.norm(ends[0].p_W - ends[1].p_W) < 0.15
+    np.testing.assert_allclose(*(np.sqrt(np.diag(s.covariance)) for s in ends), rtol=0.05)
+
+
+def test_what_is_forgotten_leaves_the_newest_as_it_was(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """Also where windows reach from the forgotten keyframes past the first that stays."""
+    navigator = lagged(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
+    stream(navigator, walk.slice(0.0, 6.2))
+    graph = navigator._recipe._builder.graph
+    graph.solve()
+    before, oldest = graph.state(graph.last), graph.keyframes[0]
+    graph.marginalise(oldest + 3)
+    graph.solve(1)
+    after = graph.state(graph.last)
+    assert graph.keyframes[0] == oldest + 3
+    np.testing.assert_allclose(after.p_W, before.p_W, atol=1e-4)
+    np.testing.assert_allclose(after.v_W, before.v_W, atol=1e-4)
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-3, atol=1e-7)
+
+
+def test_fixes_pull_the_newest_state_late_ones_too(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    navigator = lagged(oracle, prior=true_start(walk))
+    seen = walk.truth.at(np.array([10.33, 14.0])).position_W
+    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
+    before = after = None
+    for row in rows:
+        if navigator.push(*row) is None:
+            continue
+        if abs(row[0] - 10.9) < 0.01 and before is None:  # more than half a second late
+            before = navigator.state
+            navigator.update_position(10.33, seen[0], 1e-4 * np.eye(3))
+            after = navigator.state
+        if abs(row[0] - 13.5) < 0.01:  # half a second early
+            navigator.update_position(14.0, seen[1], 1e-4 * np.eye(3))
+    assert before.time == after.time
+    assert errors([after], walk)[0] < 0.1
+    assert np.trace(after.covariance[6:9, 6:9]) < 0.2 * np.trace(before.covariance[6:9, 6:9])
+    assert navigator.health.fixes == {"applied": 2}
+    assert_sound(navigator.state)
+
+
+def test_two_positions_turn_a_stream_that_started_without_a_pose(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    walk = make_walk(2, 30.0)
+    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
+    navigator = lagged(make_oracle(walk, walk.truth, CONFIG))
+    for time in (5.0, 25.0):
+        seen = R.apply(walk.truth.at(np.array([time])).position_W[0]) + shift
+        navigator.update_position(time, seen, 0.01 * np.eye(3))
+    states = stream(navigator, walk)
+    last = states[-1]
+    truth = R.apply(walk.truth.at(np.array([last.time])).position_W[0]) + shift
+    assert np.linalg.norm(last.p_W - truth) < 1.0
+    assert last.world == 2
+    assert_sound(last)
+
+
+def test_rest_stops_the_drift(make_oracle: Make, still_model: Any, make_walk: Make) -> None:
+    """A device on a table, whose network knows nothing."""
+    rng = np.random.default_rng(0)
+    n = 3000
+    time = np.arange(n) / 100.0
+    gyro = 2e-3 + 2e-3 * rng.normal(size=(n, 3))
+    accel = np.array([0.0, 0.0, 9.80665]) + 0.02 * rng.normal(size=(n, 3))
+    navigator = lagged(still_model)
+    for row in zip(time, gyro, accel, strict=True):
+        navigator.push(*row)
+    assert navigator.health.rests["applied"] > 100
+    assert np.linalg.norm(navigator.state.p_W) < 0.1
+    np.testing.assert_allclose(navigator.state.b_g, 2e-3, atol=2e-4)
+
+
+def test_states_stay_sound_under_bursts_of_nan(walk: ImuSequence, make_oracle: Make) -> None:
+    rng = np.random.default_rng(0)
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    for start in rng.integers(0, len(walk), 20):
+        (gyro if rng.random() < 0.5 else accel)[start : start + rng.integers(1, 60)] = np.nan
+    bad = replace(walk, gyro=gyro, accel=accel)
+    navigator = lagged(make_oracle(bad, walk.truth, CONFIG))
+    for state in stream(navigator, bad):
+        assert_sound(state)
+    assert len(navigator.health.gaps) > 3
+
+
+def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
+    walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve, calls = KeyframeGraph.solve, []
+
+    def fails_once(self: KeyframeGraph, most_rounds: int = 5) -> Any:
+        calls.append(self)
+        if len(calls) == 16:  # two a second
+            raise IndeterminateError("velocity at 8.0 s")
+        return solve(self, most_rounds)
+
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    filtered = stream(Navigator(oracle, CONFIG), walk)
+    monkeypatch.setattr(KeyframeGraph, "solve", fails_once)
+    navigator = lagged(oracle)
+    states = stream(navigator, walk)
+    at = next(k for k, s in enumerate(states) if abs(s.time - 8.0) < 1e-6)
+    np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-12)
+    assert len(calls) > 30
+    assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
+    assert (
+        "fell back to the filter 1 times, last for velocity at 8.0 s" in navigator.health.notes[0]
+    )
+
+
+def grown(walk: ImuSequence, model: Any, warm: float, seconds: float) -> int:
+    navigator = lagged(model)
+    rows = list(zip(walk.gyro.tolist(), walk.accel.tolist(), strict=True))
+
+    def push(start: float, stop: float) -> None:
+        for k in range(round(start * walk.rate), round(stop * walk.rate)):
+            navigator.push(k / walk.rate, *rows[k % len(rows)])
+
+    tracemalloc.start()
+    try:
+        push(0.0, warm)
+        gc.collect()  # what it still holds in free lists is no growth
+        before = tracemalloc.get_traced_memory()[0]
+        push(warm, warm + seconds)
+        gc.collect()
+        assert len(navigator._recipe._builder.graph.keyframes) < 12
+        return tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
+    assert grown(make_walk(1, 30.0, 50.0), still_model, 20.0, 30.0) < 40_000
+
+
+@pytest.mark.slow
+def test_the_memory_of_an_hour_does_not_grow(make_walk: Make, still_model: Any) -> None:
+    # Half of what keeping one number of each keyframe would take.
+    assert grown(make_walk(1, 30.0, 50.0), still_model, 120.0, 3600.0) < 16 * 2 * 3600
+
+
+@pytest.mark.parametrize("stop", [3.0, 11.37])
+def test_a_stream_goes_on_in_another_navigator(
+    walk: ImuSequence, make_oracle: Make, stop: float
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
+    cut = int(np.searchsorted(walk.time, stop))
+    one = lagged(oracle)
+    for row in rows[:cut]:
+        one.push(*row)
+    other = lagged(oracle)
+    other.restore(one.snapshot())
+    for row in rows[cut:]:
+        one.push(*row)
+        other.push(*row)
+    assert np.abs(one.state.p_W - other.state.p_W).max() < 1e-9
+    np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_behind_a_long_gap_it_begins_anew(
+    make_walk: Make, make_oracle: Make, without: Make
+) -> None:
+    walk = make_walk(1, 80.0, 50.0)
+    holed = without(walk, (walk.time > 8.0) & (walk.time < 70.0))
+    oracle = make_oracle(holed, walk.truth, CONFIG)
+    navigator = lagged(oracle)
+    for state in stream(navigator, holed):
+        assert_sound(state)
+    track = navigator.run(holed)
+    assert np.isfinite(track.covariance).all()
+    assert track.health.notes[0].startswith("graph of")

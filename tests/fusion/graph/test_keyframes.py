@@ -1,0 +1,273 @@
+"""The batch graph on simulated walks: against the filter, under symmetries, faults and fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import GRAPH as CONFIG
+from support import Broken, ate
+
+from stario.fusion import Navigator
+from stario.fusion.config import NavigatorConfig, config_from_dict
+from stario.fusion.evaluation.backends import score_walk, summary
+from stario.fusion.filter.estimator import PriorPose
+from stario.fusion.fixes import heading_fix, position_fix, velocity_fix
+from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.state import NavState
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.metrics import position_nees
+from stario.sequences.noise import ImuNoise
+from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+
+
+def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
+    return Navigator(model, config, backend="graph", **more)
+
+
+# --- what it is good for ---------------------------------------------------------------------
+
+
+def test_it_is_closer_to_the_truth_than_the_filter() -> None:
+    scores = [score_walk(seed, 30.0) for seed in range(1, 4)]
+    figures = summary(scores)
+    assert figures["median_ate_to_ekf"]["graph"] < 0.95
+    assert 0.8 < figures["median_ate_to_ekf"]["fixed_lag"] < 1.2
+
+
+def test_its_states_stand_at_the_filters_times_with_a_smaller_covariance(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    smoothed, filtered = graph(oracle).run(walk), Navigator(oracle, CONFIG).run(walk)
+    np.testing.assert_array_equal(smoothed.time, filtered.time)
+    ours, theirs = (np.trace(t.covariance[:, 3:6, 3:6], axis1=1, axis2=2) for t in
+                    (smoothed, filtered))  # fmt: skip
+    assert (ours[10:] < 1.05 * theirs[10:]).all()  # velocity, after the first second
+    assert ours.mean() < 0.7 * theirs.mean()
+    for covariance in smoothed.covariance:
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert "keyframes" in smoothed.health.notes[0]
+    assert 0.5 < position_nees(smoothed.trajectory, walk.truth).mean < 9.0
+
+
+def test_between_keyframes_it_moves_like_the_imu(walk: ImuSequence, make_oracle: Make) -> None:
+    """Velocity is the derivative of position, and nothing jumps where keyframes stand."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    track = graph(oracle).run(walk).trajectory
+    step = np.diff(track.time)[:, None]
+    mean = 0.5 * (track.velocity_W[1:] + track.velocity_W[:-1])
+    off = np.linalg.norm(np.diff(track.position_W, axis=0) / step - mean, axis=1)
+    assert off.max() < 0.05
+    truth = walk.truth.at(track.time)
+    turned = (track.attitude_WB * truth.attitude_WB.inv()).magnitude()
+    assert np.abs(np.diff(turned)).max() < 0.01
+
+
+def test_a_run_is_the_same_twice(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    once, twice = graph(oracle).run(walk), graph(oracle).run(walk.without_truth())
+    for name, values in once.arrays().items():
+        np.testing.assert_array_equal(twice.arrays()[name], values, err_msg=name)
+
+
+# --- symmetries ------------------------------------------------------------------------------
+
+
+def test_a_turned_and_shifted_world_turns_and_shifts_the_track(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    R = walk.truth.attitude_WB[0].as_matrix()
+    turn, shift = about_z(2.0), np.array([100.0, -40.0, 3.0])
+    first = PriorPose(R, np.zeros(3), np.zeros(3), velocity_sigma=1.0)
+    other = replace(first, R_WB=turn.as_matrix() @ R, p_W=shift)
+    here, there = (graph(oracle, prior=prior).run(walk).trajectory for prior in (first, other))
+    expected = turn.apply(here.position_W) + shift
+    np.testing.assert_allclose(there.position_W, expected, atol=1e-4)
+    np.testing.assert_allclose(there.velocity_W, turn.apply(here.velocity_W), atol=1e-4)
+
+
+def test_another_mount_turns_the_track_about_the_vertical_and_no_more(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    R_BM = Rotation.from_rotvec([1.5, 1.0, -0.5])
+    turned = replace(
+        walk,
+        gyro=R_BM.apply(walk.gyro, inverse=True),
+        accel=R_BM.apply(walk.accel, inverse=True),
+        truth=replace(walk.truth, attitude_WB=walk.truth.attitude_WB * R_BM),
+    )
+    ours, theirs = (
+        graph(make_oracle(s, s.truth, CONFIG)).run(s).trajectory for s in (turned, walk)
+    )
+    turn = ours.attitude_WB * (theirs.attitude_WB * R_BM).inv()
+    assert np.ptp(np.unwrap(yaw_of(turn))) < 1e-4
+    back = about_z(float(yaw_of(turn)[0])).apply(ours.position_W, inverse=True)
+    assert np.abs(back - theirs.position_W).max() < 1e-3
+
+
+# --- an indeterminate system -----------------------------------------------------------------
+
+
+def first_state(covariance: np.ndarray) -> NavState:
+    zero = np.zeros(3)
+    return NavState(12.3, np.eye(3), zero, zero, zero, zero, covariance)
+
+
+@pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "pose"), (9, "bias")])
+def test_a_state_that_nothing_determines_is_named(first: int, name: str) -> None:
+    sigma = np.full(15, 0.1)
+    sigma[first : first + 3] = 1e9
+    graph = KeyframeGraph(first_state(np.diag(sigma**2)), gate=0.997)
+    samples = np.linspace(12.3, 13.3, 11), np.zeros((11, 3)), np.tile([0.0, 0.0, 9.80665], (11, 1))
+    segment = preintegrate(*samples, np.zeros(3), np.zeros(3), ImuNoise(), 9.80665)
+    graph.add_keyframe(segment, replace(first_state(np.eye(15)), time=13.3))
+    with pytest.raises(IndeterminateError, match=rf"{name} at 1[23]\.3 s"):
+        graph.solve()
+    np.testing.assert_array_equal(graph.pose(1).p_W, np.zeros(3))
+
+
+def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
+    walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(self: KeyframeGraph, most_rounds: int = 5) -> None:
+        raise IndeterminateError("velocity at 12.3 s")
+
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    filtered = Navigator(oracle, CONFIG).run(walk)
+    monkeypatch.setattr(KeyframeGraph, "solve", fails)
+    track = graph(oracle).run(walk)
+    np.testing.assert_array_equal(track.trajectory.position_W, filtered.trajectory.position_W)
+    np.testing.assert_array_equal(track.covariance, filtered.covariance)
+    assert track.health.notes == ["graph fell back to the filter's track: velocity at 12.3 s"]
+    assert track.health.notes[0] in track.health.lines()
+
+
+def test_a_perfect_sensor_is_no_reason_to_fail(walk: ImuSequence, make_oracle: Make) -> None:
+    """Densities of zero: gtsam has nothing to invert, the track comes out all the same."""
+    exact = replace(CONFIG, noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
+    track = graph(make_oracle(walk, walk.truth, exact), exact).run(walk)
+    assert np.isfinite(track.trajectory.position_W).all()
+    assert len(track.health.notes) == 1
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mean", "variance"), [(np.nan, 1e-4), (0.0, np.inf), (0.0, -1.0)])
+def test_measurements_without_meaning_are_refused_and_counted(
+    walk: ImuSequence, make_oracle: Make, mean: float, variance: float
+) -> None:
+    model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
+    track = graph(model).run(walk)
+    assert sum(track.health.refused.values()) == track.health.updates // 3
+    assert np.isfinite(track.covariance).all()
+    assert ate(track, walk) < 0.5
+
+
+def test_outliers_are_weighed_down(walk: ImuSequence, make_oracle: Make) -> None:
+    model = Broken(make_oracle(walk, walk.truth, CONFIG, sigma=0.05), 2.0, 0.05**2)
+    track = graph(model).run(walk)
+    assert "weighed down" in track.health.notes[0]
+    assert " 0 measurements" not in track.health.notes[0]
+    open_gate = replace(CONFIG, filter=replace(CONFIG.filter, gate=1.0 - 1e-16))
+    model = Broken(make_oracle(walk, walk.truth, open_gate, sigma=0.05), 2.0, 0.05**2)
+    assert ate(track, walk) < 0.6 * ate(graph(model, open_gate).run(walk), walk)
+
+
+@pytest.mark.parametrize("length", [0.3, 1.0, 3.0])
+def test_a_gap_is_crossed_and_its_sigma_covers_the_error(
+    walk: ImuSequence, make_oracle: Make, without: Make, length: float
+) -> None:
+    holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
+    track = graph(make_oracle(holed, walk.truth, CONFIG)).run(holed)
+    assert (~track.trajectory.valid).sum() == 1
+    assert np.isfinite(track.covariance).all()
+    assert track.health.notes[0].startswith("graph of")  # it did not fall back
+    at_end = walk.truth.at(np.clip(track.time[-1:], 0.0, walk.time[-1]))
+    turn = about_z(float(yaw_of(at_end.attitude_WB * track.trajectory.attitude_WB[-1].inv())[0]))
+    start = walk.truth.position_W[0]
+    error = np.linalg.norm(turn.apply(track.trajectory.position_W[-1]) + start - at_end.position_W)
+    assert error < 4.0 * np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9])) + 0.5
+
+
+def test_an_unknown_back_end_is_refused_by_name(still_model: Any) -> None:
+    with pytest.raises(InputError, match="backend: found 'ukf', expected one of ekf, graph"):
+        Navigator(still_model, backend="ukf")
+
+
+@pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
+def test_a_lag_out_of_bounds_is_refused(lag: float) -> None:
+    with pytest.raises(ConfigError, match=r"graph\.lag"):
+        config_from_dict({"graph": {"lag": lag}})
+
+
+# --- fixes -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time", [10.0, 10.37, 10.4])
+def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(
+    walk: ImuSequence, make_oracle: Make, time: float
+) -> None:
+    """On a keyframe, between the filter's states, and on one of them."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    prior = PriorPose(
+        walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], walk.truth.position_W[0]
+    )
+    truth = walk.truth.at(np.array([time])).position_W[0]
+    fix = position_fix(time, truth, 1e-4 * np.eye(3))
+    track = graph(oracle, prior=prior).run(walk, fixes=[fix])
+    for error, limit in ((track, 0.06), (graph(oracle, prior=prior).run(walk), np.inf)):
+        near = np.abs(error.time - time) < 0.11
+        true = walk.truth.at(error.time[near]).position_W
+        assert np.linalg.norm(error.trajectory.position_W[near] - true, axis=1).max() < limit
+    k = int(np.argmin(np.abs(track.time - time)))
+    assert np.sqrt(track.covariance[k, 6:9, 6:9].trace()) < 0.08
+    assert track.health.fixes == {"applied": 1}
+
+
+def test_heading_and_velocity_fixes_are_met(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], np.zeros(3))
+    truth = walk.truth.at(np.array([9.25, 14.0]))
+    yaw = float(yaw_of(truth.attitude_WB)[0])
+    fixes = [
+        heading_fix(9.25, yaw, 1e-3),
+        velocity_fix(14.0, truth.velocity_W[1], 1e-4 * np.eye(3)),
+    ]
+    track = graph(oracle, prior=prior).run(walk, fixes=fixes)
+    near = int(np.argmin(np.abs(track.time - 9.25)))
+    at = walk.truth.at(track.time[[near]])
+    off = yaw_of(track.trajectory.attitude_WB[[near]] * at.attitude_WB.inv())
+    assert abs(float(off[0])) < 0.01
+    k = int(np.argmin(np.abs(track.time - 14.0)))
+    assert np.linalg.norm(track.trajectory.velocity_W[k] - truth.velocity_W[1]) < 0.05
+    assert track.covariance[k, 3, 3] < 2e-4
+
+
+def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    walk = make_walk(2, 40.0)
+    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
+    truth = walk.truth.at(np.array([5.0, 30.0]))
+    seen = R.apply(truth.position_W) + shift
+    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip((5.0, 30.0), seen, strict=True)]
+    track = graph(make_oracle(walk, walk.truth, CONFIG)).run(walk, fixes=fixes)
+    times = np.clip(track.time, 0.0, walk.time[-1])
+    error = track.trajectory.position_W - R.apply(walk.truth.at(times).position_W) - shift
+    assert np.linalg.norm(error, axis=1).max() < 1.0
+    P = track.covariance[:, 6:9, 6:9]
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
+    assert np.median(nees) < 8.0
+    assert track.health.fixes["applied"] == 2

@@ -1,0 +1,260 @@
+"""Epochs and windows: every moment once, nothing across a gap, and nothing from the filter."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.imu.front_end import Intake, all_epochs
+from stario.fusion.imu.intervals import Epoch, IntakeCounts
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU
+from stario.sequences.windows import WINDOW_SECONDS, windows_of, world_streams
+
+CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10))
+
+
+def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.trapezoid(values, time, axis=0)
+
+
+def assert_seamless(epochs: list[Epoch], first: float) -> None:
+    """Each epoch begins where the one before ended, with the same samples there."""
+    assert epochs[0].start == first
+    for before, after in pairwise(epochs):
+        assert after.start == before.stop
+        np.testing.assert_allclose(after.gyro[0], before.gyro[-1], atol=1e-12)
+        np.testing.assert_allclose(after.accel[0], before.accel[-1], atol=1e-12)
+    for epoch in epochs:
+        assert (np.diff(epoch.time) > 0).all()
+
+
+def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) -> ImuSequence:
+    """The walk sampled unevenly: times jittered (values as the walk had them), samples lost."""
+    rng = np.random.default_rng(seed)
+    time = sequence.time + jitter / sequence.rate * rng.uniform(-0.45, 0.45, len(sequence))
+    time[0] = sequence.time[0]
+    time = np.clip(time, sequence.time[0], sequence.time[-1])
+
+    def at(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(time, sequence.time, v) for v in values.T], axis=1)
+
+    keep = rng.random(len(time)) > drops
+    keep[0] = True
+    keep[1:] &= np.diff(time) > 0
+    gyro, accel = at(sequence.gyro), at(sequence.accel)
+    return replace(sequence, time=time[keep], gyro=gyro[keep], accel=accel[keep])
+
+
+@pytest.mark.parametrize(
+    ("rate", "jitter", "drops"),
+    [
+        (50.0, 0.0, 0.0),
+        (50.0, 0.5, 0.05),
+        (100.0, 1.0, 0.2),
+        (199.36, 0.0, 0.0),
+        (200.0, 1.0, 0.1),
+        (1000.0, 0.0, 0.0),
+        (1000.0, 1.0, 0.2),
+    ],
+)
+def test_epochs_cover_every_moment_once(
+    make_walk: Callable[..., ImuSequence], rate: float, jitter: float, drops: float
+) -> None:
+    walk = uneven(make_walk(2, 8.0, rate), drops, jitter)
+    epochs, intake = all_epochs(walk, CONFIG)
+    assert intake.counts == IntakeCounts(used=len(walk))
+    assert_seamless(epochs, walk.time[0])
+    period = 1.0 / CONFIG.filter.output_rate
+    np.testing.assert_allclose([e.stop - e.start for e in epochs], period, atol=1e-9)
+    end = epochs[-1].stop
+    assert walk.time[-1] - end < period
+    # Trapezoids between the recording's samples, up to the last epoch's end.
+    inside = walk.time < end
+    for name in ("gyro", "accel"):
+        values = getattr(walk, name)
+        last = [np.interp(end, walk.time, values[:, k]) for k in range(3)]
+        whole = integral(np.append(walk.time[inside], end), np.vstack([values[inside], last]))
+        pieces = sum(integral(e.time, getattr(e, name)) for e in epochs)
+        np.testing.assert_allclose(pieces, whole, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [1, 2, 5, 10, 20])
+def test_windows_come_at_the_update_rate_one_second_after_the_start(
+    walk: ImuSequence, rate: int
+) -> None:
+    epochs, _ = all_epochs(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
+    stops = np.array([e.stop for e in epochs if e.window is not None]) - walk.time[0]
+    assert stops[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(np.diff(stops), 1.0 / rate, atol=1e-9)
+    assert all(e.update for e in epochs if e.window is not None)
+
+
+@pytest.mark.parametrize(("rate", "bound"), [(100.0, 1e-3), (200.0, 1e-3), (1000.0, 5e-3)])
+def test_windows_equal_those_of_training_for_the_same_attitude(
+    make_walk: Callable[..., ImuSequence], rate: float, bound: float
+) -> None:
+    walk = make_walk(3, 6.0, rate, PERFECT_IMU)
+    epochs, _ = all_epochs(walk, CONFIG)
+    # The levelled attitude stands in for the truth; corrections at epochs' ends are small steps.
+    pairs = [(e.time[k], e.attitudes[k]) for e in epochs for k in range(len(e.time) - 1)]
+    time, R = zip(*pairs, strict=True)
+    truth = Trajectory(np.array(time), np.zeros((len(time), 3)), Rotation.from_matrix(np.stack(R)))
+    (stream,) = world_streams(replace(walk, truth=truth), attitude="true")
+    theirs, _ = windows_of(stream, 20)
+    ours = np.stack([e.window for e in epochs if e.window is not None])
+    n = min(len(ours), len(theirs))
+    assert n > 40
+    off = np.abs(ours[:n] - theirs[:n])
+    # At an epoch's end the attitude steps, and a faster sensor's average stops short of it.
+    assert off.mean() < bound
+    assert off.max() < 100.0 * bound
+    assert ours.dtype == np.float32
+
+
+def test_windows_start_with_the_attitude_they_state(walk: ImuSequence) -> None:
+    epochs, _ = all_epochs(walk, CONFIG)
+    by_stop = {round(e.stop, 6): e for e in epochs}
+    checked = 0
+    for epoch in epochs:
+        before = by_stop.get(round(epoch.stop - WINDOW_SECONDS, 6))
+        if epoch.window is None or before is None:
+            continue
+        np.testing.assert_array_equal(epoch.R_NB_window, before.R_NB)
+        first = before.R_NB @ before.accel[-1]
+        np.testing.assert_allclose(epoch.window[3:, 0], first, atol=1e-5)
+        checked += 1
+    assert checked > 100
+
+
+def test_bad_samples_are_dropped_and_counted_and_the_rest_is_as_if_they_had_never_been(
+    walk: ImuSequence, without: Callable[..., ImuSequence]
+) -> None:
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    gyro[300, 1], accel[500], time[700], gyro[900] = np.nan, np.inf, np.nan, -np.inf
+    time[1000] = time[999]  # repeated
+    time[1200] = time[1201] = time[1150]  # late
+    bad = replace(walk, time=time, gyro=gyro, accel=accel)
+    gone = np.zeros(len(walk), dtype=bool)
+    gone[[300, 500, 700, 900, 1000, 1200, 1201]] = True
+    epochs, intake = all_epochs(bad, CONFIG)
+    expected, _ = all_epochs(without(walk, gone), CONFIG)
+    assert intake.counts == IntakeCounts(
+        used=len(walk) - 7, not_finite=4, duplicate=1, out_of_order=2
+    )
+    assert len(epochs) == len(expected)
+    for ours, theirs in zip(epochs, expected, strict=True):
+        np.testing.assert_array_equal(ours.time, theirs.time)
+        np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)
+
+
+def cut(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
+    return (walk.time > start) & (walk.time < stop)
+
+
+@pytest.mark.parametrize("length", [0.15, 0.5, 5.0])
+def test_a_gap_is_one_epoch_and_no_window_spans_it(
+    walk: ImuSequence, without: Callable[..., ImuSequence], length: float
+) -> None:
+    start, stop = 6.02, 6.02 + length
+    holed = without(walk, cut(walk, start + 1e-9, stop - 1e-9))
+    epochs, intake = all_epochs(holed, CONFIG)
+    (gap,) = [e for e in epochs if e.gap]
+    assert gap.start == pytest.approx(start)
+    assert gap.stop == pytest.approx(stop)
+    assert intake.counts.gaps == [(pytest.approx(start), pytest.approx(length))]
+    assert_seamless(epochs, holed.time[0])
+    spans = [(e.stop - WINDOW_SECONDS, e.stop) for e in epochs if e.window is not None]
+    assert not any(a < gap.stop - 1e-9 and b > gap.start + 1e-9 for a, b in spans)
+    after = [b for a, b in spans if a > gap.start]
+    assert min(after) == pytest.approx(stop + WINDOW_SECONDS)
+
+
+def test_a_tenth_of_a_second_is_bridged(
+    walk: ImuSequence, without: Callable[..., ImuSequence]
+) -> None:
+    holed = without(walk, cut(walk, 6.0 + 1e-9, 6.1 - 2e-2))
+    epochs, intake = all_epochs(holed, CONFIG)
+    assert intake.counts.gaps == []
+    assert not any(e.gap for e in epochs)
+    assert_seamless(epochs, walk.time[0])
+
+
+def test_after_a_gap_in_the_first_second_it_begins_anew(
+    walk: ImuSequence, without: Callable[..., ImuSequence]
+) -> None:
+    holed = without(walk, cut(walk, 0.5 + 1e-9, 0.9 - 1e-9))
+    epochs, intake = all_epochs(holed, CONFIG)
+    assert intake.counts.gaps == [(pytest.approx(0.5), pytest.approx(0.4))]
+    assert intake.start is not None
+    assert intake.start.time == pytest.approx(0.9)
+    assert_seamless(epochs, intake.start.time)
+    assert not any(e.gap for e in epochs)
+
+
+def test_two_gaps_with_one_sample_between_them(
+    walk: ImuSequence, without: Callable[..., ImuSequence]
+) -> None:
+    gone = cut(walk, 5.0 + 1e-9, 6.0 - 1e-9)
+    gone[np.argmin(np.abs(walk.time - 5.5))] = False
+    epochs, intake = all_epochs(without(walk, gone), CONFIG)
+    assert [length for _, length in intake.counts.gaps] == pytest.approx([0.5, 0.5])
+    assert sum(e.gap for e in epochs) == 2
+    assert_seamless(epochs, walk.time[0])
+
+
+def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
+    walk: ImuSequence,
+) -> None:
+    intake = Intake(CONFIG)
+    for k in range(250):  # half a second of samples, then 0.5 s without, once 0.8 s
+        for j in range(50):
+            row = (float(k) + (0.3 if k > 100 else 0.0) + 0.01 * j, *walk.gyro[j], *walk.accel[j])
+            intake.push(row)
+    counts = intake.counts
+    assert counts.gap_count == 249
+    assert counts.longest_gap == pytest.approx(0.81)
+    assert [start for start, _ in counts.gaps] == pytest.approx(np.arange(149, 249) + 0.79)
+    assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
+
+
+def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence) -> None:
+    late = replace(walk, time=walk.time + 1.7e9)
+    ours, theirs = (
+        [e.window for e in all_epochs(s, CONFIG)[0] if e.window is not None] for s in (late, walk)
+    )
+    assert len(ours) == len(theirs)
+    assert np.abs(np.stack(ours) - np.stack(theirs)).max() < 2e-3
+
+
+def test_what_the_filter_is_told_does_not_reach_the_windows(walk: ImuSequence) -> None:
+    other = NavigatorConfig(
+        filter=FilterConfig(
+            update_rate=10, measurement="velocity", covariance_scale=9.0, gyro_bias_sigma=1.0
+        )
+    )
+    for ours, theirs in zip(all_epochs(walk, CONFIG)[0], all_epochs(walk, other)[0], strict=True):
+        np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)
+        assert (ours.window is None) == (theirs.window is None)
+
+
+def test_it_takes_samples_one_by_one_and_holds_no_more_than_a_second(walk: ImuSequence) -> None:
+    intake = Intake(CONFIG)
+    held = 0
+    for row in np.column_stack([walk.time, walk.gyro, walk.accel]).tolist():
+        intake.push(tuple(row))
+        held = max(held, len(intake._samples))
+    assert held <= 1.0 * walk.rate + 2
+
+
+def test_absurd_values_are_dropped_and_counted() -> None:
+    intake = Intake(CONFIG)
+    for k in range(300):
+        value = 1e300 if k == 150 else 0.0
+        intake.push((k * 0.005, value, 0.0, 0.0, 0.0, 0.0, 9.81))
+    assert intake.counts.not_finite == 1
+    assert intake.counts.used == 299

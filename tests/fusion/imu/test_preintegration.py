@@ -1,0 +1,263 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from stario.fusion.imu.preintegration import corrected_increments, preintegrate
+from stario.fusion.lie import exp_se23, exp_so3, log_se23, log_so3, skew
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+
+GRAVITY = 9.80665
+NOISE = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3)
+
+
+def samples(rate: float, duration: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A hand-held device in lively motion, without noise."""
+    t = np.linspace(0.0, duration, round(duration * rate) + 1)
+    gyro = np.stack([2 * np.sin(9 * t), 1.5 * np.cos(7 * t), 1.0 + np.sin(5 * t)], axis=1)
+    accel = np.stack([3 * np.cos(8 * t), 2 * np.sin(11 * t), GRAVITY + 4 * np.sin(6 * t)], axis=1)
+    return t, gyro, accel
+
+
+def state() -> tuple[np.ndarray, ...]:
+    return (
+        exp_so3(np.array([0.4, -1.2, 2.0])),
+        np.array([1.0, -0.6, 0.2]),
+        np.array([12.0, -7.0, 1.5]),
+        np.array([0.01, -0.02, 0.03]),
+        np.array([0.1, 0.2, -0.15]),
+    )
+
+
+def moved(x: tuple[np.ndarray, ...], error: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The state that lies a right-invariant error away."""
+    R, v, p = exp_se23(error[:9])
+    return R @ x[0], R @ x[1] + v, R @ x[2] + p, x[3] + error[9:12], x[4] + error[12:]
+
+
+def difference(x: tuple[np.ndarray, ...], y: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Right-invariant error of x against y."""
+    R = x[0] @ y[0].T
+    return np.concatenate([log_se23(R, x[1] - R @ y[1], x[2] - R @ y[2]), x[3] - y[3], x[4] - y[4]])
+
+
+def coning(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """One second of attitude that cones about x at 10 Hz, with a vibrating force; exact end."""
+    t = np.linspace(0.0, 1.0, round(rate) + 1)
+
+    def signals(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        phase = 2 * np.pi * 10 * t
+        gyro = np.stack([0 * t, 3 * np.cos(phase), 3 * np.sin(phase)], axis=-1)
+        accel = np.stack([0 * t, 20 * np.sin(phase), GRAVITY - 20 * np.cos(phase)], axis=-1)
+        return gyro, accel
+
+    def rates(t: float, y: np.ndarray) -> np.ndarray:
+        gyro, accel = signals(np.asarray(t))
+        R = y[:9].reshape(3, 3)
+        return np.concatenate([(R @ skew(gyro)).ravel(), R @ accel])
+
+    end = solve_ivp(
+        rates, (0, 1), np.r_[np.eye(3).ravel(), 0, 0, 0], rtol=1e-12, atol=1e-12, method="DOP853"
+    ).y[:, -1]
+    gyro, accel = signals(t)
+    return t, gyro, accel, end[:9].reshape(3, 3), end[9:]
+
+
+def folded(dt: np.ndarray, rate: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    R, v = np.eye(3), np.zeros(3)
+    for step, w, a in zip(dt, rate, force, strict=True):
+        v = v + R @ a * step
+        R = R @ exp_so3(w * step)
+    return R, v
+
+
+def between(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
+    """Samples of the straight lines between samples."""
+    fine = np.linspace(t[0], t[-1], finer * (len(t) - 1) + 1)
+    return np.stack([np.interp(fine, t, column) for column in values.T], axis=1)
+
+
+def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
+    R, v, p, b_g, b_a = state()
+    t, gyro, accel = samples(200)
+    finer = 100
+    dt = 0.005 / finer
+    expected_R, expected_v, expected_p = R, v, p
+    w, a = between(t, gyro, finer) - b_g, between(t, accel, finer) - b_a
+    for k in range(finer * (len(t) - 1)):
+        rate, force = 0.5 * (w[k] + w[k + 1]), 0.5 * (a[k] + a[k + 1])
+        a_W = expected_R @ exp_so3(0.5 * dt * rate) @ force - [0, 0, GRAVITY]
+        expected_p = expected_p + expected_v * dt + 0.5 * a_W * dt * dt
+        expected_v = expected_v + a_W * dt
+        expected_R = expected_R @ exp_so3(rate * dt)
+    for k in range(0, 100, 10):
+        part = slice(k, k + 11)
+        segment = preintegrate(t[part], gyro[part], accel[part], b_g, b_a, NOISE, GRAVITY)
+        assert segment.duration == pytest.approx(0.05)
+        R, v, p = segment.predict(R, v, p, b_g, b_a)
+    np.testing.assert_allclose(log_so3(R @ expected_R.T), 0.0, atol=1e-5)
+    np.testing.assert_allclose(v, expected_v, atol=5e-5)
+    np.testing.assert_allclose(p, expected_p, atol=5e-5)
+
+
+def test_a_device_at_rest_stays() -> None:
+    R, _, p, b_g, b_a = state()
+    t = np.linspace(0.0, 1.0, 101)
+    gyro = np.tile(b_g, (101, 1))
+    accel = np.tile(R.T @ [0, 0, GRAVITY] + b_a, (101, 1))
+    segment = preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY)
+    R_end, v_end, p_end = segment.predict(R, np.zeros(3), p, b_g, b_a)
+    np.testing.assert_allclose(R_end, R, atol=1e-12)
+    np.testing.assert_allclose(v_end, 0.0, atol=1e-12)
+    np.testing.assert_allclose(p_end, p, atol=1e-12)
+
+
+def test_coning_and_sculling_corrections_beat_the_midpoint() -> None:
+    t, gyro, accel, R_true, v_true = coning(200)
+    corrected = corrected_increments(t, gyro, accel)
+    midpoint = np.diff(t), 0.5 * (gyro[1:] + gyro[:-1]), 0.5 * (accel[1:] + accel[:-1])
+
+    def errors(
+        increments: tuple[np.ndarray, ...], R_ref: np.ndarray, v_ref: np.ndarray
+    ) -> np.ndarray:
+        R, v = folded(*increments)
+        return np.array([np.linalg.norm(log_so3(R @ R_ref.T)), np.linalg.norm(v - v_ref)])
+
+    # Against the true motion, which bends between samples, and against straight lines between them.
+    assert (errors(corrected, R_true, v_true) < 0.6 * errors(midpoint, R_true, v_true)).all()
+    fine = np.linspace(0.0, 1.0, 10_001), between(t, gyro, 50), between(t, accel, 50)
+    lines = folded(*corrected_increments(*fine))
+    assert (errors(corrected, *lines) < 0.02 * errors(midpoint, *lines)).all()
+
+
+def test_transition_agrees_with_finite_differences() -> None:
+    x = state()
+    segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
+
+    def across(y: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+        return (*segment.predict(*y), y[3], y[4])
+
+    end, step = across(x), 1e-6
+    numeric = np.empty((15, 15))
+    for k, d in enumerate(step * np.eye(15)):
+        plus, minus = across(moved(x, d)), across(moved(x, -d))
+        numeric[:, k] = (difference(plus, end) - difference(minus, end)) / (2 * step)
+    np.testing.assert_allclose(segment.linearise(*x).transition, numeric, atol=1e-6)
+
+
+def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
+    x = state()
+    segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
+    other = moved(x, np.r_[0.3, -0.2, 2.0, 5.0, 3.0, 1.0, 50.0, 20.0, 10.0, np.zeros(6)])
+    np.testing.assert_array_equal(
+        segment.linearise(*x).transition[:, :9], segment.linearise(*other).transition[:, :9]
+    )
+
+
+def test_yaw_and_position_stay_unobservable_constants() -> None:
+    x = state()
+    segment = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY)
+    unobservable = np.zeros((15, 4))
+    unobservable[2, 0] = 1.0
+    unobservable[6:9, 1:] = np.eye(3)
+    np.testing.assert_array_equal(segment.linearise(*x).transition @ unobservable, unobservable)
+
+
+def test_noise_is_that_of_perturbed_samples() -> None:
+    """Sum over every sample's noise and every step of the biases' walks, by finite differences."""
+    R, v, p, b_g, b_a = state()
+    n, dt = 10, 0.02
+    t, gyro, accel = samples(1 / dt, n * dt)
+    step = 1e-5
+    # Without rotation inside the intervals' corrections the samples act one interval each.
+    dt_k, rate, force = corrected_increments(t, gyro - b_g, accel - b_a)
+
+    def end(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
+        y_R, y_v, y_p = R, v, p
+        for k in range(n):
+            a_W = y_R @ a[k] - [0, 0, GRAVITY]
+            y_p = y_p + y_v * dt_k[k] + 0.5 * a_W * dt_k[k] ** 2
+            y_v = y_v + a_W * dt_k[k]
+            y_R = y_R @ exp_so3(w[k] * dt_k[k])
+        return y_R, y_v, y_p, np.zeros(3), np.zeros(3)
+
+    reference = end(rate, force)
+    expected = np.zeros((15, 15))
+    for k in range(n):
+        for axis in range(3):
+            for which in range(4):  # gyro noise, accel noise, gyro walk, accel walk
+                w, a = rate.copy(), force.copy()
+                signal = w if which in (0, 2) else a
+                signal[slice(k, k + 1) if which < 2 else slice(k + 1, n), axis] -= step
+                column = difference(end(w, a), reference) / step
+                density = (NOISE.gyro_noise, NOISE.accel_noise, NOISE.gyro_walk, NOISE.accel_walk)
+                sigma = density[which] * (dt**-0.5 if which < 2 else dt**0.5)
+                if which >= 2:
+                    column[(9 if which == 2 else 12) + axis] = 1.0
+                expected += np.outer(column, column) * sigma**2
+    noise = (
+        preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY).linearise(R, v, p, b_g, b_a).noise
+    )
+    sigma = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        noise / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-3
+    )
+
+
+def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
+    x = state()
+    loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
+    plain, scaled = (
+        preintegrate(*samples(200), x[3], x[4], noise, GRAVITY).linearise(*x).noise
+        for noise in (NOISE, loud)
+    )
+    np.testing.assert_allclose(np.diag(scaled)[:9], 9.0 * np.diag(plain)[:9], rtol=0.02)
+    np.testing.assert_array_equal(scaled[9:, 9:], plain[9:, 9:])
+
+
+def test_a_segment_with_the_noise_of_its_parts_is_their_sequence() -> None:
+    """An impact is followed by what it did to the speed: the noise of their mean is another."""
+    x = state()
+    t, gyro, accel = samples(200)
+    loud = [replace(NOISE, accel_noise=size * NOISE.accel_noise) for size in (8.0, 1.0, 1.0, 4.0)]
+    parts, step = [], (len(t) - 1) // 4
+    transition, noise, y = np.eye(15), np.zeros((15, 15)), x[:3]
+    for k, density in enumerate(loud):
+        part = slice(k * step, (k + 1) * step + 1)
+        segment = preintegrate(t[part], gyro[part], accel[part], *x[3:], density, GRAVITY)
+        ahead = segment.linearise(*y, *x[3:])
+        transition = ahead.transition @ transition
+        noise = ahead.transition @ noise @ ahead.transition.T + ahead.noise
+        y = ahead[:3]
+        parts += [density] * step
+    whole = preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY).linearise(*x)
+    np.testing.assert_allclose(whole.transition, transition, atol=1e-2)
+    sigma = np.sqrt(noise.diagonal())
+    np.testing.assert_allclose(
+        whole.noise / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
+    )
+    mean = replace(NOISE, accel_noise=NOISE.accel_noise * np.sqrt(np.mean([64, 1, 1, 16])))
+    other = preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY).linearise(*x).noise
+    assert other[6, 6] < 0.8 * noise[6, 6]
+
+
+def test_noise_does_not_depend_on_the_sensor_rate() -> None:
+    x = state()
+    slow, fast = (
+        preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY).linearise(*x).noise
+        for rate in (100, 400)
+    )
+    np.testing.assert_allclose(np.diag(fast), np.diag(slow), rtol=0.02)
+
+
+def test_samples_that_do_not_fit_are_named() -> None:
+    t, gyro, accel = samples(200, 0.1)
+    biases = np.zeros(3), np.zeros(3), NOISE, GRAVITY
+    with pytest.raises(InputError, match="1 samples"):
+        preintegrate(t[:1], gyro[:1], accel[:1], *biases)
+    with pytest.raises(InputError, match="increasing"):
+        preintegrate(t[::-1], gyro, accel, *biases)
+    with pytest.raises(InputError, match="finite"):
+        preintegrate(t, gyro, np.where(accel == accel[3], np.nan, accel), *biases)

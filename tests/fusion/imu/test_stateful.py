@@ -1,0 +1,94 @@
+"""A network that remembers earlier windows gives the same track in a stream as at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.tracks import network_track_true_attitude
+from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.navigator import Navigator
+from stario.sequences.errors import InputError
+
+
+class Counting:
+    """Says how many windows its memory holds: one metre for each, in each series of its own."""
+
+    def predict(self, windows):
+        raise AssertionError("a network that remembers is asked along a track")
+
+    def along_track(self, updates):
+        return _Chains(updates)
+
+
+class _Chains:
+    def __init__(self, updates):
+        self.counts, self.index = [0] * updates, 0
+
+    def predict(self, windows):
+        mean = np.zeros((len(windows), 3))
+        for k in range(len(windows)):
+            mean[k, 0] = self.counts[self.index % len(self.counts)]
+            self.counts[self.index % len(self.counts)] += 1
+            self.index += 1
+        return mean, np.tile(np.eye(3), (len(windows), 1, 1))
+
+    def checkpoint(self):
+        return {"counts": list(self.counts), "index": self.index}
+
+    def rewind(self, memory):
+        self.counts, self.index = list(memory["counts"]), memory["index"]
+
+
+def with_gap(walk, without):
+    return without(walk, (walk.time - walk.time[0] > 8.0) & (walk.time - walk.time[0] < 9.0))
+
+
+@pytest.mark.parametrize("rate", [1, 5])
+def test_memory_lasts_from_gap_to_gap_in_series_of_their_own(walk, without, rate) -> None:
+    config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
+    observed = Navigator(Counting(), config).observe(with_gap(walk, without))
+    stretches, told = [[]], []
+    for epoch, measurement in zip(observed.epochs, observed.measurements, strict=True):
+        if epoch.gap:
+            stretches.append([])
+        if measurement is not None:
+            stretches[-1].append(measurement[0][0])
+    assert len(stretches) == 2
+    for stretch in stretches:
+        assert stretch == [k // rate for k in range(len(stretch))]
+        told += stretch
+    assert len(told) > 15 * rate
+
+
+def test_a_stream_is_the_same_track_also_when_continued(walk, without) -> None:
+    sequence = with_gap(walk, without)
+    track = Navigator(Counting()).run(sequence).trajectory
+    navigator = Navigator(Counting())
+    states = []
+    for k, sample in enumerate(zip(sequence.time, sequence.gyro, sequence.accel, strict=True)):
+        if k == 700:
+            navigator, data = Navigator(Counting()), navigator.snapshot()
+            navigator.restore(data)
+        state = navigator.push(*sample)
+        if state is not None:
+            states.append(state)
+    at = np.searchsorted(track.time, [s.time for s in states])
+    np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
+
+
+def test_the_track_with_true_attitude_remembers_too(walk) -> None:
+    config = NavigatorConfig(filter=FilterConfig(update_rate=1))
+    track = network_track_true_attitude(Counting(), walk, config)
+    speed = track.trajectory.velocity_W[:, 0]
+    assert (np.diff(speed) >= 0.0).all()
+    assert speed[-1] == len(track.trajectory.time) - 2
+
+
+def test_a_model_without_memory_is_asked_itself(still_model) -> None:
+    network = AlongTrack(still_model, 10)
+    assert not network.remembers
+    assert network.checkpoint() is None
+    with pytest.raises(InputError, match="memory"):
+        network.rewind({"counts": [1], "index": 1})

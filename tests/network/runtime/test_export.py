@@ -1,0 +1,146 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from stario.network.architectures import ARCHITECTURES, build_network
+from stario.network.card import Calibration, Card
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import DisplacementModel, load_model, save_model
+from stario.network.runtime.engines import TorchEngine
+from stario.network.runtime.graph_form import graph_form
+from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+ort = pytest.importorskip("onnxruntime")
+
+from stario.network.runtime.export import export_onnx  # noqa: E402
+
+CALIBRATION = Calibration((1.5, 1.5, 0.7), (1.2, 1.2, 0.9), (0.02, 0.02, 0.01))
+
+
+def fresh(name: str) -> DisplacementModel:
+    torch.manual_seed(0)
+    return DisplacementModel(
+        TorchEngine(DisplacementNetwork(build_network(name))), Card(name, calibration=CALIBRATION)
+    )
+
+
+def some_windows(count: int) -> FloatArray:
+    windows = np.random.default_rng(count).standard_normal((count, 6, 200)).astype(np.float32)
+    windows[:, 5] += STANDARD_GRAVITY
+    return windows
+
+
+def assert_close(found: FloatArray, expected: FloatArray) -> None:
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def assert_parity(model: DisplacementModel, path: Path) -> DisplacementModel:
+    export_onnx(model, path)
+    exported = load_model(path)
+    for count in (1, 3, 70):
+        windows = some_windows(count)
+        for found, expected in zip(exported.predict(windows), model.predict(windows), strict=True):
+            assert_close(found, expected)
+    return exported
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("export") / "rnin.onnx"
+    export_onnx(fresh("RNIN"), path)
+    return path
+
+
+def test_a_star_network_exported_gives_the_same_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Tracing takes a second for every block: two different ones here, all of them in slow tests.
+    monkeypatch.setattr("stario.network.stario.BLOCKS", (1, 0, 0, 1))
+    exported = assert_parity(fresh("StarIO"), tmp_path / "star.onnx")
+    assert exported.card.calibration == CALIBRATION
+    assert exported.name == "StarIO"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["default", *ARCHITECTURES])
+def test_every_network_exported_gives_the_same_numbers(name: str, tmp_path: Path) -> None:
+    assert_parity(load_model() if name == "default" else fresh(name), tmp_path / "model.onnx")
+
+
+@pytest.mark.parametrize("gated_unit", [True, False])
+def test_the_graph_form_of_stario_gives_the_same_numbers(gated_unit: bool) -> None:
+    network = fresh("StarIO" if gated_unit else "StarIO without MSGCU").training_form
+    windows = torch.from_numpy(some_windows(5))
+    with torch.inference_mode():
+        for found, expected in zip(graph_form(network)(windows), network(windows), strict=True):
+            torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-5)
+
+
+def test_a_network_that_remembers_does_so_in_both_engines(exported: Path) -> None:
+    windows, model = some_windows(6), fresh("RNIN")
+    for found, expected in zip(
+        load_model(exported).along_track(2).predict(windows),
+        model.along_track(2).predict(windows),
+        strict=True,
+    ):
+        assert_close(found, expected)
+    assert_close(load_model(exported).predict(windows)[0], model.predict(windows)[0])
+
+
+def test_the_file_says_what_its_windows_are(exported: Path) -> None:
+    session = ort.InferenceSession(exported)
+    assert [(n.name, n.shape) for n in session.get_inputs()] == [
+        ("windows", ["batch", 6, 200]),
+        ("state", [2, "batch", 256]),
+    ]
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert "200 Hz" in metadata["windows"]
+    assert "[m]" in metadata["displacement"]
+    assert "gravity-aligned" in metadata["frame"]
+    assert '"architecture": "RNIN"' in metadata["stario_card"]
+
+
+def test_a_file_that_is_none_of_ours_is_refused(exported: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(exported.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match=r"broken\.onnx: graph"):
+        load_model(broken)
+    with pytest.raises(WeightsError, match=r"absent\.onnx: file"):
+        load_model(tmp_path / "absent.onnx")
+    import onnx
+
+    foreign = onnx.load(exported)
+    del foreign.metadata_props[:]
+    onnx.save(foreign, broken)
+    with pytest.raises(WeightsError, match=r"stario_card"):
+        load_model(broken)
+
+
+def test_an_exported_file_cannot_be_trained(exported: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="an exported graph"):
+        export_onnx(load_model(exported), tmp_path / "again.onnx")
+
+
+def test_a_model_that_remembers_depends_on_the_order_of_windows(tmp_path: Path) -> None:
+    model = fresh("RNIN")
+    save_model(tmp_path / "rnin.safetensors", model.training_form, model.card)
+    loaded = load_model(tmp_path / "rnin.safetensors")
+    windows = some_windows(6)
+    at_once = loaded.along_track(3).predict(windows)[0]
+    track = loaded.along_track(3)
+    one_by_one = np.concatenate([track.predict(windows[k : k + 1])[0] for k in range(6)])
+    assert np.array_equal(at_once, one_by_one)
+    # The first window of each series is alone, the others are not.
+    alone = loaded.predict(windows)[0]
+    np.testing.assert_allclose(at_once[:3], alone[:3], atol=1e-5)
+    assert (np.abs(at_once[3:] - alone[3:]).max(axis=1) > 1e-5).all()
+
+
+def test_a_model_without_memory_is_its_own_along_a_track() -> None:
+    model = fresh("I-MobileNet")
+    assert model.along_track(10) is model

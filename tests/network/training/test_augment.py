@@ -1,0 +1,292 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from stario.network.training.augment import Augmentation, WindowSampler
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, windows_of, world_streams
+
+NOTHING = Augmentation(
+    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
+    gyro_noise=0.0, accel_noise=0.0,
+)  # fmt: skip
+"""No range at all; yaw and mirror image are drawn always, for both are exact."""
+
+TO_MIRROR_IMAGE = np.diag([1.0, -1.0, 1.0])
+
+
+def path(speed: float = 1.0, yaw: float = 0.0, mirrored: bool = False) -> Trajectory:
+    """A device on a smooth path that never repeats; traversed faster, turned or mirrored."""
+    u = np.arange(0.0, 16.0, 0.01)
+    position = np.stack(
+        [
+            2 * np.sin(1.3 * u) + 0.3 * u,
+            np.cos(0.7 * u),
+            0.3 * np.sin(3 * u) + 0.1 * np.sin(5.3 * u),
+        ],
+        1,
+    )
+    turn = np.stack([np.sin(1.1 * u), 0.8 * np.cos(1.7 * u), 0.9 * u + np.sin(2.3 * u)], axis=1)
+    R_WB = Rotation.from_rotvec(turn).as_matrix()
+    if mirrored:
+        # A mirror image of the world seen by a device with a mirrored y axis of its own.
+        position, R_WB = position @ TO_MIRROR_IMAGE, TO_MIRROR_IMAGE @ R_WB @ TO_MIRROR_IMAGE
+    R = Rotation.from_rotvec([0.0, 0.0, yaw])
+    return Trajectory(u / speed, R.apply(position), R * Rotation.from_matrix(R_WB))
+
+
+def stream_of(trajectory: Trajectory, name: str = "path") -> WorldStream:
+    """What a perfect IMU measures on the way."""
+    recording = simulate_imu(trajectory, errors=PERFECT_IMU, name=name)
+    (stream,) = world_streams(recording, attitude="true")
+    return stream
+
+
+STREAM = stream_of(path())
+
+
+@dataclass
+class Drawn:
+    """A drawn window (6, 200) with its displacement, and what undoes its yaw and mirror image."""
+
+    window: FloatArray
+    displacement: FloatArray
+    start: int
+    turn: FloatArray  # (3, 3), with determinant -1 if mirrored
+
+    @property
+    def mirrored(self) -> bool:
+        return bool(np.linalg.det(self.turn) < 0.0)
+
+    @property
+    def yaw(self) -> float:
+        R = self.turn @ TO_MIRROR_IMAGE if self.mirrored else self.turn
+        return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def drawn(sampler: WindowSampler, references: FloatArray, count: int) -> list[Drawn]:
+    """Draw windows, find where each begins and how it was turned from the window alone.
+
+    Args:
+        sampler: to draw from.
+        references: (K, 6, 200) windows from every start.
+        count: of the windows.
+    """
+    found = []
+    for window, displacement in zip(
+        *(t.double().numpy() for t in sampler.batch(count)), strict=True
+    ):
+        # Neither a yaw nor a mirror image touches the vertical acceleration and the turn rate.
+        distance = np.square(references[:, 5] - window[5])
+        distance += np.square(np.abs(references[:, 2]) - np.abs(window[2]))
+        start = int(np.argmin(distance.sum(axis=1)))
+        u, _, vt = np.linalg.svd(window[3:5] @ references[start, 3:5].T)
+        turn = np.eye(3)
+        turn[:2, :2] = u @ vt
+        found.append(Drawn(window, displacement, start, turn))
+    return found
+
+
+def windows_at_every_start(stream: WorldStream) -> tuple[FloatArray, FloatArray]:
+    windows, displacements = windows_of(stream, 1)
+    return windows.astype(np.float64), displacements.astype(np.float64)
+
+
+def test_without_ranges_windows_are_those_of_the_navigator_turned_or_mirrored() -> None:
+    windows, displacements = windows_at_every_start(STREAM)
+    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=0), windows, 32)
+    assert {d.mirrored for d in draws} == {True, False}
+    for d in draws:
+        # Angular rate is an axial vector: a mirror image turns its sign over.
+        axial = d.turn * np.linalg.det(d.turn)
+        np.testing.assert_allclose(d.window[:3], axial @ windows[d.start, :3], atol=1e-5)
+        np.testing.assert_allclose(d.window[3:], d.turn @ windows[d.start, 3:], atol=1e-5)
+        np.testing.assert_allclose(d.displacement, d.turn @ displacements[d.start], atol=1e-5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_turned_window_is_a_window_of_the_turned_world(mirrored: bool) -> None:
+    references = windows_at_every_start(STREAM)[0]
+    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=1), references, 32)
+    some = [d for d in draws if d.mirrored is mirrored][:3]
+    assert len(some) == 3
+    for d in some:
+        windows, displacements = windows_of(stream_of(path(yaw=d.yaw, mirrored=mirrored)), 1)
+        np.testing.assert_allclose(d.window, windows[d.start], atol=2e-4)
+        np.testing.assert_allclose(d.displacement, displacements[d.start], atol=1e-4)
+
+
+@pytest.mark.parametrize("speed", [0.8, 1.25, 1.6])
+def test_a_replayed_window_is_one_of_the_same_path_traversed_at_that_speed(speed: float) -> None:
+    windows, displacements = windows_at_every_start(stream_of(path(speed=speed)))
+    replay = Augmentation(**{**vars(NOTHING), "speeds": (speed, speed), "replayed": 1.0})
+    # Starts on the recording's grid fall between the samples of the faster one: take near ones.
+    draws = drawn(WindowSampler([STREAM], [1.0], replay, seed=2), windows, 64)
+    near = [d for d in draws if np.abs(d.window[5] - windows[d.start, 5]).max() < 2e-3]
+    assert len(near) >= 5
+    for d in near:
+        axial = d.turn * np.linalg.det(d.turn)
+        np.testing.assert_allclose(d.window[:3], axial @ windows[d.start, :3], atol=5e-3)
+        np.testing.assert_allclose(d.window[3:], d.turn @ windows[d.start, 3:], atol=2e-2)
+        np.testing.assert_allclose(d.displacement, d.turn @ displacements[d.start], atol=2e-3)
+
+
+def test_yaw_covers_the_circle_and_leaves_no_direction_favoured() -> None:
+    references = windows_at_every_start(STREAM)[0]
+    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=3), references, 256)
+    quadrants = np.bincount([int((d.yaw + np.pi) // (np.pi / 2)) % 4 for d in draws], minlength=4)
+    assert quadrants.min() > 256 / 4 - 4 * np.sqrt(256 * 3 / 16)
+
+
+def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
+    """A device at rest, or in a lift at constant speed [m/s]: the IMU shows gravity alone."""
+    imu_W = np.zeros((length, 6), np.float32)
+    imu_W[:, 5] = STANDARD_GRAVITY
+    position_W = np.zeros((length, 3), np.float32)
+    position_W[:, 2] = climb * np.arange(length) / 200.0
+    return WorldStream(name, imu_W, position_W)
+
+
+def only(**ranges: object) -> Augmentation:
+    return Augmentation(**{**vars(NOTHING), **ranges})  # type: ignore[arg-type]
+
+
+def test_tilt_turns_gravity_and_never_beyond_its_limit() -> None:
+    windows, _ = WindowSampler([resting("rest")], [1.0], only(tilt=0.1), seed=0).batch(256)
+    gravity = windows[:, 3:, 0].double()
+    np.testing.assert_allclose(gravity.norm(dim=1), STANDARD_GRAVITY, rtol=1e-6)
+    angle = torch.acos((gravity[:, 2] / STANDARD_GRAVITY).clamp(max=1.0))
+    assert 0.06 < float(angle.max()) <= 0.1 + 1e-4
+    assert float(gravity[:, :2].mean(dim=0).abs().max()) < 0.1
+
+
+def test_biases_are_constant_over_a_window_and_within_their_range() -> None:
+    ranges = only(gyro_bias=0.05, accel_bias=0.2)
+    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    torch.testing.assert_close(windows, windows[:, :, :1].expand(-1, -1, WINDOW_SAMPLES))
+    bias = windows[:, :, 0]
+    bias[:, 5] -= STANDARD_GRAVITY
+    limits = torch.tensor([0.05] * 3 + [0.2] * 3)
+    assert (bias.abs() <= limits + 1e-5).all()
+    assert (bias.abs().amax(0) > 0.9 * limits).all()
+
+
+def test_noise_is_white_and_within_its_deviation() -> None:
+    ranges = only(gyro_noise=0.02, accel_noise=0.15)
+    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    deviation = windows.std(dim=2)
+    assert (deviation <= 1.3 * torch.tensor([0.02] * 3 + [0.15] * 3)).all()
+    varied = windows - windows.mean(dim=2, keepdim=True)
+    neighbours = (varied[:, :, 1:] * varied[:, :, :-1]).mean() / varied.square().mean()
+    assert abs(float(neighbours)) < 0.02
+
+
+def test_the_same_seed_draws_the_same_windows() -> None:
+    def batches(seed: int) -> list[torch.Tensor]:
+        sampler = WindowSampler([STREAM], [1.0], Augmentation(), seed)
+        return [*sampler.batch(8), *sampler.batch(8)]
+
+    first, again, other = batches(5), batches(5), batches(6)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not torch.equal(first[0], other[0])
+    assert not torch.equal(first[0], first[2])
+
+
+def test_weights_are_per_second_of_a_stream() -> None:
+    # A short lift that goes up and a long one that goes down, the short one three times as dear.
+    streams = [resting("up", 1201, climb=1.0), resting("down", 4201, climb=-1.0)]
+    _, displacement = WindowSampler(streams, [3.0, 1.0], NOTHING, seed=0).batch(2000)
+    share = float((displacement[:, 2] > 0.0).double().mean())
+    assert share == pytest.approx(3 * 5 / (3 * 5 + 20), abs=0.05)
+
+
+def test_no_window_reaches_over_the_end_of_its_stream() -> None:
+    streams = [resting(str(k), 400, climb=1.0) for k in range(8)]
+    ranges = only(speeds=(0.6, 1.8), replayed=0.5)
+    _, displacement = WindowSampler(streams, [1.0] * 8, ranges, seed=0).batch(2000)
+    # One that did would fall by the height of a stream.
+    assert float(displacement[:, 2].min()) > 0.59
+    assert float(displacement[:, 2].max()) < 1.81
+
+
+def test_a_stream_shorter_than_the_fastest_window_is_refused() -> None:
+    with pytest.raises(InputError, match="short: found a stretch of 300 samples"):
+        WindowSampler([STREAM, resting("short", 300)], [1.0, 1.0], Augmentation(), seed=0)
+
+
+def mapped(stream: WorldStream, folder: Path) -> WorldStream:
+    """The same stream in files that are not read until they are used."""
+    for name in ("imu_W", "position_W"):
+        np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
+    imu_W, position_W = (
+        np.load(folder / f"{stream.name}-{name}.npy", mmap_mode="r")
+        for name in ("imu_W", "position_W")
+    )
+    return WorldStream(stream.name, imu_W, position_W)
+
+
+def test_memory_mapped_streams_give_the_same_windows(tmp_path: Path) -> None:
+    streams = [stream_of(path(speed), f"path-{speed}") for speed in (1.0, 1.4, 0.8)]
+    files = [mapped(stream, tmp_path) for stream in streams]
+    weights = [1.0, 0.3, 2.0]
+    memory, disk = (WindowSampler(s, weights, Augmentation(), seed=5) for s in (streams, files))
+    for _ in range(3):
+        for expected, found in zip(memory.batch(64), disk.batch(64), strict=True):
+            assert torch.equal(expected, found)
+
+
+def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        pytest.skip("this system does not say how much memory is resident")
+    rows = 10 * 3600 * 200  # 260 MB; a file of zeros that takes no room on the disk
+    imu_W, position_W = (
+        np.memmap(tmp_path / str(width), np.float32, "w+", shape=(rows, width)) for width in (6, 3)
+    )
+    before = int(statm.read_text().split()[1])
+    sampler = WindowSampler([WorldStream("long", imu_W, position_W)], [1.0], Augmentation(), seed=0)
+    windows, _ = sampler.batch(64)
+    assert torch.isfinite(windows).all()
+    assert int(statm.read_text().split()[1]) - before < 25_000  # pages of 4 kB
+
+
+def test_windows_in_a_row_follow_each_other_and_are_varied_as_one() -> None:
+    ranges = only(gyro_bias=0.05, accel_bias=0.2, tilt=0.1)
+    sampler = WindowSampler([resting("lift", 2400, climb=1.0)], [1.0], ranges, 0, successive=5)
+    windows, displacement = sampler.batch(16)
+    assert windows.shape == (16, 5, 6, 200)
+    # One tilt and one bias for all of a row, another for the next row.
+    torch.testing.assert_close(windows, windows[:, :1].expand_as(windows))
+    assert float((windows[0] - windows[1]).abs().max()) > 1e-3
+    torch.testing.assert_close(displacement[..., 2], torch.ones(16, 5), atol=1e-4, rtol=0.0)
+
+
+def test_windows_in_a_row_are_those_of_the_path_turned() -> None:
+    windows, displacements = windows_at_every_start(STREAM)
+    rows, moved = WindowSampler([STREAM], [1.0], NOTHING, 3, successive=4).batch(6)
+    for row, moves in zip(rows.double().numpy(), moved.double().numpy(), strict=True):
+        distance = np.square(windows[:, 5] - row[0, 5])
+        start = int(np.argmin(distance.sum(axis=1)))
+        for k in range(4):
+            there = start + k * WINDOW_SAMPLES
+            # Neither a yaw nor a mirror image touches the vertical and the length of a way.
+            np.testing.assert_allclose(row[k, 5], windows[there, 5], atol=1e-5)
+            np.testing.assert_allclose(moves[k, 2], displacements[there, 2], atol=1e-5)
+            lengths = [np.linalg.norm(d[:2]) for d in (moves[k], displacements[there])]
+            assert lengths[0] == pytest.approx(lengths[1], abs=1e-5)
+
+
+def test_a_swing_goes_on_from_one_window_to_the_next() -> None:
+    swinging = only(swung=1.0, swing_rate=2.5, lever=0.35)
+    windows, displacement = WindowSampler(
+        [resting("rest", 2400)], [1.0], swinging, 0, successive=3
+    ).batch(8)
+    seam = (windows[:, 1:, :, 0] - windows[:, :-1, :, -1]).abs().max()
+    assert float(displacement.norm(dim=-1).max()) > 0.05
+    assert float(seam) < 0.2  # a sample's change, not a jump to another swing

@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from stario.network.training.calibrate import calibrate
+from stario.sequences.sequence import FloatArray
+
+TRUE_SCALE = np.array([1.7, 1.7, 0.4])
+
+
+def errors_and_log_sigmas(count: int = 20_000) -> tuple[FloatArray, FloatArray]:
+    """Gaussian errors whose deviation is TRUE_SCALE times what the network believes."""
+    rng = np.random.default_rng(0)
+    log_sigma = rng.uniform(np.log(0.1), np.log(1.0), (count, 3))
+    return TRUE_SCALE * np.exp(log_sigma) * rng.standard_normal((count, 3)), log_sigma
+
+
+def test_recovers_a_known_scale() -> None:
+    np.testing.assert_allclose(calibrate(*errors_and_log_sigmas()).scale, TRUE_SCALE, rtol=0.02)
+
+
+def test_calibrated_errors_are_chi_square_on_average() -> None:
+    error, log_sigma = errors_and_log_sigmas()
+    calibration = calibrate(error, log_sigma)
+    assert np.mean(error**2 / calibration.variance(log_sigma), axis=0) == pytest.approx(
+        [1.0] * 3, rel=0.03
+    )
+
+
+def test_recovers_a_network_that_understates_contrasts() -> None:
+    rng = np.random.default_rng(1)
+    log_sigma = rng.uniform(np.log(0.1), np.log(0.5), (20_000, 3))
+    error = np.exp(1.5 * log_sigma) * rng.standard_normal(log_sigma.shape)
+    calibration = calibrate(error, log_sigma)
+    np.testing.assert_allclose(calibration.exponent, 1.5, atol=0.05)
+    np.testing.assert_allclose(calibration.scale, 1.0, rtol=0.08)
+
+
+def test_horizontal_axes_share_their_factor() -> None:
+    error, log_sigma = errors_and_log_sigmas()
+    x, y, _ = calibrate(error * [3.0, 1.0, 1.0], log_sigma).scale
+    assert x == y
+
+
+def test_a_few_wild_errors_do_not_rule() -> None:
+    error, log_sigma = errors_and_log_sigmas()
+    error[::200] *= 1000.0
+    np.testing.assert_allclose(calibrate(error, log_sigma).scale, TRUE_SCALE, rtol=0.15)

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.network.training.data import gather, generated_streams, simulated_streams, split_off
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WorldStream
+
+
+def stream(name: str, samples: int) -> WorldStream:
+    count = np.arange(samples, dtype=np.float32)[:, None]
+    return WorldStream(name, count + np.zeros(6, np.float32), count + np.zeros(3, np.float32))
+
+
+def test_the_last_fifth_of_each_recording_is_held_out() -> None:
+    recordings = [[stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], []]
+    first, last = split_off(recordings)
+    assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
+    assert [(s.name, len(s)) for s in last] == [("a", 2000), ("b", 1000)]
+    assert last[0].imu_W[0, 0] == 2000  # where the first part ends
+
+
+def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
+    first, last = split_off([[stream("a", 1500)]])
+    assert [len(s) for s in first] == [1200]
+    assert last == []
+
+
+def test_kinds_of_streams_make_up_their_shares() -> None:
+    kinds = ([stream("a", 3000), stream("a", 1000)], [stream("b", 500)], [])
+    material = gather(*kinds, shares=(0.6, 0.3, 0.1))
+    drawn = np.array([len(s) for s in material.streams]) * material.weights
+    np.testing.assert_allclose(drawn[2] / drawn[:2].sum(), 0.5)
+    assert material.words[0].startswith("recorded")
+
+
+def test_simulated_streams_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
+    calls: list[int] = []
+    walks = tmp_path / "walks.npz"
+    walks.write_bytes(b"1")
+
+    def build() -> list[WorldStream]:
+        calls.append(1)
+        return generated_streams(1, 4.0, 0)
+
+    for _ in range(2):
+        streams = simulated_streams("captured", build, tmp_path / "cache", walks, 0)
+    np.testing.assert_array_equal(streams[0].imu_W, generated_streams(1, 4.0, 0)[0].imu_W)
+    assert len(calls) == 1
+    simulated_streams("captured", build, tmp_path / "cache", walks, 1)
+    walks.write_bytes(b"22")
+    simulated_streams("captured", build, tmp_path / "cache", walks, 0)
+    assert len(calls) == 3
+
+
+def test_lively_recordings_are_drawn_more_often() -> None:
+    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
+    material = gather([calm, lively], [], [])
+    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
+    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
+
+
+def moving(name: str, acceleration: float) -> WorldStream:
+    imu_W = np.zeros((2000, 6), np.float32)
+    imu_W[:, 3], imu_W[:, 5] = acceleration, STANDARD_GRAVITY
+    return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32))

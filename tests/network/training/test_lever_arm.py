@@ -1,0 +1,75 @@
+"""A swing's rate, acceleration and displacement belong to one motion."""
+
+import pytest
+import torch
+
+from stario.network.training.lever_arm import Sines, Swing, draw_swing, swung
+
+GRAVITY = 9.80665
+
+
+def at_rest(size: int) -> torch.Tensor:
+    imu = torch.zeros(size, 200, 6, dtype=torch.float64)
+    imu[..., 5] = GRAVITY
+    return imu
+
+
+def drawn(size: int, share: float = 1.0) -> Swing:
+    drawn = draw_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
+    angle = Sines(*(value.double() for value in vars(drawn.angle).values()))
+    return Swing(drawn.axis.double(), drawn.lever.double(), angle)
+
+
+def test_acceleration_integrates_to_the_displacement() -> None:
+    swing = drawn(64)
+    imu, displacement = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
+    # The velocity a window begins with is omega x r.
+    now = torch.zeros(1, dtype=torch.float64)
+    lever = turned(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
+    velocity = torch.linalg.cross(imu[:, 0, :3], lever)
+    accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
+    dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
+    for k in range(200):
+        velocity_next = velocity + 0.5 * dt * (accel[:, k] + accel[:, min(k + 1, 199)])
+        moved = moved + 0.5 * dt * (velocity + velocity_next)
+        velocity = velocity_next
+    assert displacement.abs().max() > 0.1
+    assert (moved - displacement[:, 0]).abs().max() < 2e-3
+
+
+def test_rate_and_lever_belong_to_one_rotation() -> None:
+    """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
+    swing = drawn(64)
+    imu, _ = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
+    alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
+    lever = turned(swing.lever, swing.axis, alpha)
+    gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
+    velocity = torch.linalg.cross(gyro, lever)
+    assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
+
+
+def test_no_swing_is_faster_than_its_bound() -> None:
+    swing = drawn(512)
+    time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
+    assert 1.5 < swing.angle.at(time)[1].abs().max() <= 2.5
+
+
+def test_what_is_not_swung_stays_as_it_is() -> None:
+    imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    displacement = torch.ones(16, 1, 3, dtype=torch.float64)
+    after, moved = swung(imu, displacement, drawn(16, share=0.0))
+    assert torch.allclose(after, imu, atol=1e-12)
+    assert torch.equal(moved, displacement)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.75])
+def test_the_share_of_swung_windows(share: float) -> None:
+    swing = drawn(4000, share)
+    assert (swing.angle.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
+
+
+def turned(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    skew = torch.linalg.cross(
+        axis[:, None, :].expand(-1, 3, -1), torch.eye(3, dtype=axis.dtype).expand(len(axis), 3, 3)
+    ).mT
+    return (torch.linalg.matrix_exp(skew * angle[:, None, None]) @ vector[:, :, None])[:, :, 0]

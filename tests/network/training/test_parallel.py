@@ -1,0 +1,95 @@
+"""Training under torch's launcher: the same run, shared by two processes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+from stario.network.training.parallel import workers
+from stario.sequences.errors import ConfigError
+
+SCRIPT = """
+import copy, sys
+from pathlib import Path
+import numpy as np
+import torch
+from stario.network.training.augment import Augmentation
+from stario.network.training.config import TrainingConfig
+from stario.network.training import train as training
+from stario.network.training.train import train
+from stario.sequences.windows import WorldStream
+
+def swaying(name, phase, seconds):
+    t = np.arange(round(200 * seconds)) / 200.0
+    way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
+    imu_W = np.zeros((len(t), 6), np.float32)
+    imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, 9.80665]
+    return WorldStream(name, imu_W, way.astype(np.float32))
+
+if sys.argv[2] == "plain":  # no batch norm: what two processes compute is the same number
+    torch.manual_seed(0)
+    plain = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(1200, 6))
+    training.build_network = lambda name: copy.deepcopy(plain)
+config = TrainingConfig(
+    architecture="TLIO", epochs=2, epoch_windows=64, batch=16, rate=1e-3, device="cpu",
+    likelihood_from=0.5, average=0.5, dropout=0.0,
+)
+stop = int(sys.argv[3])
+def kill(step, loss):
+    if step == stop:
+        raise KeyboardInterrupt
+train(config, [swaying("a", 0.3, 20.0)], [1.0], [swaying("b", 0.8, 6.0)], Path(sys.argv[1]), kill)
+"""
+
+
+def launched(script: Path, folder: Path, processes: int, network: str, stop: int = 0) -> int:
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    command += ["--nproc-per-node", str(processes), str(script), str(folder), network, str(stop)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+    assert stop or done.returncode == 0, done.stderr
+    return done.returncode
+
+
+def reports(folder: Path) -> list[float]:
+    """Training and validation error of each epoch."""
+    log = json.loads((folder / "log.json").read_text())
+    return [r[name] for r in log for name in ("training_error", "validation_error")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("network", "tolerance"), [("plain", 1e-4), ("TLIO", 0.25)])
+def test_two_processes_train_as_one_does(network: str, tolerance: float, tmp_path: Path) -> None:
+    """To rounding without batch norms; these see half a batch each."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    one, two, again = (tmp_path / name for name in ("one", "two", "again"))
+    launched(script, one, 1, network)
+    launched(script, two, 2, network)
+    assert reports(two) == pytest.approx(reports(one), rel=tolerance)
+    # Killed in the second epoch and launched again: the same as without.
+    assert launched(script, again, 2, network, stop=6) != 0
+    assert len(reports(again)) == 2
+    launched(script, again, 2, network)
+    weights = [safetensors.torch.load_file(f / "model.safetensors") for f in (two, again)]
+    for name, value in weights[0].items():
+        torch.testing.assert_close(weights[1][name], value, rtol=1e-4, atol=1e-6)
+
+
+def test_without_a_launcher_there_is_one_process_that_leads() -> None:
+    with workers("cpu", 7) as these:
+        assert these.leads
+        assert these.mean(3.0) == these.agreed(3.0) == 3.0
+        batch = torch.arange(7)
+        assert torch.equal(these.share(batch), batch)
+
+
+def test_a_batch_that_cannot_be_shared_out_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="7 for 2 processes"), workers("cpu", 7):
+        pass

@@ -1,0 +1,430 @@
+import hashlib
+import json
+import math
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from stario.network.architectures import build_network
+from stario.network.card import card_path
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import load_model
+from stario.network.training.augment import Augmentation
+from stario.network.training.config import (
+    TrainingConfig,
+    learning_rate,
+    loss_with_sigma,
+    training_config,
+)
+from stario.network.training.train import EpochReport, train
+from stario.network.training.validation import ValidationSet
+from stario.sequences.errors import ConfigError, InputError, ReadError, StarioError, WeightsError
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WorldStream, windows_of
+
+TINY = TrainingConfig(
+    epochs=4,
+    epoch_windows=128,
+    batch=16,
+    rate=1e-3,
+    likelihood_from=0.5,
+    average=0.9,
+    device="cpu",
+    augmentation=Augmentation(
+        speeds=(1.0, 1.0), swung=0.0, tilt=0.02, gyro_bias=0.01, accel_bias=0.05
+    ),
+)
+
+
+def swaying(name: str, phase: float, seconds: float = 20.0) -> WorldStream:
+    """A device on a swing of period 2 s, whose acceleration tells its displacement."""
+    t = np.arange(round(200 * seconds)) / 200.0
+    way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
+    imu_W = np.zeros((len(t), 6), np.float32)
+    imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, STANDARD_GRAVITY]
+    return WorldStream(name, imu_W, way.astype(np.float32))
+
+
+STREAMS = [swaying("a", 0.3), swaying("b", 1.2)]
+VALIDATION = [swaying("c", 0.8, 6.0), swaying("d", 2.0, 6.0)]
+
+
+def run(folder: Path, config: TrainingConfig = TINY, **options: Any) -> Path:
+    return train(config, STREAMS, [1.0, 1.0], VALIDATION, folder, **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpochReport]]:
+    """A run without interruption: the model's path and the reports of its epochs."""
+    reports: list[EpochReport] = []
+    folder = tmp_path_factory.mktemp("finished")
+    return run(folder, on_epoch=reports.append, trained_on=["swings"]), reports
+
+
+@pytest.fixture
+def model(finished: tuple[Path, list[EpochReport]], tmp_path: Path) -> Path:
+    """A copy of the trained model and its card, to be spoilt."""
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(finished[0].read_bytes())
+    card_path(path).write_bytes(card_path(finished[0]).read_bytes())
+    return path
+
+
+def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
+    reports = finished[1]
+    assert [r.epoch for r in reports] == [1, 2, 3, 4]
+    assert reports[-1].training_error < 0.75 * reports[0].training_error
+    # Far better than to say that nothing moves.
+    displacement = windows_of(VALIDATION[0], 20)[1]
+    assert reports[-1].validation_error < 0.5 * np.mean(np.sum(displacement**2, axis=1))
+    assert list(reports[-1].validation_by_recording) == ["c", "d"]
+
+
+def test_the_model_predicts_what_it_was_validated_on(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    path, reports = finished
+    model = load_model(path)
+    assert model.card.trained_on == ["swings"]
+    assert model.card.recipe["batch"] == TINY.batch
+    for stream in VALIDATION:
+        windows, truth = windows_of(stream, 20)
+        error = np.mean(np.sum((model.predict(windows)[0] - truth) ** 2, axis=1))
+        kept = model.card.figures["validation_mse_m2"][stream.name]
+        assert error == pytest.approx(kept, rel=1e-3)
+        # What is kept is the best epoch of the likelihood's, not the last one of all.
+        assert any(kept == r.validation_by_recording[stream.name] for r in reports[2:])
+
+
+def test_the_likelihood_teaches_sigma(finished: tuple[Path, list[EpochReport]]) -> None:
+    """Squared error alone leaves the weights that give sigma without a gradient."""
+    path, _ = finished
+    with safetensors.safe_open(path.parent / "checkpoint.safetensors", framework="pt") as file:
+        moment = file.get_tensor(f"optimiser.{_index_of_last_bias(file)}.exp_avg")
+    assert (moment[3:] != 0.0).all()
+    early = run(path.parent.parent / "early", replace(TINY, epochs=1, likelihood_from=1.0))
+    with safetensors.safe_open(early.parent / "checkpoint.safetensors", framework="pt") as file:
+        moment = file.get_tensor(f"optimiser.{_index_of_last_bias(file)}.exp_avg")
+    assert (moment[:3] != 0.0).all()
+    assert (moment[3:] == 0.0).all()
+
+
+def _index_of_last_bias(file: Any) -> int:
+    names = list(file.keys())
+    return max(int(key.split(".")[1]) for key in names if key.startswith("optimiser."))
+
+
+def test_a_killed_and_resumed_run_gives_the_same_weights(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    def kill(step: int, loss: float) -> None:
+        if step == 21:  # in the third epoch of eight steps
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, on_step=kill)
+    assert not (tmp_path / "model.safetensors").exists()
+    reports: list[EpochReport] = []
+    resumed = safetensors.torch.load_file(run(tmp_path, on_epoch=reports.append))
+    expected = safetensors.torch.load_file(finished[0])
+    assert [r.epoch for r in reports] == [3, 4]
+    assert resumed.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(resumed[name], value), name
+
+
+@pytest.mark.parametrize(("spoilt", "kept"), [({3}, {4}), ({4}, {3}), ({3, 4}, {1, 2})])
+def test_an_epoch_without_a_finite_error_is_never_the_best(
+    finished: tuple[Path, list[EpochReport]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    spoilt: set[int],
+    kept: set[int],
+) -> None:
+    """The likelihood begins with epoch 3; with nothing of its own it keeps what was before."""
+    whole, epoch = ValidationSet.errors, count(1)
+
+    def errors(self: ValidationSet, network: DisplacementNetwork) -> dict[str, float]:
+        found = whole(self, network)
+        return found | {"c": math.nan} if next(epoch) in spoilt else found
+
+    monkeypatch.setattr(ValidationSet, "errors", errors)
+    model = load_model(run(tmp_path))
+    choice = [r.validation_by_recording for r in finished[1] if r.epoch in kept]
+    assert model.card.figures["validation_mse_m2"] in choice
+
+
+def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(tmp_path: Path) -> None:
+    spoilt = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
+
+    def spoil(report: EpochReport) -> None:
+        for stream in spoilt:
+            stream.imu_W[:] = np.nan
+
+    with pytest.raises(InputError, match=r"loss: found nan .* in step 9.*`rate` below 0\.001"):
+        train(TINY, spoilt, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=spoil)
+    state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
+    assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
+    assert not (tmp_path / "model.safetensors").exists()
+    reports: list[EpochReport] = []
+    run(tmp_path, on_epoch=reports.append)
+    assert [r.epoch for r in reports] == [2, 3, 4]
+
+
+def test_a_finished_run_is_not_trained_on(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    checkpoint.write_bytes((finished[0].parent / checkpoint.name).read_bytes())
+    steps: list[int] = []
+    path = run(tmp_path, on_step=lambda step, loss: steps.append(step), trained_on=["swings"])
+    assert steps == []
+    assert path.read_bytes() == finished[0].read_bytes()
+
+
+def test_a_finished_run_says_that_nothing_is_trained(
+    finished: tuple[Path, list[EpochReport]], caplog: pytest.LogCaptureFixture
+) -> None:
+    run(finished[0].parent, trained_on=["swings"])
+    assert "all 4 epochs are done" in caplog.text
+
+
+def test_a_checkpoint_of_other_recordings_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    folder = finished[0].parent
+    more = [*STREAMS, swaying("e", 0.1)]
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, more, [1.0, 1.0, 1.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, STREAMS, [1.0, 2.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="first weights"):
+        run(folder, start_from=load_model(finished[0]))
+
+
+def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
+    log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
+    assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]
+
+
+def test_a_checkpoint_of_another_recipe_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    with pytest.raises(ConfigError, match=r"rate: found 0\.001, expected 0\.01"):
+        run(finished[0].parent, replace(TINY, rate=0.01))
+    harder = replace(TINY, augmentation=replace(TINY.augmentation, tilt=0.3))
+    with pytest.raises(ConfigError, match="augmentation"):
+        run(finished[0].parent, harder)
+
+
+@pytest.mark.parametrize("length", [0, 5, 1000, 100_000])
+def test_a_truncated_checkpoint_is_named(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path, length: int
+) -> None:
+    whole = (finished[0].parent / "checkpoint.safetensors").read_bytes()
+    (tmp_path / "checkpoint.safetensors").write_bytes(whole[:length])
+    with pytest.raises(ReadError, match=r"checkpoint.safetensors: checkpoint: found .*whole"):
+        run(tmp_path)
+
+
+def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="streams"):
+        train(TINY, [], [], VALIDATION, tmp_path)
+
+
+def test_the_rate_warms_up_and_falls() -> None:
+    config = replace(TINY, epochs=100, warm_up=0.1, rate=1.0)
+    rates = [learning_rate(config, step) for step in range(config.steps)]
+    peak = int(np.argmax(rates))
+    assert peak == pytest.approx(0.1 * config.steps, abs=1.0)
+    assert max(rates) == pytest.approx(1.0)
+    assert (np.diff(rates[: peak + 1]) >= 0.0).all()
+    assert (np.diff(rates[peak:]) <= 0.0).all()
+    assert 0.0 < rates[-1] < 0.02
+
+
+def test_the_loss_is_least_at_the_true_sigma() -> None:
+    squared = torch.full((1, 3), 0.09)
+    log_sigma = torch.full((1, 3), math.log(0.3), requires_grad=True)
+    loss_with_sigma(squared, log_sigma).backward()
+    torch.testing.assert_close(log_sigma.grad, torch.zeros(1, 3), atol=1e-6, rtol=0.0)
+
+
+def test_sigma_takes_nothing_from_the_mean() -> None:
+    """The mean's gradient is that of the squared error, whatever sigma is."""
+    for sigma in (0.01, 1.0):
+        squared = torch.full((1, 3), 0.04, requires_grad=True)
+        loss_with_sigma(squared, torch.full((1, 3), math.log(sigma))).backward()
+        assert squared.grad is not None
+        torch.testing.assert_close(squared.grad, torch.ones(1, 3))
+
+
+def test_a_checkpoint_from_before_windows_in_a_row_goes_on(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    path = finished[0].parent / "checkpoint.safetensors"
+    with safetensors.safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    config = json.loads(metadata["config"])
+    del config["successive"]
+    content = safetensors.torch.load_file(path)
+    safetensors.torch.save_file(
+        content,
+        tmp_path / path.name,
+        metadata={**metadata, "config": json.dumps(config)},
+    )
+    assert run(tmp_path, trained_on=["swings"]).read_bytes() == finished[0].read_bytes()
+
+
+def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -> None:
+    values = {"architecture": "RNIN", "epochs": 1, "epoch_windows": 40, "batch": 20}
+    config = training_config({**values, "device": "cpu", "likelihood_from": 0.0})
+    assert config.successive == 10
+    # A step changes the weights that only a state which is not zero reaches.
+    path = run(tmp_path / "row", config)
+    assert load_model(path).along_track(2) is not None
+    first = DisplacementNetwork(build_network_of(config)).state_dict()
+    last = safetensors.torch.load_file(path)
+    change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
+    assert float(change.abs().max()) > 0.0
+    # Streams shorter than ten seconds cannot give any.
+    with pytest.raises(InputError, match="none long enough"):
+        train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
+
+
+def build_network_of(config: TrainingConfig) -> torch.nn.Module:
+    torch.manual_seed(config.seed)
+    return build_network(config.architecture)
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"epoch": 3}, "epoch"),
+        ({"batch": 10, "successive": 3}, "batch"),
+        ({"augmentation": {"tild": 0.1}}, "augmentation.tild"),
+        ({"augmentation": 3}, "augmentation"),
+        ({"epochs": 0}, "epochs"),
+        ({"precision": "half"}, "precision"),
+        ({"device": "tpu"}, "device"),
+        ({"attitude": "guessed"}, "attitude"),
+        ({"architecture": "Star"}, "architecture"),
+        ({"seed": -1}, "seed"),
+        ({"dropout": "no"}, "dropout"),
+        ({"augmentation": {"speeds": 3}}, "speeds"),
+        ({"augmentation": {"speeds": [1]}}, "speeds"),
+        ({"augmentation": {"speeds": ["slow", "fast"]}}, "speeds"),
+    ],
+)
+def test_a_recipe_that_does_not_fit_is_refused(values: dict[str, object], field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        training_config(values)
+    assert caught.value.field == field
+
+
+def test_a_recipe_survives_json() -> None:
+    values = json.loads(json.dumps({"batch": 8, "augmentation": {"speeds": [0.7, 1.5]}}))
+    config = training_config(values)
+    assert config.batch == 8
+    assert config.augmentation.speeds == (0.7, 1.5)
+
+
+def spoil_card(path: Path, **values: object) -> None:
+    content = json.loads(card_path(path).read_text(encoding="utf-8"))
+    card_path(path).write_text(json.dumps(content | values), encoding="utf-8")
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(WeightsError) as caught:
+        load_model(path)
+    assert isinstance(caught.value, StarioError)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert str(path.parent) in text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("architecture", "ResNet99"),
+        ("architecture", ["StarIO"]),
+        ("sha256", "0" * 64),
+        ("sha256", 7),
+        ("outputs", 2),
+        ("rate", 100.0),
+        ("samples", 400),
+        ("frame", "body"),
+        ("channels", ["accel_x"]),
+        ("format", 2),
+        ("colour", "red"),
+        ("calibration", {"scale": [1.0, 1.0], "floor": [0.0, 0.0, 0.0]}),
+        ("calibration", {"scale": [1.0, 1.0, -1.0], "floor": [0.0, 0.0, 0.0]}),
+        ("calibration", {"tint": [1.0, 1.0, 1.0]}),
+        ("calibration", 1.0),
+    ],
+)
+def test_a_card_that_does_not_match_is_refused(model: Path, field: str, value: object) -> None:
+    spoil_card(model, **{field: value})
+    assert field in refused(model)
+
+
+def test_the_unspoilt_copy_loads(model: Path) -> None:
+    assert load_model(model).name == "StarIO"
+    assert load_model(str(model)).name == "StarIO"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"architecture": "StarIO"}', "\udcff"])
+def test_a_card_that_is_none_is_refused(model: Path, text: str) -> None:
+    card_path(model).write_bytes(text.encode(errors="surrogateescape"))
+    assert "card" in refused(model)
+
+
+def test_truncated_weights_are_refused(model: Path) -> None:
+    model.write_bytes(model.read_bytes()[:-100])
+    assert "cut short" in refused(model)
+
+
+@pytest.mark.parametrize("missing", ["weights", "card"])
+def test_a_missing_half_is_refused(model: Path, missing: str) -> None:
+    (model if missing == "weights" else card_path(model)).unlink()
+    assert "side by side" in refused(model)
+
+
+def with_state(path: Path, state: dict[str, torch.Tensor]) -> None:
+    """Other tensors under a card whose checksum is right."""
+    content = safetensors.torch.save(state)
+    path.write_bytes(content)
+    spoil_card(path, sha256=hashlib.sha256(content).hexdigest())
+
+
+@pytest.mark.parametrize("change", ["unknown", "missing", "shape", "none"])
+def test_tensors_of_another_network_are_refused(model: Path, change: str) -> None:
+    state = safetensors.torch.load_file(model)
+    if change == "unknown":
+        state["another.weight"] = torch.zeros(3)
+    elif change == "missing":
+        del state["head.7.bias"]
+    elif change == "shape":
+        state["head.7.bias"] = torch.zeros(2)
+    with_state(model, state if change != "none" else {})
+    found = {"unknown": "another.weight", "missing": "head.7.bias", "shape": "head.7.bias"}
+    assert found.get(change, "Missing") in refused(model)
+
+
+def test_a_last_stage_starts_from_weights_and_keeps_their_calibration(
+    model: Path, tmp_path: Path
+) -> None:
+    first = load_model(model)
+    slow = replace(TINY, rate=1e-8, epochs=1)
+    last = load_model(run(tmp_path / "last", slow, start_from=first, keep_calibration=True))
+    assert last.card.calibration == first.card.calibration
+    before = dict(first.training_form.named_parameters())
+    for name, value in last.training_form.named_parameters():
+        torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)

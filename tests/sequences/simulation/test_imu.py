@@ -1,0 +1,206 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import (
+    GOOD_IMU,
+    PERFECT_IMU,
+    PHONE_IMU,
+    ImuErrors,
+    simulate,
+    simulate_imu,
+)
+
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+
+
+def waving(rate: float = 100.0, duration: float = 20.0) -> Trajectory:
+    """A device moved and turned about all axes, up to about 3 rad/s and 5 m/s^2."""
+    t = np.arange(round(duration * rate) + 1) / rate
+    position = np.stack([np.sin(1.3 * t) + 0.3 * t, np.cos(0.7 * t), 0.05 * np.sin(9.0 * t)], 1)
+    turn = np.stack([np.sin(1.1 * t), 0.8 * np.cos(1.7 * t), 0.4 * np.sin(4.0 * t)], axis=1)
+    R_WB = Rotation.from_rotvec(np.outer(0.9 * t, [0, 0, 1])) * Rotation.from_rotvec(turn)
+    return Trajectory(t, position, R_WB)
+
+
+def standing(duration: float, rate: float = 1.0) -> Trajectory:
+    t = np.arange(round(duration * rate) + 1) / rate
+    return Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
+
+
+def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
+    """Pose at every fourth sample from the first truth and the samples alone, by Simpson's rule."""
+    truth = imu.truth
+    assert truth is not None
+    assert truth.velocity_W is not None
+    h = 2.0 / imu.rate
+    w0, w1, w2 = imu.gyro[:-2:2], imu.gyro[1:-1:2], imu.gyro[2::2]
+    # Magnus expansion of fourth order: Simpson's mean and the first coning term.
+    turns = Rotation.from_rotvec(h / 6.0 * (w0 + 4.0 * w1 + w2) + h**2 / 12.0 * np.cross(w0, w2))
+    attitudes = [truth.attitude_WB[0]]
+    for turn in turns:
+        attitudes.append(attitudes[-1] * turn)
+    R_WB = Rotation.concatenate(attitudes)
+    a = R_WB.apply(np.array(imu.accel[::2])) - UP
+    a0, a1, a2, h = a[:-2:2], a[1:-1:2], a[2::2], 2.0 * h
+    origin = np.zeros((1, 3))
+    gained = np.cumsum(h / 6.0 * (a0 + 4.0 * a1 + a2), axis=0)
+    velocity = truth.velocity_W[0] + np.concatenate([origin, gained])
+    # The double integral of the parabola through a0, a1, a2: their weights are 1/6, 1/3 and 0.
+    moved = np.cumsum(h * velocity[:-1] + h**2 / 6.0 * (a0 + 2.0 * a1), axis=0)
+    return truth.position_W[0] + np.concatenate([origin, moved]), R_WB[::2]
+
+
+def test_strapdown_of_a_perfect_imu_returns_the_trajectory() -> None:
+    imu = simulate_imu(waving(), rate=400.0, errors=PERFECT_IMU)
+    position, R_WB = strapdown(imu)
+    assert imu.truth is not None
+    off = (R_WB.inv() * imu.truth.attitude_WB[::4]).magnitude()
+    assert off.max() < 1e-7
+    assert np.abs(position - imu.truth.position_W[::4]).max() < 1e-5
+
+
+def test_truth_passes_through_the_given_poses() -> None:
+    given = waving()
+    truth = simulate_imu(given, rate=200.0, errors=PERFECT_IMU).truth
+    assert truth is not None
+    assert np.abs(truth.position_W[::2] - given.position_W).max() < 1e-9
+    assert (truth.attitude_WB[::2].inv() * given.attitude_WB).magnitude().max() < 1e-7
+
+
+def test_velocity_gyro_and_accel_are_the_derivatives_of_truth() -> None:
+    imu = simulate_imu(waving(), rate=2000.0, errors=PERFECT_IMU)
+    truth, h = imu.truth, 1.0 / 2000.0
+    assert truth is not None
+    assert truth.velocity_W is not None
+    p = truth.position_W
+    velocity = (p[2:] - p[:-2]) / (2.0 * h)
+    assert np.abs(velocity - truth.velocity_W[1:-1]).max() < 1e-5
+    acceleration = (p[2:] - 2.0 * p[1:-1] + p[:-2]) / h**2
+    measured = truth.attitude_WB.apply(np.array(imu.accel)) - UP
+    assert np.abs(acceleration - measured[1:-1]).max() < 1e-4
+    turned = (truth.attitude_WB[:-2].inv() * truth.attitude_WB[2:]).as_rotvec() / (2.0 * h)
+    assert np.abs(turned - imu.gyro[1:-1]).max() < 1e-5
+
+
+def test_gyro_and_accel_of_a_known_motion() -> None:
+    """A turntable: rate along z, centripetal acceleration inward, gravity's reaction upward."""
+    t = np.arange(1001) / 100.0
+    rate, radius = 1.5, 0.5
+    angle = rate * t
+    position = radius * np.stack([np.cos(angle), np.sin(angle), 0 * t], axis=1)
+    track = Trajectory(t, position, Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])))
+    imu = simulate_imu(track, rate=250.0, errors=PERFECT_IMU, gravity=9.8)
+    inner = slice(50, -50)
+    assert np.allclose(imu.gyro[inner], [0.0, 0.0, rate], atol=1e-6)
+    assert np.allclose(imu.accel[inner], [-(rate**2) * radius, 0.0, 9.8], atol=1e-6)
+
+
+@pytest.mark.parametrize("rate", [50.0, 400.0])
+def test_white_noise_has_its_density_at_any_rate(rate: float) -> None:
+    errors = ImuErrors(noise=ImuNoise(2e-3, 3e-2, 0.0, 0.0))
+    imu = simulate_imu(standing(200.0), rate=rate, errors=errors, seed=3)
+    assert np.allclose(imu.gyro.std(axis=0), 2e-3 * math.sqrt(rate), rtol=0.04)
+    assert np.allclose((imu.accel - UP).std(axis=0), 3e-2 * math.sqrt(rate), rtol=0.04)
+
+
+def test_bias_walk_grows_with_the_square_root_of_time() -> None:
+    errors = ImuErrors(noise=ImuNoise(0.0, 0.0, 1e-3, 2e-2))
+    for lag in (1.0, 10.0):
+        gyro, accel = [], []
+        for seed in range(4):
+            run = simulate(standing(1000.0), rate=20.0, errors=errors, seed=seed)
+            k = round(lag * 20.0)
+            gyro.append(run.b_g[k::k] - run.b_g[:-k:k])
+            accel.append(run.b_a[k::k] - run.b_a[:-k:k])
+            assert np.allclose(run.sequence.gyro, run.b_g)
+            assert np.allclose(run.sequence.accel - UP, run.b_a)
+        assert np.concatenate(gyro).std() == pytest.approx(1e-3 * math.sqrt(lag), rel=0.1)
+        assert np.concatenate(accel).std() == pytest.approx(2e-2 * math.sqrt(lag), rel=0.1)
+
+
+def test_turn_on_bias_scale_and_misalignment_have_their_deviations() -> None:
+    errors = ImuErrors(
+        noise=PERFECT_IMU.noise, gyro_turn_on=0.01, accel_turn_on=0.1, accel_scale=0.02
+    )
+    runs = [simulate(standing(6.0), 10.0, errors, seed) for seed in range(300)]
+    assert np.std([run.b_g[0] for run in runs]) == pytest.approx(0.01, rel=0.1)
+    assert np.std([run.b_a[-1] for run in runs]) == pytest.approx(0.1, rel=0.1)
+    along_z = [run.sequence.accel[0, 2] - run.b_a[0, 2] for run in runs]
+    assert np.std(along_z) == pytest.approx(0.02 * STANDARD_GRAVITY, rel=0.15)
+    tilted = ImuErrors(noise=PERFECT_IMU.noise, misalignment=0.01)
+    rows = [simulate_imu(standing(6.0), 10.0, tilted, seed).accel[0] for seed in range(300)]
+    assert np.std([row[:2] for row in rows]) == pytest.approx(0.01 * STANDARD_GRAVITY, rel=0.15)
+    assert np.allclose(np.linalg.norm(rows, axis=1), STANDARD_GRAVITY)
+
+
+def test_saturation_clips() -> None:
+    free = simulate_imu(waving(), errors=PERFECT_IMU)
+    errors = ImuErrors(noise=PERFECT_IMU.noise, gyro_range=1.0, accel_range=9.0)
+    clipped = simulate_imu(waving(), errors=errors)
+    assert np.abs(free.gyro).max() > 1.5
+    assert np.array_equal(clipped.gyro, np.clip(free.gyro, -1.0, 1.0))
+    assert np.array_equal(clipped.accel, np.clip(free.accel, -9.0, 9.0))
+
+
+def test_a_seed_reproduces_and_another_differs() -> None:
+    first, again, other = (simulate_imu(waving(), seed=seed) for seed in (5, 5, 6))
+    assert np.array_equal(first.gyro, again.gyro)
+    assert np.array_equal(first.accel, again.accel)
+    assert not np.array_equal(first.gyro, other.gyro)
+
+
+def test_presets_are_ordered() -> None:
+    true = simulate_imu(waving(), errors=PERFECT_IMU)
+    off = [np.abs(simulate_imu(waving(), errors=e).gyro - true.gyro).mean() for e in (
+        GOOD_IMU, PHONE_IMU)]  # fmt: skip
+    assert 0.0 < off[0] < off[1] < 0.05
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 333.0])
+def test_samples_cover_the_track_at_the_rate(rate: float) -> None:
+    imu = simulate_imu(waving(duration=7.0), rate=rate)
+    assert imu.rate == pytest.approx(rate)
+    assert imu.time[0] == 0.0
+    assert 7.0 - 1.0 / rate < imu.time[-1] <= 7.0
+
+
+def test_gaps_short_ones_are_bridged_long_ones_refused() -> None:
+    track = waving()
+    valid = np.ones(len(track), dtype=bool)
+    valid[500:505] = False
+    bad = track.position_W.copy()
+    bad[~valid] += 1.0
+    short = Trajectory(track.time, bad, track.attitude_WB, valid=valid)
+    imu, whole = simulate_imu(short, errors=PERFECT_IMU), simulate_imu(track, errors=PERFECT_IMU)
+    assert np.abs(imu.accel - whole.accel).max() < 1e-2
+    valid[500:550] = False
+    with pytest.raises(InputError, match=r"4\.990 s"):
+        simulate_imu(Trajectory(track.time, bad, track.attitude_WB, valid=valid))
+
+
+def test_poses_that_are_missing_are_a_gap_like_those_marked() -> None:
+    """What a spline makes of 5 s without poses is neither a walk nor a truth."""
+    track = waving()
+    kept = (track.time < 10.0) | (track.time > 15.0)
+    holed = Trajectory(track.time[kept], track.position_W[kept], track.attitude_WB[kept])
+    with pytest.raises(InputError, match=r"no valid pose for 5\.020 s after 9\.990 s"):
+        simulate_imu(holed)
+
+
+def test_what_cannot_be_simulated_is_refused() -> None:
+    with pytest.raises(InputError, match="at least 6"):
+        simulate_imu(standing(4.0))
+    with pytest.raises(InputError, match="rate"):
+        simulate_imu(standing(9.0), rate=0.0)
+    with pytest.raises(InputError, match="gravity"):
+        simulate_imu(standing(9.0), gravity=math.nan)
+    with pytest.raises(InputError, match="gyro_scale"):
+        ImuErrors(gyro_scale=-1.0)
+    with pytest.raises(InputError, match="accel_range"):
+        ImuErrors(accel_range=0.0)

@@ -1,0 +1,166 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import welch
+
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.routes import band_noise, drift, random_route
+from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk, step_rate
+
+
+@pytest.mark.parametrize("carry", CARRY_WAYS)
+def test_every_way_to_carry_is_plausible(carry: str) -> None:
+    for seed in range(3):
+        style = replace(WalkStyle.random(np.random.default_rng(seed)), carry=carry, next_carry="")
+        imu = simulate_imu(generate_walk(seed, 30.0, style=style), errors=PERFECT_IMU)
+        force, turning = np.linalg.norm(imu.accel, axis=1), np.linalg.norm(imu.gyro, axis=1)
+        assert np.isfinite(imu.accel).all()
+        assert force.max() < 6.0 * STANDARD_GRAVITY
+        assert turning.max() < 20.0
+        assert imu.truth is not None
+        upward = imu.truth.attitude_WB.apply(np.array(imu.accel))[:, 2].mean()
+        assert upward == pytest.approx(STANDARD_GRAVITY, abs=0.15)
+
+
+def test_a_hundred_walks_are_plausible_and_cover_the_styles() -> None:
+    styles = [WalkStyle.random(np.random.default_rng(seed)) for seed in range(100)]
+    assert {style.carry for style in styles} == set(CARRY_WAYS)
+    assert 10 < sum(bool(style.next_carry) for style in styles) < 60
+    for seed in range(40):
+        imu = simulate_imu(generate_walk(seed, 20.0), errors=PERFECT_IMU)
+        assert np.linalg.norm(imu.accel, axis=1).max() < 6.0 * STANDARD_GRAVITY
+        assert np.linalg.norm(imu.gyro, axis=1).max() < 20.0
+
+
+def test_a_seed_reproduces_and_another_differs() -> None:
+    first, again, other = (generate_walk(seed, 10.0) for seed in (1, 1, 2))
+    assert np.array_equal(first.position_W, again.position_W)
+    assert np.array_equal(first.quat_xyzw, again.quat_xyzw)
+    assert np.abs(first.position_W - other.position_W).max() > 0.1
+
+
+def test_step_rate_and_step_length_grow_together_with_speed() -> None:
+    style = WalkStyle(height=1.75, step_constant=0.225)
+    speed = np.array([0.5, 1.0, 1.4, 2.0])
+    rate = step_rate(speed, style)
+    length = speed / rate
+    assert np.allclose(length / rate, length[0] / rate[0])
+    assert 1.7 < rate[2] < 2.1  # a person of 1.75 m at 1.4 m/s: about 1.9 steps/s of 0.74 m
+    tall, short = replace(style, height=1.95), replace(style, height=1.55)
+    assert (step_rate(speed, tall) < step_rate(speed, short)).all()
+
+
+@pytest.mark.parametrize("speed", [0.7, 1.1, 1.5])
+def test_the_device_bounces_at_the_step_rate_of_its_speed(speed: float) -> None:
+    """Over many walks the strongest vertical line lies where the walked speed puts it."""
+    style = WalkStyle(carry="bag", preferred_speed=speed, vigor=0.5)
+    found, expected = [], []
+    for seed in range(6):
+        walk = generate_walk(seed, 60.0, style=style)
+        found += list(_bounce_rates(walk))
+        expected += list(step_rate(_window_speeds(walk), style))
+    walking = np.array(expected) > step_rate(np.array([0.5]), style)[0]
+    ratio = np.array(found)[walking] / np.array(expected)[walking]
+    assert walking.sum() > 20
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.08)
+
+
+def _windows(walk: Trajectory) -> list[slice]:
+    return [slice(k, k + 400) for k in range(0, len(walk) - 400, 400)]
+
+
+def _window_speeds(walk: Trajectory) -> np.ndarray:
+    velocity = np.gradient(walk.position_W[:, :2], walk.time, axis=0)
+    smooth = np.stack([np.convolve(v, np.ones(100) / 100, mode="same") for v in velocity.T], axis=1)
+    return np.array([np.linalg.norm(smooth[w], axis=1).mean() for w in _windows(walk)])
+
+
+def _bounce_rates(walk: Trajectory) -> np.ndarray:
+    upward = np.gradient(np.gradient(walk.position_W[:, 2], walk.time), walk.time)
+    rates = []
+    for w in _windows(walk):
+        f, power = welch(upward[w], 100.0, nperseg=400, nfft=4096)
+        band = (f > 0.7) & (f < 2.6)
+        rates.append(f[band][np.argmax(power[band])])
+    return np.array(rates)
+
+
+def test_routes_stop_turn_climb_and_keep_to_a_persons_speeds() -> None:
+    routes = [random_route(np.random.default_rng(seed), 6000, 100.0, 1.1) for seed in range(20)]
+    speed = np.concatenate([route.speed for route in routes])
+    turning = np.concatenate([np.abs(route.turn_rate) for route in routes])
+    assert speed.max() < 2.25
+    assert 0.02 < (speed < 0.05).mean() < 0.3
+    assert ((speed < 0.1) & (turning > 0.7)).any()
+    assert turning.max() > 1.5
+    heights = [np.ptp(route.position_W[:, 2]) for route in routes]
+    assert max(heights) > 1.5
+    assert min(heights) == pytest.approx(0.0, abs=1e-9)
+    backward = [_forward_speed_is_negative(route.position_W, route.heading) for route in routes]
+    assert any(backward)
+
+
+def _forward_speed_is_negative(position: np.ndarray, heading: np.ndarray) -> bool:
+    velocity = about_z(heading).apply(np.gradient(position, 0.01, axis=0), inverse=True)
+    return bool((velocity[:, 0] < -0.2).any())
+
+
+def test_wheels_neither_climb_nor_bounce() -> None:
+    style = WalkStyle(carry="trolley")
+    rolling = generate_walk(4, 60.0, style=style)
+    walking = generate_walk(4, 60.0, style=replace(style, carry="handheld"))
+    assert np.ptp(rolling.position_W[:, 2]) < 0.005
+    bounce = [np.diff(walk.position_W[:, 2], 2).std() for walk in (rolling, walking)]
+    assert _low_band(rolling) < 0.1 * _low_band(walking), bounce
+
+
+def _low_band(walk: Trajectory) -> float:
+    f, power = welch(np.diff(walk.position_W[:, 2], 2) * 1e4, 100.0, nperseg=1024)
+    return float(power[(f > 1.0) & (f < 3.0)].sum())
+
+
+def test_a_rig_is_turned_fast() -> None:
+    peaks = []
+    for seed in range(6):
+        walk = generate_walk(seed, 60.0, style=WalkStyle(carry="rig"))
+        gyro = simulate_imu(walk, errors=PERFECT_IMU).gyro
+        peaks.append(np.degrees(np.linalg.norm(gyro, axis=1).max()))
+    assert 120.0 < np.median(peaks) < 360.0
+
+
+def test_walks_are_smooth_enough_for_the_spline() -> None:
+    """The same walk drawn from every second pose gives nearly the same accelerations."""
+    for carry in CARRY_WAYS:
+        fine = generate_walk(9, 20.0, rate=200.0, style=WalkStyle(carry=carry))
+        coarse = Trajectory(fine.time[::2], fine.position_W[::2], fine.attitude_WB[::2])
+        a = simulate_imu(fine, errors=PERFECT_IMU)
+        b = simulate_imu(coarse, errors=PERFECT_IMU)
+        inner = slice(100, -100)
+        assert (a.accel - b.accel)[inner].std() < 0.1 * a.accel[inner].std()
+        assert (a.gyro - b.gyro)[inner].std() < 0.1 * a.gyro[inner].std()
+
+
+def test_noise_helpers_have_unit_deviation_and_their_band() -> None:
+    rng = np.random.default_rng(0)
+    assert drift(rng, 200_000, 100.0, 0.5).std() == pytest.approx(1.0, rel=0.05)
+    noise = band_noise(rng, 100_000, 100.0, 5.0, 10.0, 2)
+    assert noise.std() == pytest.approx(1.0, rel=0.05)
+    f, power = welch(noise[:, 0], 100.0, nperseg=1024)
+    assert power[(f > 4.0) & (f < 11.0)].sum() > 0.7 * power.sum()
+
+
+def test_styles_and_arguments_are_checked() -> None:
+    with pytest.raises(InputError, match="carry"):
+        WalkStyle(carry="on a hat")
+    with pytest.raises(InputError, match="height"):
+        WalkStyle(height=17.5)
+    with pytest.raises(InputError, match="mount_rotvec"):
+        WalkStyle(mount_rotvec=(0.0, 0.0, float("nan")))
+    with pytest.raises(InputError, match="duration"):
+        generate_walk(0, duration=0.0)
+    with pytest.raises(InputError, match="rate"):
+        generate_walk(0, rate=10.0)

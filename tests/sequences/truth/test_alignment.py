@@ -1,0 +1,128 @@
+"""Lag, clocks and mount between a tracked body and the IMU in it, on simulated walks."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.truth.alignment import align_tracked_body, cumulative_rotations
+from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.truth.mount_heading import heading_turn
+
+MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
+LEVER_B = np.array([0.02, -0.1, 0.01])
+
+
+def recorded(carry: str, seconds: float = 120.0) -> tuple[ImuSequence, Trajectory]:
+    style = WalkStyle(carry=carry, preferred_speed=0.8)
+    imu = simulate_imu(generate_walk(3, seconds, style=style), 100.0, PHONE_IMU)
+    assert imu.truth is not None
+    return imu, imu.truth
+
+
+def captured(truth: Trajectory, noise_rad: float, seed: int = 0) -> tuple[np.ndarray, Rotation]:
+    """Position of a point off the IMU and a noisy attitude of the tracked body around it."""
+    rng = np.random.default_rng(seed)
+    shaken = Rotation.from_rotvec(noise_rad * rng.standard_normal((len(truth), 3)))
+    position = truth.position_W - truth.attitude_WB.apply(LEVER_B)
+    position = position + 1e-4 * rng.standard_normal(position.shape)
+    return position, truth.attitude_WB * MOUNT_VB.inv() * shaken
+
+
+def test_products_of_many_rotations_are_those_one_by_one() -> None:
+    steps = Rotation.random(200, rng=np.random.default_rng(1))
+    one_by_one = [Rotation.identity()]
+    for step in steps:
+        one_by_one.append(one_by_one[-1] * step)
+    products = Rotation.from_quat(cumulative_rotations(steps))
+    assert len(products) == 201
+    assert (products.inv() * Rotation.concatenate(one_by_one)).magnitude().max() < 1e-12
+    assert len(cumulative_rotations(Rotation.identity(1)[:0])) == 1
+
+
+@pytest.mark.parametrize("apart", [0.4, -1.65, 3000.0])
+def test_clocks_are_brought_together(apart: float) -> None:
+    """Few seconds off, or of another origin; the capture starts later and ends earlier."""
+    imu, truth = recorded("handheld", 60.0)
+    _, attitude_WV = captured(truth, 0.003)
+    part = slice(800, 5000)
+    valid = np.ones(4200, dtype=np.bool_)
+    valid[1000:1100] = False
+    offset = clock_offset(imu.time, imu.gyro, truth.time[part] + apart, attitude_WV[part], valid)
+    assert offset == pytest.approx(-apart, abs=0.05)
+
+
+def mount_errors(carry: str, noise_rad: float) -> list[float]:
+    """Angle [deg] from the true mount to the gyroscope's and to that of both sensors."""
+    imu, truth = recorded(carry)
+    position, attitude_WV = captured(truth, noise_rad)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    arguments = (imu.time, imu.gyro, imu.accel, truth.time, attitude_WV, valid)
+    found = align_tracked_body(*arguments), align_tracked_body(*arguments, position)
+    return [float(np.degrees((MOUNT_VB.inv() * x.mounts[0][2]).magnitude())) for x in found]
+
+
+def test_on_a_trolley_the_accelerometer_finds_the_mounts_heading() -> None:
+    """The gyroscope alone says little of a turn about the only axis that the body turns about."""
+    gyro_alone, both = mount_errors("trolley", 0.008)
+    assert gyro_alone > 3.0
+    assert both < 1.0  # the sensors' axes are 0.6 degrees apart themselves
+
+
+@pytest.mark.parametrize("late", [-0.031, 0.0, 0.052])
+def test_the_lag_is_found_within_a_millisecond_even_where_little_is_turned(late: float) -> None:
+    imu, truth = recorded("trolley")
+    position, attitude_WV = captured(truth, 0.004)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    aligned = align_tracked_body(
+        imu.time, imu.gyro, imu.accel, truth.time - late, attitude_WV, valid, position
+    )
+    assert aligned.lag == pytest.approx(late, abs=0.0006)
+    assert aligned.correlation > 0.9
+
+
+def test_where_the_gyroscope_knows_the_mount_it_stays() -> None:
+    gyro_alone, both = mount_errors("handheld", 0.004)
+    assert gyro_alone < 0.7
+    assert both < 0.7
+
+
+@pytest.mark.parametrize("error_deg", [-6.0, 4.0])
+def test_a_turn_of_the_mount_is_seen_beside_lever_and_bias(error_deg: float) -> None:
+    imu, truth = recorded("trolley")
+    position, _ = captured(truth, 0.0)
+    up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True).mean(axis=0)
+    wrong = Rotation.from_rotvec(np.radians(error_deg) * up_B / np.linalg.norm(up_B))
+    noise = 0.02 * np.random.default_rng(2).standard_normal((len(truth), 3))
+    shaken = truth.attitude_WB * wrong * Rotation.from_rotvec(noise)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    force = imu.accel + np.array([0.05, -0.08, 0.1])
+    turn = heading_turn(truth.time, imu.gyro, force, position, shaken, valid)
+    assert np.degrees((wrong * turn).magnitude()) < 1.0
+
+
+def test_too_little_to_tell_leaves_the_mount_alone() -> None:
+    imu, truth = recorded("trolley", 10.0)
+    valid = np.zeros(len(truth), dtype=np.bool_)
+    valid[::2] = True  # no stretch is whole
+    turn = heading_turn(truth.time, imu.gyro, imu.accel, truth.position_W, truth.attitude_WB, valid)
+    assert turn.magnitude() == 0.0
+
+
+def test_single_frames_turned_about_any_axis_are_masked() -> None:
+    imu, truth = recorded("handheld")
+    _, attitude_WV = captured(truth, 0.004)
+    rng = np.random.default_rng(2)
+    struck = np.arange(500, len(truth) - 500, 400)
+    axes = rng.standard_normal((len(struck), 3))
+    turns = np.deg2rad(15.0) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    quat = attitude_WV.as_quat()
+    quat[struck] = (attitude_WV[struck] * Rotation.from_rotvec(turns)).as_quat()
+    valid = np.ones(len(truth), dtype=np.bool_)
+    aligned = align_tracked_body(
+        imu.time, imu.gyro, imu.accel, truth.time, Rotation.from_quat(quat), valid
+    )
+    assert not aligned.valid[struck].any()
+    assert aligned.valid.mean() > 0.99

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.conventions import with_axes
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.truth.fit import fit_truth
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 200.0, seed=2)
+
+
+def truth_of(sequence: ImuSequence) -> Trajectory:
+    assert sequence.truth is not None
+    return sequence.truth
+
+
+def test_a_truth_that_fits_needs_nothing(walk: ImuSequence) -> None:
+    fit = fit_truth(walk)
+    assert abs(fit.time_offset) < 0.002
+    assert fit.misalignment < np.radians(1.0)
+    assert fit.tilt < np.radians(1.0)
+    assert fit.correlation > 0.99
+    assert fit.agreeing > 0.99
+    assert fit.jumps == 0
+    assert fit.axes() is None
+
+
+@pytest.mark.parametrize("offset", [-3.21, -0.05, 0.4, 2.503])
+def test_the_clocks_offset_is_found(walk: ImuSequence, offset: float) -> None:
+    truth = truth_of(walk)
+    late = replace(walk, truth=replace(truth, time=truth.time - offset))
+    assert fit_truth(late).time_offset == pytest.approx(offset, abs=0.003)
+
+
+def test_the_rotation_between_the_axes_is_found(walk: ImuSequence) -> None:
+    truth = truth_of(walk)
+    R_TB = Rotation.from_rotvec([0.3, -0.8, 0.4])
+    turned = replace(walk, truth=replace(truth, attitude_WB=truth.attitude_WB * R_TB.inv()))
+    fit = fit_truth(turned)
+    assert (fit.R_TB.inv() * R_TB).magnitude() < np.radians(1.0)
+    assert fit.axes() is None  # no permutation comes near
+
+
+@pytest.mark.parametrize(
+    ("turned", "mended"), [("y,-x,z", "-y,x,z"), ("z,x,y", "y,z,x"), ("-x,-y,z", "-x,-y,z")]
+)
+def test_axes_are_named_whatever_the_clock(walk: ImuSequence, turned: str, mended: str) -> None:
+    truth = truth_of(walk)
+    late = replace(walk, truth=replace(truth, time=truth.time + 1.0))
+    assert fit_truth(with_axes(late, turned)).axes() == mended
+
+
+def test_a_world_off_level_is_told(walk: ImuSequence) -> None:
+    truth = truth_of(walk)
+    lean = Rotation.from_rotvec([np.radians(5.0), 0.0, 0.0])
+    leaning = replace(walk, truth=replace(truth, attitude_WB=lean * truth.attitude_WB))
+    assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
+
+
+def test_a_truth_that_flips_jumps(walk: ImuSequence) -> None:
+    truth = truth_of(walk)
+    quat_xyzw = truth.quat_xyzw
+    late = truth.time > 20.0
+    flip = Rotation.from_rotvec([0.0, 0.0, np.pi])
+    quat_xyzw[late] = (truth.attitude_WB[late] * flip).as_quat()
+    flipped = replace(walk, truth=replace(truth, attitude_WB=Rotation.from_quat(quat_xyzw)))
+    assert fit_truth(flipped).jumps == 1
+
+
+def test_a_gap_of_the_imu_is_no_jump_of_the_truth(walk: ImuSequence) -> None:
+    kept = (walk.time < 15.0) | (walk.time > 18.0)
+    gappy = replace(walk, time=walk.time[kept], gyro=walk.gyro[kept], accel=walk.accel[kept])
+    fit = fit_truth(gappy)
+    assert fit.jumps == 0
+    assert fit.misalignment < np.radians(1.0)
+    assert abs(fit.time_offset) < 0.003
+
+
+def test_another_recordings_truth_does_not_agree(walk: ImuSequence) -> None:
+    other = simulate_imu(generate_walk(99, 40.0, style=WalkStyle(carry="pocket")), 200.0)
+    fit = fit_truth(replace(walk, truth=other.truth))
+    assert fit.correlation < 0.7
+    assert fit.axes() is None
+
+
+def test_too_little_to_compare_is_refused(walk: ImuSequence) -> None:
+    with pytest.raises(InputError, match="truth"):
+        fit_truth(walk.without_truth())
+    with pytest.raises(InputError, match="10 s"):
+        fit_truth(walk.slice(0.0, 6.0))
+    truth = truth_of(walk)
+    with pytest.raises(InputError):
+        fit_truth(replace(walk, truth=replace(truth, time=truth.time + 500.0)))
