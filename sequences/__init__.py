@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import ImuSequence as ImuSequence
+    from stario.sequences.sequence import Magnetometer as Magnetometer
+    from stario.sequences.sequence import PositionTrack as PositionTrack
     from stario.sequences.sequence import Trajectory as Trajectory
     from stario.sequences.simulation.imu import GOOD_IMU as GOOD_IMU
     from stario.sequences.simulation.imu import PERFECT_IMU as PERFECT_IMU
@@ -40,8 +42,10 @@ _MODULES = {
     "ImuNoise": "noise",
     "ImuSequence": "sequence",
     "InputError": "errors",
+    "Magnetometer": "sequence",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
+    "PositionTrack": "sequence",
     "ReadError": "errors",
     "STANDARD_GRAVITY": "sequence",
     "StarioError": "errors",

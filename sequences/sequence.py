@@ -6,8 +6,9 @@ Frames: B is the body (the IMU's axes), W the world (z up, gravity along -z, yaw
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +167,79 @@ _TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
 
 
 @dataclass(frozen=True, eq=False)
+class PositionTrack:
+    """Known positions without attitude: a position track, or waypoints that the user passed.
+
+    Attributes:
+        time: (N,) [s], strictly increasing.
+        position_W: (N, 3), or horizontal (N, 2) [m].
+        kind: "positions" (a continuous track) or "waypoints" (single instants).
+        valid: (N,) bool, False where the position must not be used; all True by default.
+
+    Raises:
+        InputError: lengths differ, time does not increase, or a valid value is not finite.
+    """
+
+    time: FloatArray
+    position_W: FloatArray
+    kind: Literal["positions", "waypoints"]
+    valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        time = _checked_time("positions' time", self.time)
+        valid = np.asarray(self.valid, dtype=np.bool_)
+        valid = np.ones(len(time), dtype=np.bool_) if valid.size == 0 else valid
+        if valid.shape != time.shape:
+            raise InputError("positions' valid", f"shape {valid.shape}", f"({len(time)},) as time")
+        columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
+        shape = (len(time), columns)
+        position_W = _checked_array("positions", self.position_W, shape, where=valid)
+        for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> PositionTrack | None:
+        """The positions with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        if not keep.any():
+            return None
+        return PositionTrack(self.time[keep], self.position_W[keep], self.kind, self.valid[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """The magnetic field as measured beside the IMU, at its own times.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        field: (M, 3) magnetic flux density in B [uT].
+
+    Raises:
+        InputError: the shapes do not agree, time does not increase or a value is not finite.
+    """
+
+    time: FloatArray
+    field: FloatArray
+
+    def __post_init__(self) -> None:
+        time = _checked_time("magnetometer's time", self.time)
+        everywhere = np.ones(len(time), dtype=np.bool_)
+        field = _checked_array("magnetic field", self.field, (len(time), 3), where=everywhere)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "field", field)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> Magnetometer | None:
+        """The samples with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        return Magnetometer(self.time[keep], self.field[keep]) if keep.any() else None
+
+
+@dataclass(frozen=True, eq=False)
 class ImuSequence:
     """One recording of an inertial measurement unit, in body axes B.
 
@@ -180,6 +254,9 @@ class ImuSequence:
         truth: the true trajectory, or None.
         converted: which of "gyro" and "accel" the reader has converted from a unit that the file
             names, so that nobody converts them once more.
+        magnetometer: the field measured beside the IMU, or None.
+        positions: known positions where there is no pose (`truth`): a track or waypoints, or None.
+        attributes: what else is known of the recording (person, device, place, carry, ...).
 
     Raises:
         InputError: the arrays' shapes do not agree or there is no sample.
@@ -191,6 +268,9 @@ class ImuSequence:
     accel: FloatArray
     truth: Trajectory | None = None
     converted: frozenset[str] = frozenset()
+    magnetometer: Magnetometer | None = None
+    positions: PositionTrack | None = None
+    attributes: Mapping[str, str | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
@@ -222,14 +302,20 @@ class ImuSequence:
 
     def without_truth(self) -> ImuSequence:
         """The same recording with its truth removed."""
-        return replace(self, truth=None)
+        return replace(self, truth=None, positions=None)
 
     def slice(self, start: float, stop: float) -> ImuSequence:
         """The samples with start <= time <= stop [s], truth cut likewise."""
         keep = (self.time >= start) & (self.time <= stop)
-        truth = None if self.truth is None else self.truth.slice(start, stop)
+        field, positions = self.magnetometer, self.positions
         return replace(
-            self, time=self.time[keep], gyro=self.gyro[keep], accel=self.accel[keep], truth=truth
+            self,
+            time=self.time[keep],
+            gyro=self.gyro[keep],
+            accel=self.accel[keep],
+            truth=None if self.truth is None else self.truth.slice(start, stop),
+            magnetometer=None if field is None else field.slice(start, stop),
+            positions=None if positions is None else positions.slice(start, stop),
         )
 
 

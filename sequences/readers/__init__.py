@@ -9,6 +9,12 @@ from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.android import is_android, read_android
+from stario.sequences.readers.archive import (
+    archive_members,
+    is_archive,
+    is_archive_member,
+    read_archive,
+)
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.euroc import is_euroc, read_euroc
@@ -43,6 +49,7 @@ class Format:
 
 
 FORMATS: dict[str, Format] = {
+    "archive": Format(is_archive_member, read_archive),
     "ronin": Format(is_ronin, read_ronin),
     "ridi": Format(is_ridi, read_ridi),
     "imunet": Format(is_imunet, read_imunet),
@@ -65,7 +72,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     """Read a recording.
 
     Args:
-        path: a file or a folder, as the format has it.
+        path: a file or a folder, as the format has it; of an archive `file.h5:name`.
         format: a name in `FORMATS`, or "auto" to recognise it by its content.
         options: what the format's reader takes besides: `imu_topic` and `truth_topic` of a bag.
 
@@ -76,7 +83,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     path = Path(path)
     if format != "auto" and format not in FORMATS:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
-    if not path.exists():
+    if not path.exists() and not is_archive_member(path):
         raise ReadError(path, "path", "nothing there", "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
@@ -106,8 +113,12 @@ def find_recordings(
         ReadError: nothing is there, a folder holds no recording, or a list's entry is wrong.
     """
     path = Path(path)
+    if is_archive_member(path):
+        return [path]
     if not path.exists():
         raise ReadError(path, "path", "nothing there", "a recording or a folder of recordings")
+    if is_archive(path):
+        return archive_members(path)
     if _is_recording(path):
         return [path]
     if is_list(path):
@@ -132,11 +143,13 @@ def _below(path: Path) -> list[Path]:
             for name in subfolders
             if name not in {*whole, *doubles} and not name.startswith(".")
         ]
-        found += [
-            here / name
-            for name in files
-            if name.lower().endswith(_SUFFIXES) and _is_recording(here / name)
-        ]
+        for name in files:
+            if not name.lower().endswith(_SUFFIXES):
+                continue
+            if is_archive(here / name):
+                found += archive_members(here / name)
+            elif _is_recording(here / name):
+                found.append(here / name)
     return found
 
 

@@ -305,7 +305,9 @@ def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
         read_recording(tmp_path / "none.csv")
     with pytest.raises(ReadError, match=r"found a folder with imu\.csv, expected one of"):
         read_recording(tmp_path)
-    with pytest.raises(InputError, match=r"format: found 'bags', expected auto, ronin, .*, csv"):
+    with pytest.raises(
+        InputError, match=r"format: found 'bags', expected auto, archive, ronin, .*, csv"
+    ):
         read_recording(path, format="bags")
 
 
@@ -361,7 +363,8 @@ def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_de
 
 @needs_data
 def test_every_recording_is_found() -> None:
-    assert len(find_recordings(DATA)) == 18
+    assert sum(len(find_recordings(DATA / name)) for name in ("oxiod", "tumvi", "euroc")) == 18
+    assert len(find_recordings(DATA / "archives")) == 1149
 
 
 def test_a_text_file_with_rows_of_numbers_is_no_list(tmp_path: Path) -> None:

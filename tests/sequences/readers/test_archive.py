@@ -1,0 +1,72 @@
+"""Archives: recordings by name, the three kinds of truth, what is not there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from stario.sequences import ReadError, find_recordings, read_recording
+from stario.sequences.readers.archive import archive_members
+
+ARCHIVES = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives"
+
+
+def _archive(path: Path) -> Path:
+    time = np.arange(50) / 50.0
+    with h5py.File(path, "w") as file:
+        for name, person in (("a", "ann"), ("b", "bob"), ("c", "ann")):
+            group = file.create_group(name)
+            group.attrs["person"] = person
+            group["imu/t"], group["imu/gyro"] = time, np.zeros((50, 3))
+            group["imu/accel"] = np.tile([0.0, 0.0, 9.81], (50, 1))
+        file["a/mag/t"], file["a/mag/field"] = time[::5], np.ones((10, 3))
+        file["a/truth/t"], file["a/truth/p"] = time, np.ones((50, 3))
+        file["a/truth/quat_xyzw"] = np.tile([0.0, 0.0, 0.0, 1.0], (50, 1))
+        file["b/truth/t"], file["b/truth/p"] = time, np.ones((50, 3))
+        file["c/waypoints/t"], file["c/waypoints/xy"] = [0.1, 0.9], np.ones((2, 2))
+    return path
+
+
+def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    pose, track, taps = (read_recording(found) for found in find_recordings(path))
+    assert pose.truth is not None and pose.positions is None
+    assert pose.magnetometer is not None and len(pose.magnetometer) == 10
+    assert track.truth is None and track.positions is not None
+    assert track.positions.kind == "positions" and track.positions.position_W.shape == (50, 3)
+    assert taps.positions is not None and taps.positions.kind == "waypoints"
+    assert taps.positions.position_W.shape == (2, 2)
+    assert taps.attributes["person"] == "ann"
+
+
+def test_recordings_are_chosen_by_attribute(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    assert archive_members(path, person="ann") == [Path(f"{path}:a"), Path(f"{path}:c")]
+
+
+def test_a_name_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with pytest.raises(ReadError, match="'d', expected a name in it, as a, b, c"):
+        read_recording(f"{path}:d")
+
+
+def test_a_cut_archive_is_an_error_that_names_the_file(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(ReadError, match="walks.h5"):
+        read_recording(path)
+
+
+@pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")
+def test_gravity_stands_up_in_the_true_frame_of_the_archives() -> None:
+    for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):
+        recording = read_recording(ARCHIVES / name)
+        assert recording.truth is not None
+        truth = recording.truth.at(recording.time)
+        known = truth.valid
+        up = truth.attitude_WB.apply(recording.accel)[known].mean(axis=0)
+        assert np.linalg.norm(up[:2]) < 0.5 and 9.4 < up[2] < 10.2
