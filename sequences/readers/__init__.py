@@ -48,8 +48,12 @@ class Format:
     options: tuple[str, ...] = ()
 
 
+def _is_archive_or_member(path: Path) -> bool:
+    return is_archive(path) or is_archive_member(path)
+
+
 FORMATS: dict[str, Format] = {
-    "archive": Format(is_archive_member, read_archive),
+    "archive": Format(_is_archive_or_member, read_archive),
     "ronin": Format(is_ronin, read_ronin),
     "ridi": Format(is_ridi, read_ridi),
     "imunet": Format(is_imunet, read_imunet),

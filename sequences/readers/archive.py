@@ -23,6 +23,7 @@ from stario.sequences.time_order import advancing
 SUFFIXES = (".h5", ".hdf5")
 
 _HDF5_MAGIC = b"\x89HDF"
+_RONIN = "data.hdf5"
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -42,7 +43,10 @@ def is_archive_member(path: Path) -> bool:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file is an archive: HDF5 whose groups hold an IMU's samples."""
+    """Whether a file is an archive: HDF5 whose groups hold an IMU's samples or a track.
+
+    One that cannot be opened is taken for one, by its name: reading it says what is wrong.
+    """
     if path.suffix.lower() not in SUFFIXES or magic(path, 4) != _HDF5_MAGIC:
         return False
     h5py = optional_package("h5py", "readers")
@@ -51,7 +55,7 @@ def is_archive(path: Path) -> bool:
             first = next(iter(file.values()), None)
             return isinstance(first, h5py.Group) and ("imu/t" in first or "truth/t" in first)
     except OSError:
-        return False
+        return path.name != _RONIN
 
 
 def archive_members(path: Path, **where: str) -> list[Path]:
@@ -78,7 +82,7 @@ def read_archive(path: Path) -> ImuSequence:
     """Read one recording of an archive.
 
     Args:
-        path: `file.h5:name`.
+        path: `file.h5:name`, or the file alone where it holds one recording.
 
     Raises:
         ReadError: the file or the recording is not there, or its content is malformed.
@@ -86,15 +90,17 @@ def read_archive(path: Path) -> ImuSequence:
     h5py = optional_package("h5py", "readers")
     file_path, name = split_name(path)
     with _opened(h5py, file_path) as file:
-        if name is None or name not in file:
-            known = ", ".join(list(file)[:3])
+        names = list(file)
+        if name is None and len(names) == 1:
+            name = names[0]
+        if name is None:
+            found = f"{len(names)} of them"
             raise ReadError(
-                file_path,
-                "recording",
-                repr(name or ""),
-                f"a name in it, as {known}",
-                "file.h5:name",
+                file_path, "recording", found, "the name of one", f"{path.name}:{names[0]}"
             )
+        if name not in file:
+            known = ", ".join(names[:3])
+            raise ReadError(file_path, "recording", repr(name), f"a name in it, as {known}")
         return _sequence(path, name, file[name])
 
 
@@ -155,4 +161,5 @@ def _opened(h5py: Any, path: Path) -> Any:
     try:
         return h5py.File(path)
     except OSError as error:
-        raise ReadError(path, "content", str(error), "an HDF5 archive of recordings") from error
+        fix = "is the download complete?"
+        raise ReadError(path, "content", str(error), "a whole HDF5 archive", fix) from None
