@@ -20,7 +20,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
     track_table,
 )
 from stario.sequences.errors import InputError
@@ -53,7 +52,7 @@ def compare(
     settings, network = estimating.settings(), estimating.network_for(jobs)
     known = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
-    files, skipped = recordings_at(paths or [])
+    files, skipped = reading.recordings(paths or [])
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
@@ -91,7 +90,7 @@ def _print_comparison(comparison: Comparison) -> None:
 
     sequence = comparison.sequence
     path = comparison.path_m
-    way = "no truth" if path is None else f"{path:.1f} m"
+    way = f"truth: {sequence.truth_words()}" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
     time = comparison.tracks["ekf"].time
     words = metric_words(comparison.alignment)

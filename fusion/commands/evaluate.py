@@ -18,7 +18,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
 )
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ def evaluate(
     from stario.sequences.errors import InputError
     from stario.sequences.splits import split_paths
 
-    files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
+    files, skipped = reading.recordings(paths) if paths else (split_paths(data, split), [])
     if models is not None:
         named, settings = [name.strip() for name in models.split(",")], estimating.settings()
         averaged = convention or "rms"

@@ -19,7 +19,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
     track_table,
 )
 from stario.sequences.errors import InputError
@@ -52,8 +51,7 @@ def run(
         optional_package("plotly", "report")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
-    # A format that is named is that of the path itself, whatever it looks like.
-    files, skipped = recordings_at([path]) if reading.format == "auto" else ([path], [])
+    files, skipped = reading.recordings([path])
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     names: set[str] = set()
@@ -117,6 +115,8 @@ def _run(
     typer.echo(f"{way} travelled by the estimate")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
+    elif sequence.positions is not None:
+        typer.echo(f"truth: {sequence.truth_words()}")
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")
