@@ -17,7 +17,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
 )
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ def backends(
     scores: list[Score] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
-        files, skipped = recordings_at(paths or split_paths(data or Path(), split))
+        files, skipped = reading.recordings(paths or split_paths(data or Path(), split))
         settings, network = estimating.settings(), estimating.network()
         with progress_bar("backends", len(files)) as progress:
 

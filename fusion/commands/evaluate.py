@@ -18,7 +18,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
 )
 from stario.fusion.commands.judging import judge_by_groups
 from stario.sequences.errors import InputError
@@ -84,7 +83,7 @@ def evaluate(
     from stario.sequences.batch import Skipped
 
     if by is not None:
-        listed, skipped = _listed(paths or [], data, split)
+        listed, skipped = _listed(reading, paths or [], data, split)
         skipped += judge_by_groups(
             listed, reading, by, estimating.model, against, every, jobs, out, as_json
         )
@@ -92,7 +91,7 @@ def evaluate(
         return
     if against is not None:
         raise InputError("--against", f"{against} without --by", "a grouping", "--by set")
-    listed, skipped = _listed(paths or [], data, split)
+    listed, skipped = _listed(reading, paths or [], data, split)
     files = [one.path for one in listed]
     if models is not None:
         named, settings = [name.strip() for name in models.split(",")], estimating.settings()
@@ -125,13 +124,15 @@ def evaluate(
     leave_with_skipped(skipped)
 
 
-def _listed(paths: list[Path], data: Path | None, split: str) -> tuple[list[Listed], list[Skipped]]:
+def _listed(
+    reading: Reading, paths: list[Path], data: Path | None, split: str
+) -> tuple[list[Listed], list[Skipped]]:
     """Recordings that are named, or else those of a split, and what leads to none."""
     from stario.network.training.splits import listed
     from stario.sequences.splits import Listed
 
     if paths:
-        files, skipped = recordings_at(paths)
+        files, skipped = reading.recordings(paths)
         return [Listed(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or the data of a split: --data")

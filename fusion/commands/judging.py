@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,7 +49,7 @@ def judge_by_groups(
     if out is not None:
         make_folder(out)
     paths = [one.path for one in chosen]
-    prepared = prepared_recordings(paths, reading.read, asdict(reading), cache_folder(), jobs)
+    prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {one.path: one.group for one in chosen}
     with progress_bar("judge", len(chosen)) as progress:
         judged, skipped = judge(prepared, models, groups, lambda done: progress(done / len(chosen)))
