@@ -37,6 +37,9 @@ FixesOption = Annotated[
 JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
 ]
+ReportOption = Annotated[
+    bool, typer.Option("--report", help="Also write report.html: map, slider, plots, health.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
 
 

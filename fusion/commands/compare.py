@@ -15,6 +15,7 @@ from stario.fusion.commands.common import (
     OutOption,
     PathsArgument,
     Reading,
+    ReportOption,
     grouped,
     leave_with_skipped,
     print_json,
@@ -35,6 +36,7 @@ def compare(
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
     out: OutOption = None,
+    report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
@@ -43,7 +45,10 @@ def compare(
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import comparison_dict, write_comparison
     from stario.fusion.fixes import read_fixes
+    from stario.sequences.readers.checked import optional_package
 
+    if report:
+        optional_package("plotly", "report")
     settings, network = estimating.settings(), estimating.network_for(jobs)
     known = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
@@ -65,6 +70,12 @@ def compare(
                 skipped.append(outcome)
     folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings) if comparisons else []
+    if report:
+        from stario.fusion.report.page import write_comparison_report
+
+        for comparison in comparisons:
+            inner = folder / comparison.sequence.name
+            written.append(write_comparison_report(inner, comparison, settings))
     if as_json and comparisons:
         print_json(comparison_dict(comparisons))
     elif comparisons:
