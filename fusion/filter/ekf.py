@@ -147,7 +147,7 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: the slot holds no clone.
         """
-        self._check_slot(slot)
+        self.state.time_of_clone(slot)
         s = self.state
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
@@ -185,9 +185,9 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: a slot holds no clone.
         """
-        self._check_slot(slot_i)
+        self.state.time_of_clone(slot_i)
         if slot_j is not None:
-            self._check_slot(slot_j)
+            self.state.time_of_clone(slot_j)
         X = self.state.X
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
@@ -268,12 +268,6 @@ class StateCloningEkf(ErrorStateEngine):
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
         self.state = EkfState(s.time, X, s.origin_W, b_g, b_a, s.P, s.clone_times)
         self.x = np.zeros((self.dim_x, 1))
-
-    def _check_slot(self, slot: int) -> None:
-        times = self.state.clone_times
-        if not 0 <= slot < self.slots or times[slot] is None:
-            taken = [k for k, time in enumerate(times) if time is not None]
-            raise InputError("slot", repr(slot), f"one that holds a clone: {taken}")
 
 
 def _with(

@@ -13,6 +13,7 @@ import numpy as np
 from stario.fusion.error_state import CLONE, CORE, GYRO_BIAS, plain_covariance
 from stario.fusion.filter.estimate import Estimate
 from stario.fusion.lie import FloatArray, skew
+from stario.sequences.errors import InputError
 
 _CLONE_COLUMNS = [0, 1, 2, 4]
 """Columns R, p of a pose: a clone has no velocity."""
@@ -92,8 +93,25 @@ class EkfState:
         """
         return plain_covariance(self.P[:CORE, :CORE], self.X[0, :, 3:].T)
 
+    def time_of_clone(self, slot: int) -> float:
+        """When a clone was taken [s].
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
+        if time is None:
+            taken = [k for k, known in enumerate(self.clone_times) if known is not None]
+            raise InputError("slot", repr(slot), f"one that holds a clone: {taken}")
+        return time
+
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
-        """R_WB (3, 3) and p_W (3,) of a clone as estimated now."""
+        """R_WB (3, 3) and p_W (3,) of a clone as estimated now.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        self.time_of_clone(slot)
         X = self.X[1 + slot]
         return X[:, :3], np.asarray(X[:, 4] + self.origin_W)
 
@@ -103,9 +121,12 @@ class EkfState:
         return self._estimate(self.time, self.X[0], P, P[:, GYRO_BIAS], in_gap, map_frame)
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
-        """A clone as it is known now."""
-        time, first = self.clone_times[slot], CORE + CLONE * slot
-        assert time is not None  # the slot is taken
+        """A clone as it is known now.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        time, first = self.time_of_clone(slot), CORE + CLONE * slot
         rows = self.P[first : first + CLONE]
         X, P = self.X[1 + slot][:, _CLONE_COLUMNS], rows[:, first : first + CLONE]
         return self._estimate(time, X, P, rows[:, GYRO_BIAS], False, map_frame)

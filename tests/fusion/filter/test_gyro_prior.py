@@ -77,7 +77,7 @@ def test_certain_of_the_narrow_prior_the_state_is_that_filters(
 ) -> None:
     """Whatever the bias is in truth: conditioning is what the other filter does."""
     _, walk, oracle = walked
-    narrow = run(ONLY_NARROW, walk, oracle)[0].state()
+    narrow = run(ONLY_NARROW, walk, oracle)[0].nav_state()
     estimator = run(MIXED, walk, oracle)[0]
     wide, certain = estimator.filtered(), GyroPrior(CERTAIN, estimator.gyro_prior._start)
     state = nav_states([estimator.estimate()], certain)[0]
