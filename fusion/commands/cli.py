@@ -20,6 +20,7 @@ from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.faults import faults
 from stario.fusion.commands.inspect import inspect
+from stario.fusion.commands.live import live
 from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
@@ -35,6 +36,7 @@ app = typer.Typer(
 
 for command in (
     run,
+    live,
     compare,
     evaluate,
     simulate,
