@@ -42,8 +42,8 @@ def backends(
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
     from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
+    from stario.network.training.splits import split_paths
     from stario.sequences.batch import Skipped, each
-    from stario.sequences.splits import split_paths
 
     scores: list[Score] = []
     skipped: list[Skipped] = []

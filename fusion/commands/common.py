@@ -59,6 +59,12 @@ class Reading:
             "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
         ),
     ] = "m/s^2"
+    accel_sign: Annotated[
+        str,
+        typer.Option(
+            "--accel-sign", help="Where the accelerometer points at rest: up, or down: apple."
+        ),
+    ] = "up"
     axes: Annotated[
         str,
         typer.Option(
@@ -119,7 +125,9 @@ class Reading:
         topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
         named = {name: topic for name, topic in topics.items() if topic is not None}
         sequence = read_recording(path, self.format, **named)
-        return with_conventions(sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity)
+        return with_conventions(
+            sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
+        )
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ def _recorded(
 ) -> tuple[list[WorldStream], list[WorldStream], list[Skipped]]:
     """Streams to learn from, streams held out, and what could not be used, named at once."""
     from stario.network.training.data import split_off
-    from stario.sequences.splits import split_paths
+    from stario.network.training.splits import split_paths
 
     files, missing = reading.recordings(paths)
     held_files, held_missing = reading.recordings(validation)
