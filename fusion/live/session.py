@@ -72,7 +72,7 @@ class Drawn:
         table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
         self.points = table.tolist()
         self.revision += 1
-        self.map_frame = after.world
+        self.map_frame = after.map_frame
 
 
 class Session:
@@ -184,7 +184,7 @@ class Session:
         self._file.append_fix(position_fix(before.time, p_W, covariance))
         self.fixes += 1
         after = self._state()
-        if after.world != self.drawn.map_frame:
+        if after.map_frame != self.drawn.map_frame:
             self.drawn.move(before, after)
         self.drawn.add(after)
         self._tell_health(after.time)
