@@ -30,7 +30,10 @@ from stario.sequences.sequence import PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
-COMMANDS = ("run", "compare", "evaluate", "inspect", "convert", "train", "simulate", "export")
+COMMANDS = (
+    *("run", "live", "compare", "evaluate", "inspect"),
+    *("convert", "train", "simulate", "export"),
+)
 CHECKS = ("models", "backends", "faults", "consistency", "benchmark")
 
 
