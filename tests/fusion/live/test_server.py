@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from stario.fusion.fixes import read_fixes
+from stario.fusion import read_fixes
 from stario.fusion.live.hub import MOST_DEVICES, Viewer
 from stario.fusion.live.server import MOST_BYTES, live_app
 from stario.sequences import read_recording
