@@ -62,12 +62,15 @@ class LevelledStream:
         return np.ascontiguousarray(self.imu_N[rows].transpose(0, 2, 1))
 
 
-def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[LevelledStream]:
+_SHORTEST_SECONDS = 2.0
+"""Shorter stretches are left out [s]."""
+
+
+def levelled_streams(sequence: ImuSequence) -> list[LevelledStream]:
     """The unbroken stretches of a recording, each levelled from its own start.
 
     Args:
         sequence: the recording; its truth is not looked at.
-        min_seconds: shorter stretches are left out [s].
 
     Raises:
         InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
@@ -75,7 +78,7 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
     time, gyro, accel = clean_samples(sequence)
     streams = []
     for begin, end in unbroken(time):
-        if time[end - 1] - time[begin] < min_seconds:
+        if time[end - 1] - time[begin] < _SHORTEST_SECONDS:
             continue
         part = slice(begin, end)
         R_NB = levelled_attitudes(time[part], gyro[part], accel[part])

@@ -17,8 +17,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import FloatArray
-from stario.sequences.noise import ImuNoise
-from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.noise import PHONE_NOISE, ImuNoise
 from stario.sequences.windows import WINDOW_SECONDS
 
 _BY_VELOCITY = np.eye(6, 3)
@@ -46,8 +45,8 @@ def zero_velocity(stillness: StillnessDetector, noise: ImuNoise) -> ZeroVelocity
     """
     rates = stillness.mean_rates()
     n = len(rates)
-    hidden = max(noise.accel_noise, PHONE_IMU.noise.accel_noise) ** 2 * WINDOW_SECONDS
-    white = PHONE_IMU.noise.gyro_noise**2 / stillness.mean_seconds()
+    hidden = max(noise.accel_noise, PHONE_NOISE.accel_noise) ** 2 * WINDOW_SECONDS
+    white = PHONE_NOISE.gyro_noise**2 / stillness.mean_seconds()
     spread = np.maximum(rates.var(axis=0), white)
     return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden] * 3, *(n * spread)]))
 
