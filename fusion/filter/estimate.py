@@ -37,7 +37,7 @@ class Estimate:
         P_g: (15, 3) or (6, 3) of the same with d_bg.
         P_gg: (3, 3) of d_bg.
         in_gap: as in `NavState`.
-        world: as in `NavState`.
+        map_frame: as in `NavState`.
     """
 
     time: float
@@ -62,7 +62,7 @@ class Moments(NamedTuple):
 
     @property
     def plain_covariance(self) -> FloatArray:
-        """(N, n, n) of errors about the world's axes, each true minus estimate."""
+        """(N, n, n) of errors about W's axes, each true minus estimate."""
         return plain_covariance(self.P, self.X[:, :, 3:].transpose(0, 2, 1))
 
 
