@@ -340,7 +340,9 @@ class Navigator:
             known = [k for k in part if epochs[k].window is not None]
             if not known:
                 continue
-            mean, covariance = network.predict(np.stack([_window(epochs[k]) for k in known]))
+            windows_N = np.stack([_window(epochs[k]) for k in known])
+            heading = np.array([epochs[k].heading for k in known])
+            mean, covariance = network.predict(windows_N, heading)
             for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
                 measurements[k] = _measurement(epochs[k], d_N, cov_N)
             progress(0.1 + 0.5 * (part[-1] + 1) / len(epochs))
@@ -358,7 +360,8 @@ class Navigator:
         if epoch.gap:
             self._network.restart()
         if epoch.window is not None:
-            mean, covariance = self._network.predict(epoch.window[None])
+            heading = np.array([epoch.heading])
+            mean, covariance = self._network.predict(epoch.window[None], heading)
             measurement = _measurement(epoch, mean[0], covariance[0])
         self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
         return self._recipe.state()

@@ -36,6 +36,8 @@ from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SECONDS,
     resample,
+    facing,
+    mean_heading,
 )
 
 _TAIL = 4
@@ -238,8 +240,14 @@ class Intake:
         if not update or len(self._window) < self._blocks:
             return epoch
         window = np.concatenate(self._window, axis=1)
-        suspect = any(self._suspect)
-        return replace(epoch, window=window, R_NB_window=self._starts[0], suspect=suspect)
+        heading = float(mean_heading(facing(np.stack(self._starts))))
+        return replace(
+            epoch,
+            window=window,
+            R_NB_window=self._starts[0],
+            heading=heading,
+            suspect=any(self._suspect),
+        )
 
     def _block(self, epoch: Epoch) -> NDArray[np.float32]:
         """The epoch's part (6, n) of a window; averages reach half a step back, hence the tail."""

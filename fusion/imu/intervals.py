@@ -40,6 +40,7 @@ class Epoch:
         update: whether windows begin and end at this epoch's end.
         window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
+        heading: of the device in N, averaged over the window [rad].
     """
 
     time: FloatArray
@@ -51,6 +52,7 @@ class Epoch:
     update: bool = False
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
+    heading: float = 0.0
     anew: Start | None = None
     flags: Flags = FINE
     suspect: bool = False
