@@ -211,6 +211,10 @@ def show(
     person with the device in the other hand; tilted, biased and noisy.
 
     Args:
+        imu: in W.
+        heading: of the device in W, averaged over the window [rad].
+        augmentation: how far windows are varied.
+        generator: of all draws.
         together: windows in a row that share mirror, tilt and biases.
     """
     a, groups = augmentation, len(imu) // together

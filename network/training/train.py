@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -129,11 +130,9 @@ class _Run:
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.rate, weight_decay=config.weight_decay
         )
-        self._shared = workers.wrapped(
-            self.network, idle=architecture(config.architecture).heads > 1
-        )
-        if config.compiled:
-            self._shared = torch.compile(self._shared)
+        idle = architecture(config.architecture).heads > 1
+        shared = workers.wrapped(self.network, idle=idle)
+        self._shared: Any = torch.compile(shared) if config.compiled else shared
         self._mixed = config.precision == "bfloat16"
         if not workers.leads:
             torch.manual_seed(config.seed + workers.rank)  # dropout of its own

@@ -8,8 +8,8 @@ With a_mk the seconds that window k and leg m have in common,
 
 (horizontal vectors as complex numbers). psi takes out the unknown yaw between levelled frame and
 map; no gradient goes through it. The known positions are uncertain, so neighbouring legs err with
-opposite signs: r is whitened by C = A diag(s^2) A' + q T, in which A takes positions to legs, s is a
-position's deviation and q the variance that a second of displacement adds. A robust loss of the
+opposite signs: r is whitened by C = A diag(s^2) A' + q T, in which A takes positions to legs, s is
+a position's deviation and q the variance that a second of displacement adds. A robust loss of the
 whitened residuals times q is then on the scale of the windows' squared error.
 """
 
@@ -286,7 +286,8 @@ def ends_covariance(start: FloatArray, stop: FloatArray, sigma: FloatArray) -> F
     """A diag(s^2) A' (M, M) [m^2]: legs that share an end err with opposite signs there.
 
     Args:
-        start, stop: (M,) of the legs, in order [s].
+        start: (M,) of the legs, in order [s].
+        stop: (M,) of them [s].
         sigma: (M, 2) of their ends [m].
     """
     C = np.diag((sigma**2).sum(axis=1))
