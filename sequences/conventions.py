@@ -9,13 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Magnetometer
 from stario.sequences.units import with_units
 
 log = logging.getLogger(__name__)
 
 GRAVITY = ("included", "removed")
 """Whether the accelerometer's numbers hold gravity; without it they are linear acceleration."""
+
+ACCEL_SIGNS = ("up", "apple")
+"""Where the accelerometer points at rest: up, as specific force does, or down, as Apple's."""
 
 SAME_AXES = "x,y,z"
 
@@ -26,6 +29,7 @@ def with_conventions(
     accel_unit: str = "m/s^2",
     axes: str = SAME_AXES,
     gravity: str = "included",
+    accel_sign: str = "up",
 ) -> ImuSequence:
     """The recording in rad/s, m/s^2 of specific force and the axes of its truth.
 
@@ -35,6 +39,7 @@ def with_conventions(
         accel_unit: as for `with_units`.
         axes: as for `with_axes`.
         gravity: one of `GRAVITY`; "removed" is put back by `with_gravity`.
+        accel_sign: one of `ACCEL_SIGNS`; "apple" turns all three axes over.
 
     Raises:
         InputError: an argument is unknown, a unit is given for numbers that were converted from
@@ -42,12 +47,17 @@ def with_conventions(
     """
     if gravity not in GRAVITY:
         raise InputError("gravity", repr(gravity), f"one of {', '.join(GRAVITY)}")
+    if accel_sign not in ACCEL_SIGNS:
+        raise InputError("accel_sign", repr(accel_sign), f"one of {', '.join(ACCEL_SIGNS)}")
+    if accel_sign == "apple":
+        turned = accel_unit.removeprefix("-")
+        accel_unit = turned if accel_unit.startswith("-") else f"-{accel_unit}"
     sequence = with_axes(with_units(sequence, gyro_unit, accel_unit), axes)
     return with_gravity(sequence) if gravity == "removed" else sequence
 
 
 def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
-    """The recording with gyroscope and accelerometer turned to other axes.
+    """The recording with gyroscope, accelerometer and magnetometer turned to other axes.
 
     The truth stays as it is: this mends an IMU whose axes are not those whose attitude the truth
     gives. Where there is no truth, any right-handed axes do.
@@ -62,7 +72,13 @@ def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
     if axes == SAME_AXES:
         return sequence
     R = axes_matrix(axes)
-    return replace(sequence, gyro=sequence.gyro @ R.T, accel=sequence.accel @ R.T)
+    field = sequence.magnetometer
+    return replace(
+        sequence,
+        gyro=sequence.gyro @ R.T,
+        accel=sequence.accel @ R.T,
+        magnetometer=None if field is None else Magnetometer(field.time, field.field @ R.T),
+    )
 
 
 def axes_matrix(axes: str) -> FloatArray:

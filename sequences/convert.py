@@ -1,22 +1,25 @@
-"""A recording from any format into a CSV of one's own or into the EuRoC layout, without loss."""
+"""Recordings from any format into a CSV of one's own, the EuRoC layout or an archive."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.archive_writer import write_archive
 from stario.sequences.checks import MIN_SECONDS, check_units
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder, atomic_write
+from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
 from stario.sequences.readers.own_csv import write_csv
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 log = logging.getLogger(__name__)
 
-LAYOUTS = ("csv", "euroc")
+LAYOUTS = ("csv", "euroc", "archive")
 
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -32,13 +35,14 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     """Write a recording, whole or not at all.
 
     Numbers are written with the digits that bring them back bit for bit; the EuRoC layout holds
-    times in integer nanoseconds. Not written: truth's poses that are not valid, its covariance
-    and, to CSV, its velocity.
+    times in integer nanoseconds. An archive keeps everything, the others not: truth's poses that
+    are not valid, its covariance, positions without attitude, attributes; CSV no velocity, EuRoC
+    no magnetometer. What is lost is logged.
 
     Args:
         sequence: the recording.
         path: a file to write or replace, or the EuRoC recording's new folder.
-        layout: "csv" or "euroc"; None for csv where the path ends in `.csv`, else euroc.
+        layout: one of `LAYOUTS`; None for what the path's end says, see `layout_of`.
 
     Returns:
         The files written.
@@ -47,16 +51,50 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
         InputError: the layout is unknown, the path cannot be written, or the recording's numbers
             are not in s, rad/s and m/s^2, which the files would claim.
     """
-    layout = layout or ("csv" if path.suffix.lower() == ".csv" else "euroc")
-    if layout not in LAYOUTS:
-        raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
-    if sequence.duration >= MIN_SECONDS:  # a shorter one shows too little to be judged
-        check_units(sequence)
+    layout = layout_of(path, layout)
+    check_content(sequence)
     _warn_of_loss(sequence, layout)
     if layout == "euroc":
         return write_euroc(path, sequence)
-    write_csv(path, sequence)
+    if layout == "archive":
+        write_archive(path, [sequence])
+    else:
+        write_csv(path, sequence)
     return [path]
+
+
+def convert_all(sequences: Iterable[ImuSequence], path: Path) -> list[str]:
+    """Write recordings into one archive, whole or not at all; returns their names in it.
+
+    Raises:
+        InputError: as for `convert` and `write_archive`.
+    """
+    return write_archive(path, map(check_content, sequences))
+
+
+def layout_of(path: Path, layout: str | None = None) -> str:
+    """The layout that is named, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
+
+    Raises:
+        InputError: the layout is unknown.
+    """
+    if layout is None:
+        by_suffix = {".csv": "csv", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
+        return by_suffix.get(path.suffix.lower(), "euroc")
+    if layout not in LAYOUTS:
+        raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
+    return layout
+
+
+def check_content(sequence: ImuSequence) -> ImuSequence:
+    """The recording, if its numbers can be in the units that a file would claim.
+
+    Raises:
+        InputError: as for `check_units`.
+    """
+    if sequence.duration >= MIN_SECONDS:  # a shorter one shows too little to be judged
+        check_units(sequence)
+    return sequence
 
 
 def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
@@ -121,10 +159,16 @@ def _write_table(path: Path, header: str, stamps: NDArray[np.int64], values: Flo
 
 
 def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
-    truth = sequence.truth
-    if truth is None:
+    if layout == "archive":
         return
-    if layout == "csv" and truth.velocity_W is not None:
-        log.warning("%s: the truth's velocity has no column in CSV", sequence.name)
-    if truth.position_covariance_W is not None:
-        log.warning("%s: the truth's covariance has no column", sequence.name)
+    truth, lost = sequence.truth, []
+    if truth is not None and truth.velocity_W is not None and layout == "csv":
+        lost.append("the truth's velocity has no column in CSV")
+    if truth is not None and truth.position_covariance_W is not None:
+        lost.append("the truth's covariance has no column")
+    if sequence.positions is not None:
+        lost.append(f"{sequence.positions.kind} without attitude have no column: write an .h5")
+    if sequence.magnetometer is not None and layout == "euroc":
+        lost.append("the magnetometer has no file in the EuRoC layout: write a .csv or .h5")
+    for words in lost:
+        log.warning("%s: %s", sequence.name, words)

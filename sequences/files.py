@@ -39,10 +39,27 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
         InputError: another mode, the folder does not exist, `path` is a folder, or the system
             refuses to write there.
     """
-    path = Path(path)
     if mode not in ("w", "wb"):
         raise InputError("mode", repr(mode), "'w' or 'wb'")
     text: dict[str, str] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
+    with atomic_path(path) as temporary:
+        # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.
+        exclusive = mode.replace("w", "x")
+        with temporary.open(exclusive, **text) as file:  # type: ignore[call-overload]
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """A temporary file's path for a library that opens files itself, else as `atomic_write`.
+
+    Raises:
+        InputError: the folder does not exist, `path` is a folder, or the system refuses to write
+            there.
+    """
+    path = Path(path)
     with _refusals_told(path):
         if not path.parent.is_dir():
             raise InputError("path", str(path), "a file in an existing folder", "create the folder")
@@ -50,12 +67,7 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
             raise InputError("path", f"the folder {path}", "a file")
         temporary = _beside(path)
         try:
-            # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.
-            exclusive = mode.replace("w", "x")
-            with temporary.open(exclusive, **text) as file:  # type: ignore[call-overload]
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
+            yield temporary
             temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)

@@ -86,6 +86,7 @@ class Inspection:
         coverage: of the truth, None without one.
         fit: between truth and gyroscope, None where they cannot be compared.
         problems: what is wrong, one line each, with what mends it.
+        truth: what is known of the true track, in words.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Inspection:
     coverage: Coverage | None
     fit: TruthFit | None
     problems: tuple[str, ...]
+    truth: str = "none"
 
     def as_dict(self) -> dict[str, object]:
         """The findings as plain values, units in the names."""
@@ -140,6 +142,7 @@ class Inspection:
                 "jumps": fit.jumps,
                 "axes": fit.axes(),
             },
+            "known_of_truth": self.truth,
             "problems": list(self.problems),
         }
 
@@ -191,7 +194,7 @@ class Inspection:
     def _truth_lines(self) -> list[str]:
         coverage, fit = self.coverage, self.fit
         if coverage is None:
-            return ["truth: none"]
+            return [f"truth: {self.truth}"]
         lines = [
             f"truth: covers {100 * coverage.share:.1f} % of the samples, "
             f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
@@ -243,6 +246,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         coverage=coverage,
         fit=fit,
         problems=tuple(problems),
+        truth=sequence.truth_words(),
     )
 
 

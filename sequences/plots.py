@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
 _BLUE, _ORANGE, _GREEN, _PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
 _RED, _SKY, _GREY, _INK = "#D55E00", "#56B4E9", "#999999", "#333333"
-_STYLES = {
+TRACK_STYLES = {
     "inertial": ("inertial", _GREY),
     "network": ("network", _ORANGE),
     "network_true_attitude": ("network, true attitude", _GREEN),
@@ -281,7 +281,7 @@ def _panels(fig: Figure, *heights: float) -> list[Axes]:
 
 def _style(name: str, index: int) -> tuple[str, str]:
     """Legend text and colour of a track; unknown names take spare colours by their position."""
-    return _STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
+    return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
 
 
 def _broken(

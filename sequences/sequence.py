@@ -300,6 +300,17 @@ class ImuSequence:
         steps = steps[np.isfinite(steps) & (steps > 0)]
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
+    def truth_words(self) -> str:
+        """What is known of the true track, for a person."""
+        if self.truth is not None:
+            return f"{int(self.truth.valid.sum())} poses"
+        if self.positions is None:
+            return "none"
+        count = int(self.positions.valid.sum())
+        if self.positions.kind == "waypoints":
+            return f"{count} waypoints, no poses"
+        return f"{count} positions without attitude, no poses"
+
     def without_truth(self) -> ImuSequence:
         """The same recording with its truth removed."""
         return replace(self, truth=None, positions=None)

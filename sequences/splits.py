@@ -9,35 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import InputError, ReadError
-
-TEST = (
-    "oxiod/handheld/data1/syn/imu3.csv",
-    "oxiod/multi users/user2/syn/imu5.csv",
-    "oxiod/trolley/data2/syn/imu5.csv",
-    "tumvi/dataset-room4_512_16",
-)
-"""Test recordings, in the order of every table; nothing is ever tuned on them."""
-
-VALIDATION = (
-    "oxiod/handheld/data1/syn/imu7.csv",
-    "oxiod/multi users/user2/syn/imu4.csv",
-    "oxiod/trolley/data2/syn/imu1.csv",
-    "tumvi/dataset-room3_512_16",
-)
-"""Recordings kept from training: early stop, calibration of the covariance."""
-
-TRAINING = (
-    "oxiod/handheld/data1/syn/imu2.csv",
-    "oxiod/multi users/user2/syn/imu6.csv",
-    "oxiod/trolley/data1/syn/imu7.csv",
-    "oxiod/trolley/data2/syn/imu2.csv",
-    "oxiod/trolley/data2/syn/imu3.csv",
-    "oxiod/trolley/data2/syn/imu4.csv",
-    "tumvi/dataset-room1_512_16",
-    "tumvi/dataset-room2_512_16",
-)
-
-_SPLITS = {"test": TEST, "validation": VALIDATION, "training": TRAINING}
+from stario.sequences.readers.archive import split_name
+from stario.sequences.readers.text import read_lines
 
 OFFICIAL: dict[str, dict[str, str]] = {
     "ronin": {
@@ -61,24 +34,60 @@ OFFICIAL: dict[str, dict[str, str]] = {
 _PAPER_SHARES = (8, 1, 1)
 
 
-def split_paths(data: Path, split: str) -> list[Path]:
-    """Paths of a split's recordings under the data folder.
+@dataclass(frozen=True)
+class Listed:
+    """A recording of a list and the group that it belongs to.
+
+    Attributes:
+        path: of the recording.
+        group: words from the coarse to the fine, as "ilc site2 F1"; empty where none is named.
+    """
+
+    path: Path
+    group: str
+
+    def within(self, group: str) -> bool:
+        """Whether the recording belongs to a group, or to one that the group is part of."""
+        return f"{self.group} ".startswith(f"{group} ")
+
+
+def read_list(file: Path, data: Path) -> list[Listed]:
+    """Recordings of a list that names them below a data folder.
+
+    Each line is `name` or `name, group`; a name may be a recording in an archive,
+    `file.h5:name`. Comments from `#` on are dropped.
 
     Raises:
-        InputError: the split is unknown or one of its recordings is not there.
+        ReadError: the list cannot be read.
+        InputError: one of its recordings is not there.
     """
-    if split not in _SPLITS:
-        raise InputError("split", repr(split), f"one of {', '.join(_SPLITS)}")
-    paths = [data / name for name in _SPLITS[split]]
-    for path in paths:
-        if not path.exists():
+    listed = []
+    for line in read_lines(file):
+        name, _, group = (part.strip() for part in line.split("#")[0].partition(","))
+        if not name:
+            continue
+        path = data / name
+        if not split_name(path)[0].exists():
             raise InputError(
-                str(path),
-                "nothing there",
-                "the development recordings",
-                "name their folder: --data",
+                str(path), "nothing there", f"a recording of {file.name}", "name the data: --data"
             )
-    return paths
+        listed.append(Listed(path, group))
+    return listed
+
+
+def leave_out(recordings: Iterable[Listed], group: str) -> tuple[list[Listed], list[Listed]]:
+    """Recordings outside a group, to train on, and those within it, to judge by.
+
+    Raises:
+        InputError: the group has no recording, or all of them.
+    """
+    known = list(recordings)
+    outside = [one for one in known if not one.within(group)]
+    inside = [one for one in known if one.within(group)]
+    if not inside or not outside:
+        groups = ", ".join(sorted({one.group for one in known}))
+        raise InputError("group", repr(group), f"some, but not all, of {groups}")
+    return outside, inside
 
 
 @dataclass(frozen=True)

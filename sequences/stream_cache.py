@@ -31,6 +31,7 @@ from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
 from stario.sequences.readers import FORMATS
+from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.oxiod import capture_file
 from stario.sequences.sequence import ImuSequence, too_slow
 from stario.sequences.windows import Attitude, WorldStream, world_streams
@@ -98,6 +99,9 @@ def cached(
 
 def recording_files(path: Path) -> list[Path]:
     """The files that a recording's content comes from, and perhaps others beside them."""
+    path, member = split_name(path)
+    if member is not None:
+        return [path]
     while path != path.parent and _is_recording(path.parent, path.parent.stat().st_mtime_ns):
         path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
     if path.is_dir():
@@ -124,7 +128,7 @@ def _stored(
     attitude: Attitude,
 ) -> Path | list[WorldStream]:
     """The cache's file of a recording, or its streams where nothing can be written."""
-    if not path.exists():
+    if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
     key = {"path": str(path.resolve()), "files": _stamps(path), "options": dict(options)}
     key["attitude"] = attitude

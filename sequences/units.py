@@ -21,7 +21,19 @@ ACCEL_UNITS = {
 }
 """The minus is for devices that report gravity where others report specific force: Apple's."""
 
+MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mG": 0.1}
+
 _SPELLINGS = {
+    "ut": "uT",
+    "µt": "uT",
+    "μt": "uT",
+    "microtesla": "uT",
+    "nt": "nT",
+    "mt": "mT",
+    "t": "T",
+    "tesla": "T",
+    "mg": "mG",
+    "milligauss": "mG",
     "sec": "s",
     "second": "s",
     "seconds": "s",
@@ -51,7 +63,7 @@ _SPELLINGS = {
 
 
 def unit_named(text: str) -> str:
-    """The table's spelling of a unit: case, blanks and `^` do not matter (`rad s^-1`: `rad/s`)."""
+    """The tables' spelling of a unit: case, blanks and `^` do not matter (`rad s^-1`: `rad/s`)."""
     plain = text.lower().replace(" ", "").replace("^", "")
     return _SPELLINGS.get(plain, plain)
 

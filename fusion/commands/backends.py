@@ -17,7 +17,6 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
 )
 
 if TYPE_CHECKING:
@@ -43,13 +42,13 @@ def backends(
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
     from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
+    from stario.network.training.splits import split_paths
     from stario.sequences.batch import Skipped, each
-    from stario.sequences.splits import split_paths
 
     scores: list[Score] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
-        files, skipped = recordings_at(paths or split_paths(data or Path(), split))
+        files, skipped = reading.recordings(paths or split_paths(data or Path(), split))
         settings, network = estimating.settings(), estimating.network()
         with progress_bar("backends", len(files)) as progress:
 

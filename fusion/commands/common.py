@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.sequences.errors import StarioError
+from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
@@ -37,6 +37,9 @@ FixesOption = Annotated[
 JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
 ]
+ReportOption = Annotated[
+    bool, typer.Option("--report", help="Also write report.html: map, slider, plots, health.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
 
 
@@ -56,6 +59,12 @@ class Reading:
             "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
         ),
     ] = "m/s^2"
+    accel_sign: Annotated[
+        str,
+        typer.Option(
+            "--accel-sign", help="Where the accelerometer points at rest: up, or down: apple."
+        ),
+    ] = "up"
     axes: Annotated[
         str,
         typer.Option(
@@ -76,6 +85,37 @@ class Reading:
             help="Included in the accelerometer, or removed: put back by the true attitude.",
         ),
     ] = "included"
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--where",
+            help="Of archives only recordings with this attribute, such as person=dan or "
+            "'name=r*'; of several values of one attribute any, of several attributes all.",
+        ),
+    ] = None
+
+    def as_read(self) -> dict[str, object]:
+        """What a recording's numbers depend on: all options but those that choose recordings."""
+        return {
+            item.name: getattr(self, item.name) for item in fields(self) if item.name != "where"
+        }
+
+    def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
+        """Recordings at the paths, in folders or in lists, and what leads to none."""
+        from stario.sequences.batch import Skipped
+        from stario.sequences.readers import find_recordings
+
+        if self.format != "auto":  # a format that is named is that of the path itself
+            return list(paths), []
+        chosen = _attributes(self.where or ())
+        files: list[Path] = []
+        errors: list[StarioError] = []
+        for path in paths:
+            try:
+                files += find_recordings(path, errors.append, chosen)
+            except StarioError as error:
+                errors.append(error)
+        return files, [Skipped("", str(error)) for error in errors]
 
     def read(self, path: Path) -> ImuSequence:
         """The recording at a path, in rad/s, m/s^2 of specific force and its truth's axes."""
@@ -85,7 +125,9 @@ class Reading:
         topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
         named = {name: topic for name, topic in topics.items() if topic is not None}
         sequence = read_recording(path, self.format, **named)
-        return with_conventions(sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity)
+        return with_conventions(
+            sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
+        )
 
 
 @dataclass(frozen=True)
@@ -156,19 +198,15 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return flat
 
 
-def recordings_at(paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
-    """Recordings at the paths, in folders or in lists, and what leads to none."""
-    from stario.sequences.batch import Skipped
-    from stario.sequences.readers import find_recordings
-
-    files: list[Path] = []
-    errors: list[StarioError] = []
-    for path in paths:
-        try:
-            files += find_recordings(path, errors.append)
-        except StarioError as error:
-            errors.append(error)
-    return files, [Skipped("", str(error)) for error in errors]
+def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
+    """Patterns by attribute, of `key=pattern` words."""
+    chosen: dict[str, list[str]] = {}
+    for word in words:
+        key, equals, pattern = word.partition("=")
+        if not (key and equals and pattern):
+            raise InputError("--where", repr(word), "attribute=value", "such as person=dan")
+        chosen.setdefault(key, []).append(pattern)
+    return chosen
 
 
 def leave_with_skipped(skipped: Sequence[Skipped]) -> None:

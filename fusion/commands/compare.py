@@ -15,11 +15,11 @@ from stario.fusion.commands.common import (
     OutOption,
     PathsArgument,
     Reading,
+    ReportOption,
     grouped,
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
     track_table,
 )
 from stario.sequences.errors import InputError
@@ -36,6 +36,7 @@ def compare(
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
     out: OutOption = None,
+    report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
@@ -44,11 +45,14 @@ def compare(
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import comparison_dict, write_comparison
     from stario.fusion.fixes import read_fixes
+    from stario.sequences.readers.checked import optional_package
 
+    if report:
+        optional_package("plotly", "report")
     settings, network = estimating.settings(), estimating.network_for(jobs)
     known = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
-    files, skipped = recordings_at(paths or [])
+    files, skipped = reading.recordings(paths or [])
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
@@ -66,6 +70,12 @@ def compare(
                 skipped.append(outcome)
     folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings) if comparisons else []
+    if report:
+        from stario.fusion.report.page import write_comparison_report
+
+        for comparison in comparisons:
+            inner = folder / comparison.sequence.name
+            written.append(write_comparison_report(inner, comparison, settings))
     if as_json and comparisons:
         print_json(comparison_dict(comparisons))
     elif comparisons:
@@ -80,7 +90,7 @@ def _print_comparison(comparison: Comparison) -> None:
 
     sequence = comparison.sequence
     path = comparison.path_m
-    way = "no truth" if path is None else f"{path:.1f} m"
+    way = f"truth: {sequence.truth_words()}" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
     time = comparison.tracks["ekf"].time
     words = metric_words(comparison.alignment)

@@ -1,28 +1,79 @@
-"""`stario convert`: any readable recording into a CSV or the EuRoC layout."""
+"""`stario convert`: readable recordings into a CSV, the EuRoC layout or an archive of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import Reading, grouped
+from stario.fusion.commands.common import Reading, grouped, leave_with_skipped
+from stario.sequences.errors import InputError, StarioError
+
+if TYPE_CHECKING:
+    from stario.sequences.batch import Skipped
+    from stario.sequences.sequence import ImuSequence
 
 
 @grouped
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A recording in any format.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="File or new folder to write.")],
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IN... OUT",
+            help="Recordings, folders or lists of some, and the file or new folder to write. "
+            "Into an archive (.h5) go any number, into others one.",
+        ),
+    ],
     reading: Reading,
     to: Annotated[
-        str | None, typer.Option(help="csv or euroc; by default csv if OUT ends in .csv.")
+        str | None,
+        typer.Option(help="csv, euroc or archive; by default by OUT's end, .csv, none or .h5."),
     ] = None,
 ) -> None:
-    """Convert a recording to a CSV or to the EuRoC layout, without loss."""
+    """Convert recordings to a CSV, to the EuRoC layout or to an archive, without loss."""
     from stario.sequences.convert import convert as convert_sequence
+    from stario.sequences.convert import convert_all, layout_of
 
-    sequence = reading.read(source)
-    written = convert_sequence(sequence, target, to)
-    typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
-    typer.echo("\n".join(str(path) for path in written))
+    if len(paths) < 2:
+        raise InputError("convert", str(paths[0]), "IN... OUT", "name what to write as well")
+    *sources, target = paths
+    if layout_of(target, to) != "archive":
+        sequence = reading.read(_only(reading, sources))
+        written = convert_sequence(sequence, target, to)
+        typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
+        typer.echo("\n".join(str(path) for path in written))
+        return
+    files, skipped = reading.recordings(sources)
+    names = convert_all(_read(reading, files, skipped), target)
+    typer.echo(f"{len(names)} recordings in {target}")
+    leave_with_skipped(skipped)
+
+
+def _only(reading: Reading, sources: list[Path]) -> Path:
+    """The one recording at the paths."""
+    if len(sources) == 1 and not reading.where:
+        return sources[0]
+    files, skipped = reading.recordings(sources)
+    leave_with_skipped(skipped)
+    if len(files) != 1:
+        expected = "one recording, or an archive (.h5) to write"
+        raise InputError("convert", f"{len(files)} recordings", expected)
+    return files[0]
+
+
+def _read(reading: Reading, files: list[Path], skipped: list[Skipped]) -> Iterator[ImuSequence]:
+    """One recording after the other; what cannot be read or judged is told at the end."""
+    from stario.sequences.batch import Skipped
+    from stario.sequences.convert import check_content
+
+    for file in files:
+        try:
+            sequence = reading.read(file)
+            check_content(sequence)
+        except StarioError as error:
+            skipped.append(Skipped(str(file), str(error)))
+        else:
+            typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
+            yield sequence

@@ -18,12 +18,14 @@ from stario.fusion.commands.common import (
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
 )
+from stario.fusion.commands.judging import judge_by_groups
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.sequences.batch import Skipped
+    from stario.sequences.splits import Listed
 
 
 @grouped
@@ -32,9 +34,29 @@ def evaluate(
     estimating: Estimating,
     paths: PathsArgument = None,
     data: Annotated[
-        Path, typer.Option(help="Folder of the development recordings, used without PATH.")
-    ] = Path("../shared/data"),
-    split: Annotated[str, typer.Option(help="Which of them: test, validation, training.")] = "test",
+        Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option(help="Which of them: test, validation, training, holdout, all.")
+    ] = "test",
+    by: Annotated[
+        str | None,
+        typer.Option(
+            "--by",
+            help="Judge the network alone by groups: set, group, person, device, place, carry. "
+            "Truth may be poses, positions or waypoints.",
+        ),
+    ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            help="With --by: weights to compare with, by paired ratios with 95 % intervals. "
+            "{group} in the name of weights is each recording's group: leave one group out."
+        ),
+    ] = None,
+    every: Annotated[
+        int, typer.Option(min=1, help="With --by: judge by every so many recordings of a group.")
+    ] = 1,
     models: Annotated[
         str | None,
         typer.Option(
@@ -59,10 +81,18 @@ def evaluate(
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import scores_of, summary, summary_table
     from stario.sequences.batch import Skipped
-    from stario.sequences.errors import InputError
-    from stario.sequences.splits import split_paths
 
-    files, skipped = recordings_at(paths) if paths else (split_paths(data, split), [])
+    if by is not None:
+        listed, skipped = _listed(reading, paths or [], data, split)
+        skipped += judge_by_groups(
+            listed, reading, by, estimating.model, against, every, jobs, out, as_json
+        )
+        leave_with_skipped(skipped)
+        return
+    if against is not None:
+        raise InputError("--against", f"{against} without --by", "a grouping", "--by set")
+    listed, skipped = _listed(reading, paths or [], data, split)
+    files = [one.path for one in listed]
     if models is not None:
         named, settings = [name.strip() for name in models.split(",")], estimating.settings()
         averaged = convention or "rms"
@@ -92,6 +122,21 @@ def evaluate(
     elif recordings:
         typer.echo(summary_table(recordings))
     leave_with_skipped(skipped)
+
+
+def _listed(
+    reading: Reading, paths: list[Path], data: Path | None, split: str
+) -> tuple[list[Listed], list[Skipped]]:
+    """Recordings that are named, or else those of a split, and what leads to none."""
+    from stario.network.training.splits import listed
+    from stario.sequences.splits import Listed
+
+    if paths:
+        files, skipped = reading.recordings(paths)
+        return [Listed(path, "") for path in files], skipped
+    if data is None:
+        raise InputError("PATH", "none", "recordings", "name some, or the data of a split: --data")
+    return listed(split, data), []
 
 
 def _networks(

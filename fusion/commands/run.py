@@ -14,11 +14,11 @@ from stario.fusion.commands.common import (
     JsonOption,
     OutOption,
     Reading,
+    ReportOption,
     grouped,
     leave_with_skipped,
     print_json,
     progress_bar,
-    recordings_at,
     track_table,
 )
 from stario.sequences.errors import InputError
@@ -37,6 +37,7 @@ def run(
     fixes: FixesOption = None,
     backend: Annotated[str, typer.Option(help="What fuses: ekf, or graph.")] = "ekf",
     out: OutOption = None,
+    report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
@@ -44,11 +45,13 @@ def run(
     from stario.fusion.fixes import read_fixes
     from stario.fusion.navigator import Navigator
     from stario.sequences.batch import Skipped, each
+    from stario.sequences.readers.checked import optional_package
 
+    if report:
+        optional_package("plotly", "report")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
-    # A format that is named is that of the path itself, whatever it looks like.
-    files, skipped = recordings_at([path]) if reading.format == "auto" else ([path], [])
+    files, skipped = reading.recordings([path])
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     names: set[str] = set()
@@ -57,7 +60,7 @@ def run(
         sequence = reading.read(file)
         name = distinct_name(sequence.name, names)
         folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-        return _run(navigator, sequence, known, folder, told=not as_json)
+        return _run(navigator, sequence, known, folder, report, told=not as_json)
 
     records: list[dict[str, object]] = []
     for outcome in each(fused, files, jobs=1):
@@ -71,7 +74,12 @@ def run(
 
 
 def _run(
-    navigator: Navigator, sequence: ImuSequence, fixes: Sequence[Fix], folder: Path, told: bool
+    navigator: Navigator,
+    sequence: ImuSequence,
+    fixes: Sequence[Fix],
+    folder: Path,
+    report: bool,
+    told: bool,
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
@@ -90,6 +98,12 @@ def _run(
     written = write_run(
         folder, sequence.name, track, truth, aligned, metrics, words, navigator.config, backend
     )
+    if report:
+        from stario.fusion.report.page import write_report
+
+        path, config, name = folder / "report.html", navigator.config, str(backend)
+        figures = {name: metrics}
+        written.append(write_report(path, sequence, {name: track}, config, figures, alignment))
     record: dict[str, object] = {
         "recording": sequence.name,
         backend: metrics,
@@ -101,6 +115,8 @@ def _run(
     typer.echo(f"{way} travelled by the estimate")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
+    elif sequence.positions is not None:
+        typer.echo(f"truth: {sequence.truth_words()}")
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")

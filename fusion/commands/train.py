@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,7 +18,6 @@ from stario.fusion.commands.common import (
     grouped,
     leave_with_skipped,
     progress_bar,
-    recordings_at,
 )
 from stario.sequences.errors import ConfigError, InputError
 
@@ -97,7 +95,9 @@ def train(
         raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
-    recorded, held_out, skipped = _recorded(paths or [], validation or [], data, streams_of)
+    recorded, held_out, skipped = _recorded(
+        reading, paths or [], validation or [], data, streams_of
+    )
     walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
@@ -156,6 +156,7 @@ def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
 
 
 def _recorded(
+    reading: Reading,
     paths: list[Path],
     validation: list[Path],
     data: Path | None,
@@ -163,10 +164,10 @@ def _recorded(
 ) -> tuple[list[WorldStream], list[WorldStream], list[Skipped]]:
     """Streams to learn from, streams held out, and what could not be used, named at once."""
     from stario.network.training.data import split_off
-    from stario.sequences.splits import split_paths
+    from stario.network.training.splits import split_paths
 
-    files, missing = recordings_at(paths)
-    held_files, held_missing = recordings_at(validation)
+    files, missing = reading.recordings(paths)
+    held_files, held_missing = reading.recordings(validation)
     if data is not None:
         files += split_paths(data, "training")
         held_files += split_paths(data, "validation")
@@ -189,7 +190,7 @@ def _streams_of(
     recordings: list[list[WorldStream]] = []
     skipped: list[Skipped] = []
     with progress_bar("read", len(files)) as progress:
-        outcomes = recorded(files, reading.read, asdict(reading), folder, jobs, attitude)
+        outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
         for done, outcome in enumerate(outcomes, 1):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)

@@ -89,7 +89,9 @@ def _compare(
 ) -> Comparison:
     sequence = read(path)
     if truth_needed and sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(
+            f"{sequence.name}: truth", sequence.truth_words(), "a recording with true poses"
+        )
     network = _loaded(model) if isinstance(model, str) else model
     return compare(network, sequence, config, progress, fixes)
 

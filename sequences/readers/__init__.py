@@ -10,10 +10,12 @@ from pathlib import Path
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.android import is_android, read_android
 from stario.sequences.readers.archive import (
+    Where,
     archive_members,
     is_archive,
     is_archive_member,
     read_archive,
+    split_name,
 )
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
@@ -87,7 +89,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     path = Path(path)
     if format != "auto" and format not in FORMATS:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
-    if not path.exists() and not is_archive_member(path):
+    if not split_name(path)[0].exists():
         raise ReadError(path, "path", "nothing there", "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
@@ -100,7 +102,9 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
 
 
 def find_recordings(
-    path: str | Path, on_error: Callable[[ReadError], None] | None = None
+    path: str | Path,
+    on_error: Callable[[ReadError], None] | None = None,
+    where: Where | None = None,
 ) -> list[Path]:
     """The recordings at a path: itself if it is one, those that it lists, else all below it.
 
@@ -112,27 +116,52 @@ def find_recordings(
         path: a recording, a list file or a folder.
         on_error: called for each entry of a list that is empty or leads nowhere; the others are
             returned all the same. Without it such an entry is raised.
+        where: attributes that recordings must have, which only those of an archive do: for each
+            patterns, one of which must fit, `{"person": ["dan", "ha*"]}`.
 
     Raises:
         ReadError: nothing is there, a folder holds no recording, or a list's entry is wrong.
     """
     path = Path(path)
-    if is_archive_member(path):
-        return [path]
-    if not path.exists():
+    if not split_name(path)[0].exists():
         raise ReadError(path, "path", "nothing there", "a recording or a folder of recordings")
     if is_archive(path):
-        return archive_members(path)
+        return archive_members(path, where)
     if _is_recording(path):
-        return [path]
+        return _with_attributes([path], where)
     if is_list(path):
-        return _listed(path, on_error)
+        return _listed(path, on_error, where)
     if path.is_file():
-        return [path]
-    found = _below(path)
+        return _with_attributes([path], where)
+    found = sorted(_below(path))
     if not found:
         raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
-    return sorted(found)
+    return _with_attributes(found, where)
+
+
+def _with_attributes(found: list[Path], where: Where | None) -> list[Path]:
+    """Those of the recordings whose attributes fit; only archives' have any."""
+    if not where or not found:
+        return found
+    members: dict[Path, list[Path]] = {}
+    for path in found:
+        if is_archive_member(path):
+            members.setdefault(split_name(path)[0], []).append(path)
+    chosen: list[Path] = []
+    errors: list[ReadError] = []
+    for file, paths in members.items():
+        try:
+            fitting = set(archive_members(file, where))
+            chosen += [path for path in paths if path in fitting]
+        except ReadError as error:
+            errors.append(error)
+    if errors and not chosen:
+        raise errors[0]
+    if not chosen:
+        asked = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+        fix = "recordings outside of archives have no attributes"
+        raise ReadError(found[0], f"recordings with {asked}", "none", "some", fix)
+    return chosen
 
 
 def _below(path: Path) -> list[Path]:
@@ -157,21 +186,23 @@ def _below(path: Path) -> list[Path]:
     return found
 
 
-def _listed(path: Path, on_error: Callable[[ReadError], None] | None) -> list[Path]:
+def _listed(
+    path: Path, on_error: Callable[[ReadError], None] | None, where: Where | None
+) -> list[Path]:
     """What a list names, each once; a list in a list is an error, or it could name itself."""
     found: list[Path] = []
     for entry in list_entries(path):
         try:
             if isinstance(entry, ReadError):
                 raise entry
-            if not _is_recording(entry) and is_list(entry):
-                raise ReadError(path, "list", f"the list {entry.name}", "names of recordings")
-            found += find_recordings(entry)
+            if not _is_recording(entry.path) and is_list(entry.path):
+                raise ReadError(path, "list", f"the list {entry.path.name}", "names of recordings")
+            found += find_recordings(entry.path, where=entry.where)
         except ReadError as error:
             if on_error is None:
                 raise
             on_error(error)
-    return list(dict.fromkeys(found))
+    return _with_attributes(list(dict.fromkeys(found)), where)
 
 
 def _is_recording(path: Path) -> bool:

@@ -1,29 +1,44 @@
 """StarIO's archive: many recordings in one HDF5 file, each a group; one is named `file.h5:name`.
 
 A group holds `imu/{t,gyro,accel}`, where known `mag/{t,field}`, and truth of one of three kinds:
-`truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}`. Units are s,
-rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes say who carried
-which device where.
+`truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or `p`). Units are
+s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes say who
+carried which device where. Poses may come with `truth/{velocity,position_covariance,valid}`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, optional_package, rotations
 from stario.sequences.readers.text import magic
-from stario.sequences.sequence import ImuSequence, Magnetometer, PositionTrack, Trajectory
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    PositionTrack,
+    Trajectory,
+)
 from stario.sequences.time_order import advancing
 
 SUFFIXES = (".h5", ".hdf5")
 
+Where = Mapping[str, Sequence[str]]
+"""What recordings are asked for: patterns, one of which must fit, for each attribute."""
+
 _HDF5_MAGIC = b"\x89HDF"
 _RONIN = "data.hdf5"
+_OPTIONAL = {
+    "velocity_W": "truth/velocity",
+    "position_covariance_W": "truth/position_covariance",
+}
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -58,24 +73,58 @@ def is_archive(path: Path) -> bool:
         return path.name != _RONIN
 
 
-def archive_members(path: Path, **where: str) -> list[Path]:
-    """`file.h5:name` of every recording of an archive that has an IMU.
+def archive_members(path: Path, where: Where | None = None) -> list[Path]:
+    """`file.h5:name` of every recording of an archive that has an IMU; only names are read.
 
     Args:
         path: the archive's file.
-        where: attributes that a recording must have, as text: `person="dan"`.
+        where: for each attribute patterns of which one must fit its text, `*` for anything:
+            `{"person": ["dan", "ha*"]}`.
 
     Raises:
-        ReadError: the file cannot be read.
+        ReadError: the file cannot be read, or none has the attributes; it names the values seen.
     """
     h5py = optional_package("h5py", "readers")
+    wanted = where or {}
     with _opened(h5py, path) as file:
-        return [
-            Path(f"{path}:{name}")
+        known = {
+            name: {key: _plain(value) for key, value in group.attrs.items()} if wanted else {}
             for name, group in file.items()
             if "imu/t" in group
-            and all(str(group.attrs.get(key, "")) == value for key, value in where.items())
-        ]
+        }
+    chosen = [name for name, attributes in known.items() if matches(name, attributes, wanted)]
+    if known and not chosen:
+        raise _none_chosen(path, known, wanted)
+    return [Path(f"{path}:{name}") for name in chosen]
+
+
+def matches(name: str, attributes: Mapping[str, str | float], where: Where) -> bool:
+    """Whether a recording's attributes (its name is one) are as asked for."""
+    told = {"name": name, **attributes}
+    return all(
+        any(fnmatchcase(_text(told.get(key, "")), pattern) for pattern in patterns)
+        for key, patterns in where.items()
+    )
+
+
+def _none_chosen(
+    path: Path, known: Mapping[str, Mapping[str, str | float]], where: Where
+) -> ReadError:
+    asked = ", ".join(f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns)
+    key = next(
+        (k for k, patterns in where.items() if not _any(known, {k: patterns})), next(iter(where))
+    )
+    values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
+    seen = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
+    return ReadError(path, f"recordings with {asked}", "none", f"{key} of {seen or 'nothing'}")
+
+
+def _any(known: Mapping[str, Mapping[str, str | float]], where: Where) -> bool:
+    return any(matches(name, attributes, where) for name, attributes in known.items())
+
+
+def _text(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def read_archive(path: Path) -> ImuSequence:
@@ -105,13 +154,13 @@ def read_archive(path: Path) -> ImuSequence:
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    time = _column(path, group, "imu/t")
+    time = _column(path, group, "imu/t", finite=False)
     truth, positions = _truth(path, group)
     return ImuSequence(
         name=name,
         time=time,
-        gyro=_column(path, group, "imu/gyro"),
-        accel=_column(path, group, "imu/accel"),
+        gyro=_column(path, group, "imu/gyro", finite=False),
+        accel=_column(path, group, "imu/accel", finite=False),
         truth=truth,
         converted=frozenset({"gyro", "accel"}),
         magnetometer=_magnetometer(path, group),
@@ -129,26 +178,54 @@ def _magnetometer(path: Path, group: Any) -> Magnetometer | None:
 
 
 def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:
-    """Poses, or else positions or waypoints."""
+    """Poses, and positions or waypoints."""
+    positions = None
     if "waypoints" in group:
-        time, xy = _column(path, group, "waypoints/t"), _column(path, group, "waypoints/xy")
-        keep = advancing(time)
-        return None, PositionTrack(time[keep], xy[keep], "waypoints")
+        place = "waypoints/xy" if "waypoints/xy" in group else "waypoints/p"
+        positions = _positions(path, group, "waypoints", place)
     if "truth" not in group:
-        return None, None
-    time, position_W = _column(path, group, "truth/t"), _column(path, group, "truth/p")
-    keep = advancing(time)
+        return None, positions
     if "truth/quat_xyzw" not in group:
-        return None, PositionTrack(time[keep], position_W[keep], "positions")
-    quat = np.asarray(group["truth/quat_xyzw"][:], dtype=np.float64)
-    attitude_WB: Rotation = rotations(path, "truth/quat_xyzw", quat, "xyzw")
-    return Trajectory(time[keep], position_W[keep], attitude_WB[keep]), None
+        return None, _positions(path, group, "positions", "truth/p")
+    time = _column(path, group, "truth/t")
+    keep = advancing(time)
+    valid = _valid(path, group, "truth", time)[keep]
+    quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
+    # What is not valid may hold anything; a rotation must be one.
+    usable = valid | np.isfinite(quat).all(axis=1)
+    quat = np.where(usable.reshape(-1, 1), quat, [0.0, 0.0, 0.0, 1.0])
+    attitude_WB = rotations(path, "truth/quat_xyzw", quat, "xyzw")
+    optional = {
+        name: _column(path, group, field, finite=False)[keep] if field in group else None
+        for name, field in _OPTIONAL.items()
+    }
+    position_W = _column(path, group, "truth/p", finite=False)[keep]
+    return Trajectory(time[keep], position_W, attitude_WB, valid=valid, **optional), positions
 
 
-def _column(path: Path, group: Any, field: str) -> Any:
+def _positions(
+    path: Path, group: Any, kind: Literal["positions", "waypoints"], field: str
+) -> PositionTrack:
+    stem = field.split("/")[0]
+    time = _column(path, group, f"{stem}/t")
+    keep = advancing(time)
+    position_W = _column(path, group, field, finite=False)
+    return PositionTrack(time[keep], position_W[keep], kind, _valid(path, group, stem, time)[keep])
+
+
+def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
+    field = f"{stem}/valid"
+    if field not in group:
+        return np.ones(len(time), dtype=np.bool_)
+    return np.asarray(group[field][:], dtype=np.bool_)
+
+
+def _column(path: Path, group: Any, field: str, finite: bool = True) -> FloatArray:
+    """A dataset as numbers; of the IMU some may be missing, which its health report counts."""
     if field not in group:
         raise ReadError(path, field, "no such dataset", "an array of numbers")
-    return checked(path, field, np.asarray(group[field][:], dtype=np.float64))
+    values: FloatArray = np.asarray(group[field][:], dtype=np.float64)
+    return checked(path, field, values) if finite else values
 
 
 def _plain(value: Any) -> str | float:

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags: an Imu topic and, where there is one, a pose topic as truth.
+"""ROS 1 and ROS 2 bags: an Imu topic and, where there are, a pose topic as truth, a MagneticField.
 
 `.bag` files, rosbag2 folders, `.mcap` and `.db3` files, read by `rosbags` without ROS. Of the
 messages only the numbers are looked at: whatever precedes them, a message of the types below ends
@@ -12,19 +12,29 @@ the IMU in a world with z up; `stario inspect` shows where they are not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, optional_package, rotations, trajectory
+from stario.sequences.readers.checked import (
+    checked,
+    magnetometer,
+    optional_package,
+    rotations,
+    trajectory,
+)
 from stario.sequences.readers.text import IntArray, magic, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
+from stario.sequences.units import MAGNETIC_UNITS
 
 _IMU = "sensor_msgs/msg/Imu"
+_MAGNETIC = "sensor_msgs/msg/MagneticField"
 _DOUBLES = {
     _IMU: 37,  # orientation, gyroscope and accelerometer, each with its covariance
+    _MAGNETIC: 12,  # the field [T] and its covariance
     "geometry_msgs/msg/PoseStamped": 7,  # position xyz, quaternion xyzw
     "geometry_msgs/msg/TransformStamped": 7,
     "geometry_msgs/msg/PoseWithCovarianceStamped": 7 + 36,
@@ -54,13 +64,15 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     imu = messages[_IMU]
     stamps = imu.stamps_ns
     values = checked(path, f"{imu.topic}, values", imu.values, first_row=0)
-    truth = next((m for kind, m in messages.items() if kind != _IMU), None)
+    truth = next((m for kind, m in messages.items() if kind not in (_IMU, _MAGNETIC)), None)
+    field = messages.get(_MAGNETIC)
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
         gyro=values[:, _GYRO],
         accel=values[:, _ACCEL],
         truth=None if truth is None else _truth(path, truth, stamps[0]),
+        magnetometer=None if field is None else _magnetometer(field, stamps[0]),
     )
 
 
@@ -92,6 +104,7 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
             topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
             chosen = [_imu_topic(path, topics, imu_topic)]
             chosen += _truth_topic(path, topics, truth_topic)
+            chosen += _magnetic_topic(topics, chosen[0])
             connections = [c for c in reader.connections if c.topic in chosen]
             received: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in chosen}
             for connection, time, raw in reader.messages(connections):
@@ -117,7 +130,8 @@ def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
-    fitting = [t for t, kind in sorted(topics.items()) if kind in _DOUBLES and kind != _IMU]
+    sensors = (_IMU, _MAGNETIC)
+    fitting = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
     if wanted == NO_TRUTH:
         return []
     if wanted:
@@ -126,6 +140,20 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
         fix = f"name one: --truth-topic {fitting[0]}, or --truth-topic {NO_TRUTH}"
         raise ReadError(path, "topics", ", ".join(fitting), "one topic with poses", fix)
     return fitting
+
+
+def _magnetic_topic(topics: dict[str, str], imu_topic: str) -> list[str]:
+    """The magnetic field's topic; of several the one nearest to the IMU's in the tree of names."""
+    fitting = [topic for topic, kind in sorted(topics.items()) if kind == _MAGNETIC]
+    here = set(accumulate(imu_topic.split("/"), "{}/{}".format))
+    near = [len(here & set(accumulate(t.split("/"), "{}/{}".format))) for t in fitting]
+    return [fitting[near.index(max(near))]] if fitting else []
+
+
+def _magnetometer(field: _Messages, start_ns: np.int64) -> Magnetometer | None:
+    order = np.argsort(field.stamps_ns, kind="stable")
+    time = seconds(field.stamps_ns[order], start_ns)
+    return magnetometer(time, field.values[order, :3] * MAGNETIC_UNITS["T"])
 
 
 def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:

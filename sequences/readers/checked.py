@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.rotations import NORM_TOLERANCE
-from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import advancing
+
+_HELD_SHARE = 1.0 / 3.0
 
 
 def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
@@ -60,6 +62,25 @@ def rotations(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )
     return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+
+
+def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magnetometer | None:
+    """A magnetometer's samples that are numbers, not zero, and whose times advance; None if none.
+
+    Args:
+        time: (N,) [s].
+        field: (N, 3) [uT].
+        held: leave repeated values out where more than a third are: apps that write the last
+            reading at the IMU's rate.
+    """
+    known = np.isfinite(field).all(axis=1) & np.isfinite(time) & field.any(axis=1)
+    time, field = time[known], field[known]
+    keep = advancing(time)
+    if held and len(field) > 1:
+        fresh = np.append(True, np.diff(field, axis=0).any(axis=1))
+        if fresh.mean() < 1.0 - _HELD_SHARE:
+            keep &= fresh
+    return Magnetometer(time[keep], field[keep]) if keep.any() else None
 
 
 def trajectory(

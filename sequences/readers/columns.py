@@ -18,6 +18,9 @@ HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2
 TRUTH_HEADER = "px [m],py [m],pz [m],qx,qy,qz,qw"
 """What may follow it."""
 
+MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
+"""What may stand among them."""
+
 _log = logging.getLogger(__name__)
 
 Factor = TypeVar("Factor")
@@ -25,10 +28,12 @@ Factor = TypeVar("Factor")
 IMU = ("gx", "gy", "gz", "ax", "ay", "az")
 POSITION, QUAT = ("px", "py", "pz"), ("qx", "qy", "qz", "qw")
 TRUTH = POSITION + QUAT
+MAGNETIC = ("mx", "my", "mz")
 
 _STEMS = {
     "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
     "a": ("acc", "acce", "accel", "accelerometer", "a_rs_s"),
+    "m": ("mag", "magn", "magnet", "magnetometer", "magnetic_field"),
     "p": ("pos", "position"),
     "q": ("quat", "quaternion", "ori", "orientation"),
 }
@@ -112,6 +117,8 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
     truth = [name for name in TRUTH if name in columns]
     if truth:
         missing += [name for name in TRUTH if name not in columns]
+    if set(MAGNETIC) & set(columns):
+        missing += [name for name in MAGNETIC if name not in columns]
     if missing:
         fix = "or leave truth out" if truth and not set(missing) & {"t", *IMU} else ""
         expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, rotations, trajectory
+from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import on_one_clock
 from stario.sequences.readers.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
-from stario.sequences.readers.text import IntArray, read_table, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.readers.text import IntArray, first_line, read_table, seconds
+from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 
 _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
@@ -46,12 +46,20 @@ def read_imunet(path: Path) -> ImuSequence:
         gyro=gyro,
         accel=accel,
         truth=_truth(folder, stamps[0], time, accel),
+        magnetometer=_magnetometer(folder / "magnet.txt", stamps[0]),
     )
 
 
 def is_imunet(path: Path) -> bool:
     """Whether a folder holds the raw files."""
     return path.is_dir() and all((path / name).is_file() for name in _FILES)
+
+
+def _magnetometer(path: Path, start_ns: np.int64) -> Magnetometer | None:
+    if not path.is_file() or first_line(path) is None:
+        return None
+    stamps, field = _rows(path, 3)
+    return magnetometer(seconds(stamps, start_ns), field)
 
 
 def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:

@@ -1,21 +1,26 @@
 """List files: a recording's name on each line, as the data sets publish their splits.
 
-Blanks around a name, `,type` behind it and comments from `#` on are dropped; so are blank lines at
-the end, but an empty entry elsewhere is an error, because the data sets' own readers take it for
-the folder itself.
+Behind an archive's name may stand what its recordings are chosen by, as for `find_recordings`:
+`file.h5 person=dan place="building 2"`. Blanks around a name, `,type` behind it and comments from
+`#` on are dropped; so are blank lines at the end, but an empty entry elsewhere is an error, because
+the data sets' own readers take it for the folder itself.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.archive import Where, split_name
 from stario.sequences.readers.text import first_line, first_lines, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
 _LOOKED_AT = 20
 _OXIOD_FORMS = ("syn", "raw")
+_CHOICE = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s*$")
 
 
 def is_list(path: Path) -> bool:
@@ -29,7 +34,15 @@ def is_list(path: Path) -> bool:
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
 
 
-def list_entries(path: Path) -> Iterator[Path | ReadError]:
+@dataclass(frozen=True)
+class Entry:
+    """A line of a list: a path, and which of its recordings are meant."""
+
+    path: Path
+    where: Where
+
+
+def list_entries(path: Path) -> Iterator[Entry | ReadError]:
     """The files and folders that a list names, in its order, or what is wrong with a line.
 
     Names count from the list's folder, from a folder in it, or, where the list stands in a folder
@@ -48,6 +61,7 @@ def list_entries(path: Path) -> Iterator[Path | ReadError]:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
     for number, text in written:
+        text, where = _chosen(text)
         name = text.split(",")[0].strip()
         if not name:
             yield ReadError(
@@ -56,7 +70,19 @@ def list_entries(path: Path) -> Iterator[Path | ReadError]:
             continue
         found = _located(bases, Path(name))
         fix = "take it off the list or fetch it"
-        yield found or ReadError(path, f"line {number}", f"{name}, not there", "a recording", fix)
+        if found is None:
+            yield ReadError(path, f"line {number}", f"{name}, not there", "a recording", fix)
+        else:
+            yield Entry(found, where)
+
+
+def _chosen(text: str) -> tuple[str, Where]:
+    """A line without the `key=value` at its end, and these."""
+    where: dict[str, list[str]] = {}
+    while match := _CHOICE.search(text):
+        where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
+        text = text[: match.start()]
+    return text, where
 
 
 def _bases(folder: Path) -> list[Path]:
@@ -73,4 +99,4 @@ def _folders(folder: Path) -> list[Path]:
 def _located(bases: list[Path], name: Path) -> Path | None:
     forms = [name, *(name.parent / form / name.name for form in _OXIOD_FORMS)]
     candidates = (base / form for base in bases for form in forms)
-    return next((path for path in candidates if path.exists()), None)
+    return next((path for path in candidates if split_name(path)[0].exists()), None)

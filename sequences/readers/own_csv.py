@@ -6,6 +6,8 @@ separated by commas, semicolons or tabs as the rows below it; comments (`#`) may
 - `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
   IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
   (-m/s^2 or -g where the device reports gravity, as Apple's do). Without a unit: s, rad/s, m/s^2.
+- `mx,my,mz` [uT] (or nT, mT, T, gauss) magnetic field, in rows of its own or in those of the IMU;
+  blank or nan where it was not sampled.
 - truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may leave
   truth blank (slower truth), or gyroscope and accelerometer (truth at times of its own).
 
@@ -27,9 +29,12 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.files import atomic_write
+from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.columns import (
     HEADER,
     IMU,
+    MAGNETIC,
+    MAGNETIC_HEADER,
     TRUTH,
     TRUTH_HEADER,
     Column,
@@ -40,9 +45,15 @@ from stario.sequences.readers.columns import (
 )
 from stario.sequences.readers.text import first_lines, read_lines, read_quickly
 from stario.sequences.rotations import NORM_TOLERANCE
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    Trajectory,
+)
 from stario.sequences.time_order import advancing
-from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, TIME_UNITS
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -75,6 +86,7 @@ def read_own_csv(path: Path) -> ImuSequence:
         gyro=gyro[is_imu],
         accel=accel[is_imu],
         truth=_truth(path, rows) if "px" in table else None,
+        magnetometer=_magnetometer(path, header, rows) if "mx" in table else None,
         converted=frozenset(sensor for sensor in factors if (factors[sensor] != 1.0).any()),
     )
 
@@ -92,7 +104,7 @@ class _Rows:
 def _rows_quickly(path: Path, header: Header) -> _Rows | None:
     """The rows of a large file in which every row is whole, else None."""
     columns = header.columns
-    names = ["t", *(name for name in (*IMU, *TRUTH) if name in columns)]
+    names = ["t", *(name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns)]
     used = [columns[name].index for name in names]
     quick = read_quickly(path, header.lines, header.separator, used)
     if quick is None:
@@ -119,7 +131,7 @@ def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
     numbered = [(k, line) for k, line in enumerate(lines[first - 1 :], first) if _is_row(line)]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
-    used = [name for name in (*IMU, *TRUTH) if name in columns]
+    used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
     values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
     if not is_imu.any():
@@ -140,49 +152,64 @@ def is_own_csv(path: Path) -> bool:
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     """Write a recording so that `read_own_csv` returns the same numbers, whole or not at all.
 
-    Truth's valid poses go to the IMU's rows where their times are the same and to rows of their
-    own elsewhere; its velocity and covariance have no column. Reading counts time from the first
-    IMU sample.
+    The magnetometer's samples and truth's valid poses go to the IMU's rows where their times are
+    the same and to rows of their own elsewhere; truth's velocity and covariance have no column.
+    Reading counts time from the first IMU sample.
 
     Raises:
         InputError: the folder does not exist.
     """
-    truth = sequence.truth
-    table = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
-    rows = [",".join(map(repr, row)) for row in table.tolist()]
-    header = HEADER
+    truth, field = sequence.truth, sequence.magnetometer
+    header, rows = HEADER, _Written(sequence)
+    if field is not None:
+        header += f",{MAGNETIC_HEADER}"
+        rows.add(field.time, field.field)
     if truth is not None:
-        header = f"{HEADER},{TRUTH_HEADER}"
-        rows = _with_truth(sequence.time, rows, truth)
+        header += f",{TRUTH_HEADER}"
+        poses = np.column_stack([truth.position_W, truth.quat_xyzw])
+        rows.add(truth.time[truth.valid], poses[truth.valid])
     with atomic_write(path) as file:
-        file.write("\n".join([header, *rows]) + "\n")
+        file.write("\n".join([header, *rows.merged()]) + "\n")
 
 
-def _with_truth(time: FloatArray, rows: list[str], truth: Trajectory) -> list[str]:
-    poses = np.column_stack([truth.position_W, truth.quat_xyzw])[truth.valid]
-    texts = [",".join(map(repr, row)) for row in poses.tolist()]
-    times = truth.time[truth.valid]
-    # Truth must stay in order: it shares rows of the IMU that are newer than all before them.
-    newest = np.maximum.accumulate(np.nan_to_num(time, nan=-np.inf))
-    advances = np.diff(newest, prepend=-np.inf) > 0
-    shared: dict[float, int] = {float(time[k]): int(k) for k in np.flatnonzero(advances)}
-    empty = "," * len(TRUTH)
-    tails = [empty] * len(rows)
-    own: list[tuple[float, str]] = []
-    for t, text in zip(times.tolist(), texts, strict=True):
-        if t in shared:
-            tails[shared[t]] = "," + text
-        else:
-            own.append((t, f"{t!r}{',' * len(IMU)},{text}"))
-    whole = [row + tail for row, tail in zip(rows, tails, strict=True)]
-    # Rows of truth go before the first IMU row that is later; the IMU's own order stays.
-    places = np.searchsorted(newest, [t for t, _ in own]).tolist()
-    merged: list[str] = []
-    taken = 0
-    for place, (_, text) in zip(places, own, strict=True):
-        merged += [*whole[taken:place], text]
-        taken = place
-    return merged + whole[taken:]
+class _Written:
+    """A file's rows as they are put together: the IMU's, with what shares their times."""
+
+    def __init__(self, sequence: ImuSequence) -> None:
+        table = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
+        self._rows = [",".join(map(repr, row)) for row in table.tolist()]
+        # What is added stays in order: it shares rows of the IMU newer than all before them.
+        self._newest = np.maximum.accumulate(np.nan_to_num(sequence.time, nan=-np.inf))
+        advances = np.flatnonzero(np.diff(self._newest, prepend=-np.inf) > 0)
+        self._shared = {float(sequence.time[k]): int(k) for k in advances}
+        self._own: list[tuple[float, str]] = []
+        self._blank = "," * len(IMU)
+
+    def add(self, time: FloatArray, values: FloatArray) -> None:
+        """Columns to the right of those there are, at times (M,) that increase."""
+        empty = "," * values.shape[1]
+        tails = [empty] * len(self._rows)
+        own = []
+        for t, row in zip(time.tolist(), values.tolist(), strict=True):
+            text = "," + ",".join(map(repr, row))
+            if t in self._shared:
+                tails[self._shared[t]] = text
+            else:
+                own.append((t, f"{t!r}{self._blank}{text}"))
+        self._rows = [row + tail for row, tail in zip(self._rows, tails, strict=True)]
+        self._own = [(t, row + empty) for t, row in self._own] + own
+        self._blank += empty
+
+    def merged(self) -> list[str]:
+        """All rows, those without IMU samples before the first IMU row that is later."""
+        own = sorted(self._own, key=lambda item: item[0])
+        places = np.searchsorted(self._newest, [t for t, _ in own]).tolist()
+        merged: list[str] = []
+        taken = 0
+        for place, (_, text) in zip(places, own, strict=True):
+            merged += [*self._rows[taken:place], text]
+            taken = place
+        return merged + self._rows[taken:]
 
 
 def _is_row(line: str) -> bool:
@@ -258,6 +285,12 @@ def _seconds(
             raise ReadError(path, where, repr(cell), "a time") from None
     start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
     return np.array([float((stamp - start) / per_second) for stamp in stamps])
+
+
+def _magnetometer(path: Path, header: Header, rows: _Rows) -> Magnetometer | None:
+    units = [unit_factor(path, header.columns[name], MAGNETIC_UNITS) for name in MAGNETIC]
+    field = np.stack([rows.table[name] for name in MAGNETIC], axis=1) * np.array(units)
+    return magnetometer(rows.time, field, held=False)
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:

@@ -10,7 +10,8 @@ In `syn` the printed times are rounded to uselessness; the rows of both files ar
 100 Hz. In `raw` each file has its own clock, in ns, us, ms or s: the rate tells which. There the
 IMU's rows are sorted (neighbours are swapped now and then), and the capture is brought onto the
 phone's clock by what both see of the turning. The Nexus 5 of `multi devices` writes other rows in
-`raw`: time, code of the sensor (1 accelerometer [m/s^2], 4 gyroscope [rad/s]) and xyz.
+`raw`: time, code of the sensor (1 accelerometer [m/s^2], 2 magnetometer [uT], 4 gyroscope [rad/s])
+and xyz.
 
 The phone sits turned in the tracked body, the capture glitches and flips, and its world is not
 quite level: see `stario.sequences.truth.alignment`.
@@ -27,6 +28,7 @@ from scipy.ndimage import binary_dilation, median_filter
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import on_one_clock, time_unit
 from stario.sequences.readers.text import (
     IntArray,
@@ -38,7 +40,13 @@ from stario.sequences.readers.text import (
     seconds,
 )
 from stario.sequences.rotations import NORM_TOLERANCE
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    Trajectory,
+)
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
 
@@ -47,7 +55,7 @@ _log = logging.getLogger(__name__)
 
 _G = 9.81
 _CAPTURES = ("vi", "hand", "tango")
-_ACCELEROMETER, _GYROSCOPE = 1, 4
+_ACCELEROMETER, _MAGNETIC, _GYROSCOPE = 1, 2, 4
 
 _JUMP_M_S = 4.0
 """A tracked body that moves faster than this from row to row is a glitch."""
@@ -64,6 +72,7 @@ class _Phone:
     gyro: FloatArray
     accel: FloatArray
     stamps_ns: IntArray | None
+    magnetometer: Magnetometer | None
 
 
 def read_oxiod(path: Path) -> ImuSequence:
@@ -82,6 +91,7 @@ def read_oxiod(path: Path) -> ImuSequence:
         gyro=phone.gyro,
         accel=phone.accel,
         truth=None if capture is None else _truth(capture, phone),
+        magnetometer=phone.magnetometer,
     )
 
 
@@ -110,22 +120,26 @@ def _phone(path: Path) -> _Phone:
     table = read_table(path, columns=16)
     rows = table.values
     gyro, accel = rows[:, 4:7], -_G * (rows[:, 7:10] + rows[:, 10:13])
+    field = rows[:, 13:16]
     if path.parent.name == "syn" or len(np.unique(rows[:, 0])) < len(rows) / 2:
-        return _Phone(np.arange(len(rows)) / RATE, gyro, accel, None)
+        time = np.arange(len(rows)) / RATE
+        return _Phone(time, gyro, accel, None, magnetometer(time, field))
     stamps = _stamps_ns(table)
     order = np.argsort(stamps, kind="stable")
     stamps = stamps[order]
-    return _Phone(seconds(stamps, stamps[0]), gyro[order], accel[order], stamps)
+    time = seconds(stamps, stamps[0])
+    return _Phone(time, gyro[order], accel[order], stamps, magnetometer(time, field[order]))
 
 
 def _sensor_rows(path: Path) -> _Phone:
     """A row for each sample of each sensor, at its own time."""
     table = read_table(path, columns=5)
     stamps, code = _stamps_ns(table), table.values[:, 1]
-    gyro, accel = code == _GYROSCOPE, code == _ACCELEROMETER
+    gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
     xyz = table.values[:, 2:5]
-    stamps, rate, force = on_one_clock(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
-    return _Phone(seconds(stamps, stamps[0]), rate, force, stamps)
+    imu_ns, rate, force = on_one_clock(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
+    field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
+    return _Phone(seconds(imu_ns, imu_ns[0]), rate, force, imu_ns, field)
 
 
 def _stamps_ns(table: Table) -> IntArray:

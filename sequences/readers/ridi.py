@@ -1,7 +1,8 @@
 """RIDI and IMUNet, processed: `<sequence>/processed/data.csv`, 200 Hz (Yan et al., ECCV 2018).
 
 Columns by name: `time` [ns], `gyro_x..` [rad/s], `acce_x..` [m/s^2], `pos_x..` [m], `ori_w..z` and
-`rv_w..z`; others are left alone. The attitude is that of RIDI's and RoNIN's authors, the game
+`rv_w..z`, and `magnet_x..` [uT] where
+there are; others are left alone. The attitude is that of RIDI's and RoNIN's authors, the game
 rotation vector turned so that it starts at the pose's attitude: ori[0] conj(rv[0]) rv.
 
 IMUNet (Zeinali et al., 2022) writes the same columns from ARCore's poses, whose world has y up. Its
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import rotations, trajectory
+from stario.sequences.readers.checked import magnetometer, rotations, trajectory
 from stario.sequences.readers.named import NamedColumns, axes_of, header_names
 from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -55,7 +56,7 @@ def read_ridi(path: Path) -> ImuSequence:
     if file.name in _PICKLES:
         fix = "write the table as data.csv beside it, with pandas' to_csv"
         raise ReadError(file, "file", "a pickle, which may run code", "processed/data.csv", fix)
-    columns = NamedColumns(file, _COLUMNS)
+    columns = NamedColumns(file, _COLUMNS, optional=("magnet",))
     stamps = columns.table.stamps_ns(columns.file_column("time"))
     time, accel = seconds(stamps, stamps[0]), columns.stack("acce")
     first = columns.table.first_row
@@ -70,6 +71,7 @@ def read_ridi(path: Path) -> ImuSequence:
         gyro=columns.stack("gyro"),
         accel=accel,
         truth=trajectory(time, columns.stack("pos"), attitude_WB),
+        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
     )
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import rotations, trajectory
+from stario.sequences.readers.checked import magnetometer, rotations, trajectory
 from stario.sequences.readers.named import NamedColumns, axes_of, header_names
 from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import ImuSequence
@@ -30,6 +30,9 @@ _COLUMNS = (
     *axes_of("vio_gyro_bias"),
     *axes_of("vio_acce_bias"),
 )
+_MAGNETIC = ("magnet", "mag", "magn")
+"""Stems of the field's columns [uT], in copies that have some."""
+
 _OWN = ("gt_q_w", "gt_p_x", "vio_q_w", "vio_p_x")
 
 
@@ -43,7 +46,7 @@ def read_rnin(path: Path) -> ImuSequence:
     if not file.is_file():
         raise ReadError(file, "file", "nothing there", f"a recording's {_FILE}")
     time_name = "times" if "times" in header_names(file) else "time"
-    columns = NamedColumns(file, (time_name, *_COLUMNS))
+    columns = NamedColumns(file, (time_name, *_COLUMNS), optional=_MAGNETIC)
     stamps = columns.table.stamps_ns(columns.file_column(time_name), per_second=1)
     time = seconds(stamps, stamps[0])
     captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
@@ -57,6 +60,7 @@ def read_rnin(path: Path) -> ImuSequence:
         gyro=columns.stack("gyro") - columns.stack("vio_gyro_bias")[-1],
         accel=columns.stack("acce") - columns.stack("vio_acce_bias")[-1],
         truth=trajectory(time, columns.stack(f"{source}_p"), attitude_WB),
+        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
     )
 
 

@@ -1,10 +1,11 @@
 """RoNIN: `<sequence>/data.hdf5` with `info.json` beside it (Herath et al., ICRA 2020), 200 Hz.
 
-`synced/time` [s], `synced/gyro_uncalib` [rad/s] and `synced/acce` [m/s^2] are those of a phone
-carried anyhow; `pose/tango_pos` [m] and `pose/tango_ori` those of a second device on the chest, in
-a world with z up. Quaternions are w x y z. As the authors do, `imu_init_gyro_bias` is subtracted
-from the gyroscope, the specific force is `imu_acce_scale (acce - imu_acce_bias)`, what comes before
-`start_frame` is left out, and the phone's attitude in the Tango's world is
+`synced/time` [s], `synced/gyro_uncalib` [rad/s], `synced/acce` [m/s^2] and, where there is one,
+`synced/magnet` [uT] are those of a phone carried anyhow; `pose/tango_pos` [m] and `pose/tango_ori`
+those of a second device on the chest, in a world with z up. Quaternions are w x y z. As the authors
+do, `imu_init_gyro_bias` is subtracted from the gyroscope, the specific force is
+`imu_acce_scale (acce - imu_acce_bias)`, what comes before `start_frame` is left out, and the
+phone's attitude in the Tango's world is
 
     tango_ori[0] start_calibration conj(source[0]) source
 
@@ -22,7 +23,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, optional_package, rotations, trajectory
+from stario.sequences.readers.checked import (
+    checked,
+    magnetometer,
+    optional_package,
+    rotations,
+    trajectory,
+)
 from stario.sequences.readers.json_fields import JsonFields
 from stario.sequences.readers.text import magic
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -38,6 +45,8 @@ _FIELDS = {
     "pose/tango_ori": (4,),
 }
 _EKF = "pose/ekf_ori"
+_MAGNETIC = "synced/magnet"
+_OPTIONAL = {_EKF: (4,), _MAGNETIC: (3,)}
 
 _TRUSTED_DEG = 20.0
 """The game rotation vector is taken if its error is not above this, whatever the others'."""
@@ -66,6 +75,9 @@ def read_ronin(path: Path) -> ImuSequence:
         gyro=gyro[start:],
         accel=accel[start:],
         truth=trajectory(time, fields["pose/tango_pos"][start:], attitude_WB[start:]),
+        magnetometer=(
+            magnetometer(time, fields[_MAGNETIC][start:]) if _MAGNETIC in fields else None
+        ),
     )
 
 
@@ -82,11 +94,11 @@ def _data_file(path: Path) -> Path:
 
 
 def _fields(file: Path) -> dict[str, FloatArray]:
-    """The fields needed, finite and of one length; `pose/ekf_ori` only where there is one."""
+    """The fields needed, finite and of one length; the optional ones where there are."""
     h5py = optional_package("h5py", "readers")
     try:
         with h5py.File(file, "r") as data:
-            names = [*_FIELDS, *([_EKF] if _EKF in data else [])]
+            names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
             missing = [name for name in names if name not in data]
             if missing:
                 raise ReadError(file, missing[0], "no such field", ", ".join(_FIELDS))
@@ -98,10 +110,10 @@ def _fields(file: Path) -> dict[str, FloatArray]:
         raise ReadError(file, "file", found, "HDF5", "is the download complete?") from None
     count = len(fields["synced/time"]) if fields["synced/time"].ndim == 1 else 0
     for name, values in fields.items():
-        shape = (count, *_FIELDS.get(name, (4,)))
+        shape = (count, *(_FIELDS | _OPTIONAL)[name])
         if values.shape != shape or not count:
             raise ReadError(file, name, f"shape {values.shape}", f"{shape} as synced/time")
-        if name != _EKF:
+        if name not in _OPTIONAL:
             checked(file, name, values, first_row=0)
     return fields
 

@@ -15,7 +15,7 @@ from stario.sequences.conventions import (
     with_gravity,
 )
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
@@ -37,6 +37,10 @@ def test_axes_take_the_files_for_the_new_ones(walk: ImuSequence) -> None:
     assert np.array_equal(turned.gyro, walk.gyro[:, [1, 0, 2]] * [1, -1, 1])
     assert np.array_equal(turned.accel, walk.accel[:, [1, 0, 2]] * [1, -1, 1])
     assert turned.truth is walk.truth
+    field = Magnetometer(walk.time[:3], np.arange(9.0).reshape(3, 3))
+    seen = with_axes(replace(walk, magnetometer=field), "y,-x,z").magnetometer
+    assert seen is not None
+    assert np.array_equal(seen.field, field.field[:, [1, 0, 2]] * [1, -1, 1])
     assert with_axes(walk, "x,y,z") is walk
 
 
@@ -65,6 +69,16 @@ def test_what_is_no_permutation_is_refused(walk: ImuSequence, axes: str) -> None
 
 def test_gravity_comes_back_with_the_true_attitude(walk: ImuSequence) -> None:
     np.testing.assert_allclose(with_gravity(linear(walk)).accel, walk.accel, atol=1e-9)
+
+
+def test_apples_sign_is_turned_over_unless_the_reader_did(walk: ImuSequence) -> None:
+    apple = replace(walk, accel=-walk.accel / STANDARD_GRAVITY)
+    back = with_conventions(apple, accel_unit="g", accel_sign="apple")
+    np.testing.assert_allclose(back.accel, walk.accel)
+    with pytest.raises(InputError, match="names its unit"):
+        with_conventions(replace(walk, converted=frozenset({"accel"})), accel_sign="apple")
+    with pytest.raises(InputError, match="accel_sign: found 'left'"):
+        with_conventions(walk, accel_sign="left")
 
 
 def test_conventions_are_undone_in_one_go(walk: ImuSequence) -> None:

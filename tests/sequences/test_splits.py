@@ -1,10 +1,12 @@
+import importlib.resources
 from pathlib import Path
 
 import pytest
 
+from stario.network.training.splits import NAMES
 from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.readers import find_recordings
-from stario.sequences.splits import OFFICIAL, official_split, random_split
+from stario.sequences.splits import OFFICIAL, leave_out, official_split, random_split, read_list
 
 ROW = "t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n"
 PHONE = ",".join(["1.5e11", *["0.1"] * 6, "0,0,-1", *["0.1"] * 6]) + "\n"
@@ -124,3 +126,42 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
     path.write_text("# nothing\n\n")
     with pytest.raises(ReadError, match="no entry"):
         find_recordings(path)
+
+
+def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -> None:
+    for name in ("a.csv", "walks.h5"):
+        (tmp_path / name).touch()
+    file = tmp_path / "list.txt"
+    file.write_text("# who, where\na.csv, home anna\nwalks.h5:one, home bo\nwalks.h5:two\n\n")
+    found = read_list(file, tmp_path)
+    assert [one.path for one in found] == [
+        tmp_path / name for name in ("a.csv", "walks.h5:one", "walks.h5:two")
+    ]
+    assert [one.group for one in found] == ["home anna", "home bo", ""]
+    assert found[0].within("home")
+    assert not found[0].within("home an")
+    outside, inside = leave_out(found, "home")
+    assert [one.path.name for one in outside] == ["walks.h5:two"]
+    assert len(inside) == 2
+    with pytest.raises(InputError, match="home anna"):
+        leave_out(found, "office")
+    (tmp_path / "a.csv").unlink()
+    with pytest.raises(InputError, match="--data"):
+        read_list(file, tmp_path)
+
+
+def test_the_packages_lists_hold_groups_apart() -> None:
+    folder = importlib.resources.files("stario.network.training.splits")
+    names = {}
+    for name in NAMES:
+        lines = folder.joinpath(f"{name}.txt").read_text().splitlines()
+        names[name] = dict(line.split(", ") for line in lines if not line.startswith("#"))
+    assert len(names["test"]) == len(names["validation"]) == 4
+    assert not set(names["test"]) & set(names["all"])
+    held = set(names["holdout"])
+    assert held < set(names["all"])
+    assert not held & set(names["training"])
+    kept = {group for name, group in names["all"].items() if name not in held}
+    for group in ("tyrex Thibaud", "ridi dan", "ridi huayi", "kipd yk", "ilc site2 F1"):
+        assert group in names["holdout"].values()
+        assert group not in kept

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from stario.sequences import stream_cache
+from stario.sequences.archive_writer import write_archive
 from stario.sequences.batch import Skipped
-from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -230,6 +231,20 @@ def test_the_files_of_a_recording(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_csv(tmp_path / f"{name}.csv", WALK)
     assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]
+
+
+def test_a_recording_of_an_archive_is_kept_by_its_name(tmp_path: Path) -> None:
+    archive, read = tmp_path / "walks.h5", Reader()
+    write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
+    whole, part = find_recordings(archive)
+    for _ in range(2):
+        for path in (whole, part):
+            (stream,) = one(path, tmp_path / "cache", read)
+            assert is_mapped(stream.imu_W)
+    assert read.calls == 2
+    write_archive(archive, [WALK.slice(0.0, 6.0)])
+    one(whole, tmp_path / "cache", read)
+    assert read.calls == 3
 
 
 def test_the_folder_is_the_users_choice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

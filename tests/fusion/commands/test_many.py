@@ -107,6 +107,21 @@ def test_a_batch_goes_on_past_what_fails_and_says_so(
         assert sum(reason in line for line in lines) == 1
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_evaluate_judges_by_groups_against_other_weights(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    done = stario(
+        "evaluate", recording, "--by", "set", "--against", "default", "--out", "out", "--json"
+    )
+    assert done.code == 0
+    [group] = json.loads(done.out)["groups"]
+    assert group["recordings"] == 1
+    assert group["ratios"]["rms_10s_m"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
+    assert 0.3 < group["medians"]["default"]["length_ratio"] < 1.3
+    assert json.loads((tmp_path / "out/groups.json").read_text())["groups"] == [group]
+
+
 # --- train -------------------------------------------------------------------------------------
 
 

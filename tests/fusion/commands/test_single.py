@@ -20,10 +20,14 @@ from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import save_model
+from stario.sequences.archive_writer import write_archive
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
+from stario.sequences.readers import find_recordings
 from stario.sequences.readers.own_csv import read_own_csv, write_csv
-from stario.sequences.sequence import Trajectory
+from stario.sequences.sequence import PositionTrack, Trajectory
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 
 COMMANDS = (
     "run",
@@ -241,6 +245,41 @@ def test_a_converted_recording_gives_the_same_track(
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_recordings_go_into_an_archive_and_are_chosen_from_it(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    done = stario("convert", recording, recording.parent, "all.h5")
+    assert done.code == 0, done.err
+    assert "2 recordings in all.h5" in done.out
+    done = stario("run", "all.h5", "--where", "name=*-2", "--out", "two")
+    assert done.code == 0, done.err
+    assert (tmp_path / "two/ekf.tum").exists()
+    assert stario("convert", "all.h5:walk", "one.csv").code == 0
+    there, here = read_own_csv(tmp_path / "one.csv"), read_own_csv(recording)
+    np.testing.assert_array_equal(there.accel, here.accel)
+    for arguments in (["run", "all.h5"], ["convert", "all.h5", "out.csv"]):
+        stario(*arguments, "--where", "person=eve").assert_one_line_error("person=eve", "none")
+    stario("run", "all.h5", "--where", "eve").assert_one_line_error("--where", "attribute=value")
+    stario("convert", "all.h5", "out.csv").assert_one_line_error("2 of them", "all.h5:walk")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_positions_and_waypoints_are_no_pose_truth_and_are_told(stario, tmp_path: Path) -> None:
+    walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
+    taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
+    write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=taps)])
+    for command in ("run", "inspect", "compare"):
+        done = stario(command, "taps.h5")
+        assert done.code == 0, done.err
+        assert "truth: 2 waypoints" in done.out
+    stario("evaluate", "taps.h5").assert_one_line_error("2 waypoints, no poses")
+    done = stario("convert", "taps.h5", "taps.csv")
+    assert done.code == 0
+    assert stario("convert", "taps.h5", "again.h5").code == 0
+    assert find_recordings(tmp_path / "again.h5") == [Path(f"{tmp_path / 'again.h5'}:taps")]
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
 def test_what_the_numbers_mean_can_be_told_to_every_command(
     stario, recording: Path, tmp_path: Path, command: str
@@ -360,7 +399,10 @@ def test_a_recording_cut_within_a_line_is_named(stario, recording: Path, tmp_pat
         (["run", "missing.csv"], ["missing.csv", "nothing there"]),
         (["compare", "missing"], ["missing", "nothing there"]),
         (["evaluate", "--data", "missing"], ["missing", "--data"]),
-        (["evaluate", "--split", "practice"], ["split", "practice"]),
+        (["evaluate", "--data", ".", "--split", "practice"], ["split", "practice"]),
+        (["evaluate"], ["PATH", "--data"]),
+        (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
+        (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
         (["run", "RECORDING", "--gyro-unit", "rpm"], ["gyro_unit", "rpm"]),
         (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),

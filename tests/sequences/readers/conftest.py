@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.readers.checked import trajectory
 from stario.sequences.rotations import about_z
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -23,6 +23,9 @@ START_NS = 1520531124153717567
 
 Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
 """From a world with z up to ARCore's with y up."""
+
+FIELD_W = np.array([18.0, 5.0, -43.0])
+"""A magnetic field [uT] that is the same everywhere."""
 
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.005]), np.array([0.1, 0.05, -0.2])
 
@@ -57,7 +60,13 @@ def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
         gyro=walk.gyro[rows],
         accel=walk.accel[rows],
         truth=trajectory(time, truth.position_W[rows], truth.attitude_WB[rows]),
+        magnetometer=Magnetometer(time, field_of(walk)[rows]),
     )
+
+
+def field_of(walk: ImuSequence) -> FloatArray:
+    """The magnetic field in B at each sample."""
+    return np.asarray(pose_of(walk).attitude_WB.apply(FIELD_W, inverse=True))
 
 
 def wxyz(rotation: Rotation) -> FloatArray:
@@ -100,6 +109,7 @@ def write_ronin(folder: Path, walk: ImuSequence, **info: object) -> Written:
         data["synced/gyro_uncalib"] = walk.gyro + GYRO_BIAS
         data["synced/gyro"] = walk.gyro
         data["synced/acce"] = walk.accel / scale + ACCEL_BIAS
+        data["synced/magnet"] = field_of(walk)
         data["synced/game_rv"] = wxyz(about_z(0.7) * truth.attitude_WB)
         data["pose/tango_pos"] = truth.position_W
         data["pose/tango_ori"] = wxyz(truth.attitude_WB * R_TB.inv())
@@ -124,7 +134,7 @@ def pandas_table(folder: Path, walk: ImuSequence, ori: Rotation, rv: Rotation) -
     truth = pose_of(walk)
     header = ",time," + ",".join(map(names, ("gyro", "acce", "linacce", "grav", "magnet", "pos")))
     header += f",{names('ori', 'wxyz')},{names('rv', 'wxyz')}"
-    other = np.zeros((len(walk), 9))
+    other = np.hstack([np.zeros((len(walk), 6)), field_of(walk)])
     rows = text(
         list(range(len(walk))), stamps_ns(walk.time), walk.gyro, walk.accel, other,
         truth.position_W, wxyz(ori), wxyz(rv),
@@ -156,13 +166,17 @@ def write_imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) ->
         ("acce", walk.accel, slice(8, -12)),
         ("orientation", quat, slice(0, None)),
         ("pose", pose, poses),
+        ("magnet", field_of(walk), slice(11, None, 4)),
     ):
         stamps = stamps_ns(walk.time[rows])
         save(folder / f"{name}.txt", f"# {name}", text(stamps, values[rows], joint=" "))
     expected = cut(walk, slice(8, -12))
     time = truth.time[poses] - truth.time[8]
     known = trajectory(time, truth.position_W[poses], truth.attitude_WB[poses])
-    return Written(folder, replace(expected, name=folder.name, truth=known))
+    magnetic = slice(11, None, 4)
+    field = Magnetometer(walk.time[magnetic] - walk.time[8], field_of(walk)[magnetic])
+    expected = replace(expected, name=folder.name, truth=known, magnetometer=field)
+    return Written(folder, expected)
 
 
 def write_rnin(folder: Path, walk: ImuSequence, captured: bool = True) -> Written:
@@ -175,10 +189,10 @@ def write_rnin(folder: Path, walk: ImuSequence, captured: bool = True) -> Writte
     gt, vio = (good, other) if captured else (none, good)
     header = f"times,{names('gyro')},{names('acce')},{names('vio_gyro_bias')}"
     header += f",{names('vio_acce_bias')},{names('vio_q', 'wxyz')},{names('vio_p')}"
-    header += f",{names('gt_q', 'wxyz')},{names('gt_p')}"
+    header += f",{names('gt_q', 'wxyz')},{names('gt_p')},{names('mag')}"
     rows = text(
         10.5 + walk.time, walk.gyro + GYRO_BIAS, walk.accel + ACCEL_BIAS,
-        bias * GYRO_BIAS, bias * ACCEL_BIAS, vio, gt,
+        bias * GYRO_BIAS, bias * ACCEL_BIAS, vio, gt, field_of(walk),
     )  # fmt: skip
     save(folder / "data_train/12/SenseINS.csv", header, rows)
     expected = replace(cut(walk, slice(None)), name="data_train-12")
@@ -202,7 +216,8 @@ def write_tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
     ]  # fmt: skip
     description = {"columns_name(width)": columns, "num_rows": len(walk)}
     (folder / "imu0_resampled_description.json").write_text(json.dumps(description))
-    return Written(folder, replace(cut(walk, slice(None)), name=folder.name))
+    expected = replace(cut(walk, slice(None)), name=folder.name, magnetometer=None)
+    return Written(folder, expected)
 
 
 def write_tlio_raw(
@@ -251,6 +266,7 @@ def write_android(folder: Path, walk: ImuSequence) -> Written:
     for name, values, rows in (
         ("Gyroscope", walk.gyro, slice(0, -20)),
         ("Accelerometer", walk.accel, slice(15, None)),
+        ("Magnetometer", field_of(walk), slice(15, -20)),
     ):
         time = walk.time[rows]
         save(folder / f"{name}.csv", header, text(stamps_ns(time), time, values[rows, ::-1]))
@@ -273,6 +289,7 @@ def write_bag(
     version: str = "ros1",
     imu_topics: tuple[str, ...] = ("/imu",),
     pose_topics: tuple[tuple[str, str], ...] = (("/odom", "nav_msgs/msg/Odometry"),),
+    other_topics: tuple[tuple[str, str], ...] = (("/mag", "sensor_msgs/msg/MagneticField"),),
 ) -> Path:
     """A bag with Imu topics and poses, in one of the storages `ros1`, `sqlite3` and `mcap`."""
     pytest.importorskip("rosbags")
@@ -290,17 +307,24 @@ def write_bag(
     else:
         plugin = StoragePlugin.MCAP if version == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(path, version=9, storage_plugin=plugin)
-    truth, kinds = pose_of(walk), store.types
+    truth, kinds, field = pose_of(walk), store.types, field_of(walk)
     with writer:
         joined = {
             topic: (kind, writer.add_connection(topic, kind, typestore=store))
-            for topic, kind in [(t, "sensor_msgs/msg/Imu") for t in imu_topics] + list(pose_topics)
+            for topic, kind in [
+                *((t, "sensor_msgs/msg/Imu") for t in imu_topics),
+                *pose_topics,
+                *other_topics,
+            ]
         }
         for k, stamp in enumerate(stamps_ns(walk.time)):
             for kind, connection in joined.values():
                 header = ros_header(kinds, stamp, ros1)
                 values = (walk.gyro[k], walk.accel[k], truth.position_W[k], truth.quat_xyzw[k])
                 message = ros_message(kinds, kind, header, *map(np.ndarray.tolist, values))
+                if kind == "sensor_msgs/msg/MagneticField":
+                    tesla = kinds["geometry_msgs/msg/Vector3"](*(1e-6 * field[k]))
+                    message = kinds[kind](header, tesla, np.zeros(9))
                 writer.write(connection, stamp, pack(message, kind))
     return path
 

@@ -50,7 +50,24 @@ def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
 
 def test_recordings_are_chosen_by_attribute(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
-    assert archive_members(path, person="ann") == [Path(f"{path}:a"), Path(f"{path}:c")]
+    assert archive_members(path, {"person": ["ann"]}) == [Path(f"{path}:a"), Path(f"{path}:c")]
+
+
+def test_patterns_lists_and_folders_choose_alike(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    annes = [Path(f"{path}:a"), Path(f"{path}:c")]
+    assert archive_members(path, {"person": ["a*"], "name": ["[ac]"]}) == annes
+    assert find_recordings(tmp_path, where={"person": ["ann"]}) == annes
+    listed = tmp_path / "split.txt"
+    listed.write_text('walks.h5:b\nwalks.h5 person=ann name=a  # hers\nwalks.h5 person="ann"\n')
+    assert find_recordings(listed) == [Path(f"{path}:b"), *annes]
+    assert find_recordings(listed, where={"name": ["c"]}) == annes[1:]
+
+
+def test_what_nobody_has_is_told_with_what_they_have(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with pytest.raises(ReadError, match=r"person=eve: found none, expected person of ann, bob"):
+        find_recordings(path, where={"person": ["eve"]})
 
 
 def test_a_name_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:

@@ -27,6 +27,17 @@ def test_what_was_written_comes_back(written) -> None:
     assert off.max() < 1e-6
 
 
+def test_the_magnetometer_comes_along(written) -> None:
+    name, recording = written
+    if name == "android":
+        pytest.skip("a logger's folder is tested with its variants")
+    expected, read = recording.expected.magnetometer, read_recording(recording.path).magnetometer
+    assert (read is None) == (expected is None)
+    if expected is not None and read is not None:
+        np.testing.assert_allclose(read.time, expected.time, atol=1e-8)
+        np.testing.assert_allclose(read.field, expected.field, atol=1e-9)
+
+
 def test_each_is_recognised_by_its_content_alone(written) -> None:
     name, recording = written
     assert next(n for n, known in FORMATS.items() if known.recognises(recording.path)) == name

@@ -1,4 +1,5 @@
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,13 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.own_csv import read_own_csv
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    Trajectory,
+)
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import with_units
@@ -48,6 +55,41 @@ def test_without_truth_there_is_none(tmp_path: Path, walk: ImuSequence) -> None:
     read = read_own_csv(tmp_path / "walk.csv")
     assert read.truth is None
     assert np.array_equal(read.accel, walk.accel)
+
+
+def test_a_magnetometer_comes_back_in_shared_rows_and_in_rows_of_its_own(
+    tmp_path: Path, walk: ImuSequence
+) -> None:
+    time = np.concatenate([walk.time[2:40:3], walk.time[40:900:7] + 0.001])
+    field = np.random.default_rng(2).normal(0.0, 30.0, (len(time), 3))
+    given = replace(walk, magnetometer=Magnetometer(time, field))
+    write_csv(tmp_path / "walk.csv", given)
+    read = read_own_csv(tmp_path / "walk.csv")
+    assert read.magnetometer is not None
+    assert np.array_equal(read.magnetometer.time, time)
+    assert np.array_equal(read.magnetometer.field, field)
+    assert np.array_equal(read.accel, walk.accel)
+    assert read.truth is not None
+    assert len(read.truth) == len(walk)
+
+
+def test_the_fields_unit_is_the_headers_and_what_is_no_sample_is_left_out(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "a.csv",
+        f"{HEADER},mx [nT],my [nT],mz [nT]",
+        "0.0,0,0,0,0,0,9.8,1000,2000,3000",
+        "0.1,0,0,0,0,0,9.8,nan,nan,nan",
+        "0.2,0,0,0,0,0,9.8,,,",
+        "0.3,,,,,,,4000,5000,6000",
+    )
+    read = read_own_csv(path)
+    assert read.magnetometer is not None
+    assert np.array_equal(read.time, [0.0, 0.1, 0.2])
+    assert np.array_equal(read.magnetometer.time, [0.0, 0.3])
+    assert np.allclose(read.magnetometer.field, [[1, 2, 3], [4, 5, 6]])
+    written(path, f"{HEADER},mx [uT]", "0.0,0,0,0,0,0,9.8,1")
+    with pytest.raises(ReadError, match="no my, mz"):
+        read_own_csv(path)
 
 
 def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence) -> None:

@@ -1,0 +1,92 @@
+"""`stario evaluate --by`: networks alone, judged by groups of recordings."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from stario.fusion.commands.common import Reading, print_json, progress_bar
+
+if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
+    from stario.sequences.batch import Skipped
+    from stario.sequences.splits import Listed
+
+
+def judge_by_groups(
+    recordings: list[Listed],
+    reading: Reading,
+    by: str,
+    ours: str,
+    theirs: str | None,
+    every: int,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """The table of groups; returns the recordings that could not be used."""
+    from stario.fusion.evaluation.judging import check_by, judge, rows_of
+    from stario.fusion.evaluation.judging_table import (
+        Judgement,
+        judgement_dict,
+        judgement_text,
+        write_judgement,
+    )
+    from stario.fusion.evaluation.prepared import prepared_recordings
+    from stario.fusion.evaluation.results import make_folder
+    from stario.sequences.stream_cache import cache_folder
+
+    grouping = check_by(by)
+    chosen = _thinned(recordings, every)
+    names = [ours] if theirs is None else [ours, theirs]
+    models = {name: partial(_for_group, name) for name in names}
+    for name in names:
+        if _GROUP not in name:
+            _for_group(name, "")  # what cannot be loaded is told before anything is prepared
+    if out is not None:
+        make_folder(out)
+    paths = [one.path for one in chosen]
+    prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
+    groups = {one.path: one.group for one in chosen}
+    with progress_bar("judge", len(chosen)) as progress:
+        judged, skipped = judge(prepared, models, groups, lambda done: progress(done / len(chosen)))
+    if not judged:
+        return skipped
+    found = Judgement(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
+    if out is not None:
+        write_judgement(out, found)
+    if as_json:
+        print_json(judgement_dict(found))
+    else:
+        typer.echo(judgement_text(found))
+    return skipped
+
+
+_GROUP = "{group}"
+
+
+@cache
+def _loaded(name: str) -> DisplacementModel:
+    from stario.network.model import load_model
+
+    return load_model(name)
+
+
+def _for_group(name: str, group: str) -> DisplacementModel:
+    """Weights by name; `{group}` in it is the group, blanks as underscores."""
+    return _loaded(name.replace(_GROUP, group.replace(" ", "_")))
+
+
+def _thinned(recordings: list[Listed], every: int) -> list[Listed]:
+    """Every so many recordings of each group, the first of each included."""
+    seen: dict[str, int] = {}
+    chosen = []
+    for one in recordings:
+        number = seen.get(one.group, 0)
+        seen[one.group] = number + 1
+        if number % every == 0:
+            chosen.append(one)
+    return chosen

@@ -1,0 +1,81 @@
+"""Confidence of a paired ratio of errors: groups, recordings and blocks drawn with replacement.
+
+Errors within a recording, a person or a place are alike, so that counting windows would make any
+difference look certain. The hierarchical bootstrap (Davison, Hinkley: Bootstrap Methods and their
+Application, 1997, section 3.8) draws groups, then recordings in each, then blocks of 30 s in each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.sequence import FloatArray
+
+REPLICATES = 1000
+CONFIDENCE = 0.95
+
+Blocks = tuple[FloatArray, FloatArray]
+"""Sums of squared errors of one recording's blocks (B,): ours, theirs."""
+
+Groups = Mapping[str, Sequence[Blocks]]
+"""The recordings of each group."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Geometric mean of the ratios of root mean square errors, ours over theirs, and its bounds."""
+
+    ratio: float
+    low: float
+    high: float
+
+
+def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None:
+    """Ratio of errors over groups that count alike, within strata that count alike.
+
+    Args:
+        strata: by name (a data set, say), the groups in each; the strata are not drawn.
+        seed: of the drawing.
+
+    Returns:
+        None where there is no recording.
+    """
+    rng = np.random.default_rng(seed)
+    known = [drawn for groups in strata.values() if (drawn := _stratum(groups, rng)) is not None]
+    if not known:
+        return None
+    estimate = float(np.mean([whole for whole, _ in known]))
+    replicates = np.mean([drawn for _, drawn in known], axis=0)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(replicates, [tail, 100.0 - tail])
+    return Interval(*(float(np.exp(value)) for value in (estimate, low, high)))
+
+
+def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray] | None:
+    """Mean log ratio over groups, and that of every replicate (R,)."""
+    known = [_group(recordings, rng) for recordings in groups.values() if recordings]
+    if not known:
+        return None
+    drawn = np.stack([replicates for _, replicates in known])
+    return float(np.mean([whole for whole, _ in known])), _means_of_draws(drawn, rng)
+
+
+def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[float, FloatArray]:
+    whole = float(np.mean([0.5 * np.log(ours.sum() / theirs.sum()) for ours, theirs in recordings]))
+    drawn = np.stack([_recording(ours, theirs, rng) for ours, theirs in recordings])
+    return whole, _means_of_draws(drawn, rng)
+
+
+def _recording(ours: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Log ratio (R,) of a recording whose blocks are drawn with replacement."""
+    rows = rng.integers(len(ours), size=(REPLICATES, len(ours)))
+    return np.asarray(0.5 * np.log(ours[rows].sum(axis=1) / theirs[rows].sum(axis=1)))
+
+
+def _means_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """For each replicate, the mean of as many members (n, R) drawn with replacement."""
+    rows = rng.integers(len(values), size=values.shape)
+    return np.asarray(np.take_along_axis(values, rows, axis=0).mean(axis=0))

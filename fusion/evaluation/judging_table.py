@@ -1,0 +1,186 @@
+"""The judged groups as text, CSV, JSON and one figure."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stario.fusion.evaluation.bootstrap import CONFIDENCE, REPLICATES, Interval
+from stario.fusion.evaluation.displacement_error import FIGURES
+from stario.fusion.evaluation.judging import Judged, Row
+from stario.sequences.files import atomic_write, write_json
+from stario.sequences.plots import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_COLUMNS = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "nis": ("NIS", ".2f"),
+}
+
+WORDS = {
+    **FIGURES,
+    "medians": "over the recordings of a group",
+    "ratio": "root mean square errors, ours over theirs: geometric mean over groups, of all sets "
+    f"that of the sets; [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
+    "groups, recordings and blocks of 30 s; of waypoints the residuals stand in for 10 s",
+}
+"""What each figure means."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What was judged.
+
+    Attributes:
+        ours: name of the weights.
+        theirs: of those compared with, or None.
+        rows: the groups.
+        judged: the recordings.
+    """
+
+    ours: str
+    theirs: str | None
+    rows: list[Row]
+    judged: list[Judged]
+
+
+def judgement_text(found: Judgement) -> str:
+    """The table for a person: theirs, ours and the ratio below each other for every group."""
+    width = max([14, *(len(row.name) + 2 for row in found.rows)])
+    titles = "".join(f"{title:>11}" for title, _ in _COLUMNS.values())
+    lines = [f"{'':<{width}}{'':<8}{'n':>5}{'km':>7}{titles}"]
+    for row in found.rows:
+        told = f"{row.recordings:>5}{row.path_km:>7.2f}"
+        for label, name in (("theirs", found.theirs), ("ours", found.ours)):
+            if name is None:
+                continue
+            cells = "".join(_cell(row.medians[name][key], form) for key, (_, form) in
+                            _COLUMNS.items())  # fmt: skip
+            lines.append(f"{row.name:<{width}}{label:<8}{told}{cells}")
+        for key, interval in row.ratios.items():
+            title = _COLUMNS[key][0].split(" [")[0]
+            lines.append(f"{'':<{width}}ratio over {title}: {_interval(interval)}")
+    names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
+    return "\n".join([*lines, *names, *(f"{key}: {text}." for key, text in WORDS.items())])
+
+
+def judgement_dict(found: Judgement) -> dict[str, object]:
+    """The same as plain values, recordings included."""
+    return {
+        "ours": found.ours,
+        "theirs": found.theirs,
+        "groups": [asdict(row) for row in found.rows],
+        "recordings": [_recording(one) for one in found.judged],
+        "words": WORDS,
+    }
+
+
+def write_judgement(folder: Path, found: Judgement) -> list[Path]:
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
+    rows = [
+        {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
+        | figures
+        | (_ratios(row) if name == found.ours else {})
+        for row in found.rows
+        for name, figures in row.medians.items()
+    ]
+    single = [
+        {"recording": one.path.name, **one.labels, "weights": name, "path_m": errors.path_m}
+        | errors.figures
+        for one in found.judged
+        for name, errors in one.errors.items()
+    ]
+    written = [folder / name for name in ("groups.csv", "recordings.csv", "groups.json")]
+    for path, content in zip(written, (rows, single), strict=False):
+        _write_csv(path, content)
+    write_json(written[2], judgement_dict(found))
+    save_figure(_figure(found), folder / "groups.png")
+    return [*written, folder / "groups.png"]
+
+
+def _recording(one: Judged) -> dict[str, object]:
+    figures = {name: errors.figures for name, errors in one.errors.items()}
+    kind, path_m = next((e.kind, e.path_m) for e in one.errors.values())
+    return {"recording": str(one.path), **one.labels, "truth": kind, "path_m": path_m} | {
+        "figures": figures
+    }
+
+
+def _ratios(row: Row) -> dict[str, float]:
+    return {
+        f"{key}_{part}": getattr(interval, part)
+        for key, interval in row.ratios.items()
+        for part in ("ratio", "low", "high")
+    }
+
+
+def _write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
+    names = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue())
+
+
+def _figure(found: Judgement) -> Figure:
+    """Error by group, before and after: each line a recording, the bar the medians."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [row for row in found.rows if row.name != "all"] or found.rows
+    fig = Figure(figsize=(10.0, 1.6 + 0.55 * len(rows)), layout="constrained")
+    FigureCanvasAgg(fig)
+    panels = fig.subplots(1, 2, sharey=True)
+    drawn = (("ate_fit_percent", "stretch_percent"), ("length_ratio",))
+    titles = (
+        "error after a yaw fit [% of the path]\n(position truth: within 20 s)",
+        "length ratio",
+    )
+    for axes, keys, title in zip(panels, drawn, titles, strict=True):
+        for k, row in enumerate(rows):
+            for name, colour, shift in ((found.theirs, "#999999", 0.16), (found.ours, "#0072B2",
+                                                                        -0.16)):  # fmt: skip
+                if name is None:
+                    continue
+                values = [row.medians[name][key] for key in keys]
+                value = next((v for v in values if np.isfinite(v)), np.nan)
+                axes.plot(value, k + shift, "o", color=colour, ms=8,
+                          label=name if k == 0 else None)  # fmt: skip
+                axes.annotate(f"{value:.2f}", (value, k + shift), (7, -3), fontsize=8,
+                              textcoords="offset points", color=colour)  # fmt: skip
+        axes.set_title(title, loc="left", fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="#E6E6E6", lw=0.7)
+        axes.margins(x=0.15)
+    panels[0].set_yticks(range(len(rows)), [f"{row.name} ({row.recordings})" for row in rows])
+    panels[0].invert_yaxis()
+    panels[0].set_xlim(left=0.0)
+    panels[1].axvline(1.0, color="#333333", lw=1.0)
+    handles, labels = panels[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return fig
+
+
+def _cell(value: float, form: str) -> str:
+    return f"{'-' if value != value else format(value, form):>11}"
+
+
+def _interval(found: Interval) -> str:
+    return f"{found.ratio:.3f} [{found.low:.3f}, {found.high:.3f}]"

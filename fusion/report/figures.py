@@ -1,0 +1,170 @@
+"""The report's two figures, as plotly's own: the map, and all panels over one time axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, style
+from stario.fusion.report.series import Series, ellipse
+from stario.sequences.sequence import FloatArray
+
+PANEL_HEIGHT = 190
+"""Of a panel over time [px]."""
+
+_ELLIPSES = 16
+"""Drawn along a track."""
+
+_FONT = {"family": "system-ui, sans-serif", "size": 13, "color": INK}
+_LEFT = 58
+"""Left margin [px]: the panels' labels need no more, and a phone has no more to give."""
+
+
+def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
+    """All tracks from above on equal axes, with 3-sigma ellipses along those that state them."""
+    figure = go.Figure()
+    if truth is not None:
+        figure.add_trace(_path(TRUTH, truth, 3.0))
+    for name, series in tracks.items():
+        if series.position_covariance is not None:
+            figure.add_trace(_ellipses(name, series))
+    for name, series in tracks.items():
+        figure.add_trace(_path(name, series, 2.0))
+    for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
+        figure.add_trace(_ends(name, series))
+    figure.update_layout(
+        font=_FONT,
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        margin={"l": _LEFT, "r": 12, "t": 8, "b": 44},
+        showlegend=False,
+        hovermode="closest",
+        dragmode="pan",
+    )
+    frame = _frame(tracks, truth)
+    for axis, limits, title in (("xaxis", frame[0], "x [m]"), ("yaxis", frame[1], "y [m]")):
+        figure.update_layout(
+            {axis: {"title": {"text": title, "standoff": 6}, "range": limits, **_axis()}}
+        )
+    figure.update_layout(yaxis={"scaleanchor": "x", "scaleratio": 1})
+    return figure
+
+
+def time_figure(panels: Sequence[Panel]) -> go.Figure:
+    """All panels below each other with one time axis."""
+    count = len(panels)
+    height = PANEL_HEIGHT * count + 60
+    figure = make_subplots(
+        rows=count,
+        cols=1,
+        shared_xaxes=True,
+        vertical_spacing=46 / height,
+        subplot_titles=[panel.title for panel in panels],
+    )
+    for row, panel in enumerate(panels, start=1):
+        for trace in panel.traces:
+            figure.add_trace(trace, row=row, col=1)
+        figure.update_yaxes(row=row, col=1, **_axis(), **panel.layout)
+        figure.update_xaxes(row=row, col=1, showticklabels=True, **_axis())
+    figure.update_xaxes(title={"text": "time since the first sample [s]", "standoff": 6}, row=count)
+    # Titles begin at the panels' left edge: on a phone there is no room around a centred one.
+    figure.update_annotations(x=0.0, xanchor="left", font={"size": 13, "color": INK})
+    figure.update_layout(
+        font=_FONT,
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        height=height,
+        margin={"l": _LEFT, "r": 12, "t": 28, "b": 44},
+        showlegend=False,
+        hovermode="x",
+        dragmode="zoom",
+    )
+    return figure
+
+
+def _axis() -> dict[str, object]:
+    return {
+        "gridcolor": GRID,
+        "zeroline": False,
+        "linecolor": FAINT,
+        "showline": True,
+        "ticks": "outside",
+        "tickcolor": FAINT,
+        "ticklen": 4,
+    }
+
+
+def _path(name: str, series: Series, width: float) -> go.Scatter:
+    label, colour, dash = style(name)
+    sigma = series.horizontal_sigma
+    known = np.full(len(series.time), np.nan) if sigma is None else sigma
+    words = "" if sigma is None else "<br>sigma %{customdata[1]:.2f} m"
+    return go.Scatter(
+        x=series.position[:, 0].round(4),
+        y=series.position[:, 1].round(4),
+        name=label,
+        legendgroup=name,
+        mode="lines",
+        line={"color": colour, "dash": dash, "width": width},
+        customdata=np.column_stack([series.time, known, series.speed]).round(3),
+        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{words}"
+        "<br>speed %{customdata[2]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
+    )
+
+
+def _ellipses(name: str, series: Series) -> go.Scatter:
+    """Some outlines in one trace, nan between them."""
+    _, colour, _ = style(name)
+    assert series.position_covariance is not None  # asked for only where there is one
+    known = np.flatnonzero(np.isfinite(series.position[:, 0]))
+    rows = np.unique(known[np.linspace(0, len(known) - 1, _ELLIPSES).round().astype(int)])
+    parts = [
+        np.vstack([series.position[k, :2] + ellipse(series.position_covariance[k]), [[np.nan] * 2]])
+        for k in rows
+    ]
+    outline = np.vstack(parts).round(3)
+    return go.Scatter(
+        x=outline[:, 0],
+        y=outline[:, 1],
+        name="3 sigma",
+        legendgroup=name,
+        showlegend=False,
+        mode="lines",
+        line={"color": colour, "width": 0.8},
+        opacity=0.55,
+        hoverinfo="skip",
+    )
+
+
+def _ends(name: str, series: Series) -> go.Scatter:
+    """Where it begins, an open circle, and ends, a square."""
+    known = np.flatnonzero(np.isfinite(series.position[:, 0]))
+    at = series.position[known[[0, -1]], :2]
+    return go.Scatter(
+        x=at[:, 0],
+        y=at[:, 1],
+        legendgroup=name,
+        mode="markers",
+        marker={
+            "symbol": ["circle-open", "square"],
+            "size": 9,
+            "color": style(name)[1],
+            "line": {"width": 2},
+        },
+        hoverinfo="skip",
+    )
+
+
+def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
+    """Limits (2, 2) of x and y that fit the truth, or the estimates that are no mere drift."""
+    own = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
+    at = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + own])
+    if truth is not None:  # a track that ran away must not make the truth a dot
+        low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]
+        at = np.clip(at, low - (high - low).max(), high + (high - low).max())
+    low, high = np.nanmin(at, axis=0), np.nanmax(at, axis=0)
+    margin = 0.08 * max(1.0, float((high - low).max()))
+    return np.stack([low - margin, high + margin], axis=1)

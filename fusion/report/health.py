@@ -1,0 +1,147 @@
+"""The health report in words: what stands out, and what to do about it.
+
+Counts alone do not help who sees them for the first time. Each finding names what was seen, in
+numbers, and the next thing to try; `stario live` shows the same words while a walk goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from stario.fusion.state import Health
+
+Level = Literal["good", "note", "warning"]
+"""Nothing to do; good to know; worth acting on."""
+
+DROPPED_SHARE = 0.01
+"""Samples dropped beyond this share are worth acting on."""
+
+FLAGGED_SHARE = 1e-3
+"""So are spikes and saturated samples beyond this one."""
+
+GATED_SHARE = 0.1
+"""And updates that the filter took for outliers beyond this one."""
+
+NIS_RATIO = 2.0
+"""Mean NIS this many times its expectation, or less than it by this factor, is worth saying."""
+
+YAW_SIGMA = math.radians(15.0)
+"""A direction known less well than this [rad] bends the track."""
+
+LONG_GAP = 1.0
+"""Behind a gap of this length [s] the direction is not known any more."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that stands out.
+
+    Attributes:
+        level: whether something should be done.
+        text: what was seen.
+        advice: what to do; empty where there is nothing to do.
+    """
+
+    level: Level
+    text: str
+    advice: str = ""
+
+
+def findings(health: Health) -> list[Finding]:
+    """What stands out in a run so far, warnings first; never empty."""
+    found = [
+        *_samples(health),
+        *_gaps(health),
+        *_updates(health),
+        *_fixes(health),
+        *_direction(health),
+        *(Finding("note", note[:1].upper() + note[1:]) for note in health.notes),
+    ]
+    if not any(finding.level == "warning" for finding in found):
+        found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
+    order: dict[str, int] = {"warning": 0, "good": 1, "note": 2}
+    return sorted(found, key=lambda finding: order[finding.level])
+
+
+def _samples(health: Health) -> list[Finding]:
+    used = health.samples.get("used", 0)
+    dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
+    share = sum(dropped.values()) / max(1, used + sum(dropped.values()))
+    found = []
+    if dropped:
+        reasons = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in dropped.items())
+        advice = "Log gyroscope and accelerometer at one rate, and close other apps."
+        bad = share > DROPPED_SHARE
+        text = f"{share:.1%} of the samples were dropped ({reasons})."
+        found.append(Finding("warning" if bad else "note", text, advice if bad else ""))
+    flagged = {name: n for name, n in health.flagged.items() if n}
+    if sum(flagged.values()) > FLAGGED_SHARE * max(1, used):
+        reasons = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in flagged.items())
+        advice = "Hold or strap the device more firmly, or choose a larger range of the sensor."
+        found.append(Finding("warning", f"Samples that no motion explains: {reasons}.", advice))
+    return found
+
+
+def _gaps(health: Health) -> list[Finding]:
+    if not health.gap_count:
+        return []
+    several = f"{health.gap_count} gaps" if health.gap_count > 1 else "A gap"
+    text = f"{several} in the samples, the longest of {health.longest_gap:.2f} s."
+    if health.longest_gap < LONG_GAP:
+        return [Finding("note", text)]
+    advice = (
+        "Keep the logger in the foreground and exempt it from battery saving; "
+        "a fix of position or heading behind the gap brings the direction back."
+    )
+    return [Finding("warning", text, advice)]
+
+
+def _updates(health: Health) -> list[Finding]:
+    found = []
+    if health.updates:
+        gated = health.gated / health.updates
+        if gated > GATED_SHARE:
+            text = f"{gated:.0%} of the network's displacements did not fit the IMU."
+            advice = (
+                "The motion may be unlike what the weights learned (carrying, running, wheels): "
+                "fine-tune them on recordings of this kind with `stario train`."
+            )
+            found.append(Finding("warning", text, advice))
+    ratio = health.mean_nis / health.nis_expected
+    if ratio > NIS_RATIO:
+        text = f"Innovations are larger than expected (mean NIS {health.mean_nis:.1f})."
+        advice = "Read the sigmas as too small by about this ratio's root; recalibrate the weights."
+        found.append(Finding("warning", text, f"{advice} Ratio: {ratio:.1f}."))
+    elif ratio < 1.0 / NIS_RATIO:
+        text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
+        found.append(Finding("note", f"{text} The sigmas are on the safe side."))
+    left_out = {name: n for name, n in health.refused.items() if n}
+    if left_out:
+        reasons = ", ".join(f"{n} {name}" for name, n in left_out.items())
+        found.append(Finding("note", f"Displacements left out: {reasons}."))
+    return found
+
+
+def _fixes(health: Health) -> list[Finding]:
+    if not health.fixes:
+        return []
+    applied = health.fixes.get("applied", 0)
+    other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
+    text = f"{applied} fixes applied"
+    if not other:
+        return [Finding("note", f"{text}.")]
+    reasons = ", ".join(f"{n} {name}" for name, n in other.items())
+    refused = sum(n for name, n in other.items() if name not in ("gated", "waiting"))
+    advice = "Check the fixes' clock, frame and sigmas." if refused else ""
+    return [Finding("warning" if refused else "note", f"{text}; {reasons}.", advice)]
+
+
+def _direction(health: Health) -> list[Finding]:
+    yaw = health.final_sigma.get("yaw_rad", 0.0)
+    if yaw <= YAW_SIGMA:
+        return []
+    text = f"The direction is known to {math.degrees(yaw):.0f} degrees only (1 sigma)."
+    advice = "Rest for two seconds now and then, or give a fix of heading or two of position."
+    return [Finding("warning", text, advice)]

@@ -1,0 +1,259 @@
+"""The report as one HTML file: figures, cursor, health in words, table; it loads nothing else."""
+
+from __future__ import annotations
+
+import html
+import importlib.resources
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stario.fusion.report.health import Finding, findings
+from stario.fusion.state import Track
+from stario.sequences.files import atomic_write
+from stario.sequences.metrics import align
+from stario.sequences.readers.checked import optional_package
+
+if TYPE_CHECKING:
+    from stario.fusion.config import NavigatorConfig
+    from stario.fusion.evaluation.compare import Comparison, Metrics
+    from stario.fusion.report.series import Series
+    from stario.sequences.metrics import Alignment
+    from stario.sequences.sequence import ImuSequence
+
+_LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
+_COLUMNS = {
+    "ate_m": ("ATE [m]", 2),
+    "rte_m": ("RTE [m]", 2),
+    "aye_rad": ("AYE [rad]", 3),
+    "nees": ("NEES", 1),
+    "nis": ("NIS", 1),
+}
+
+
+def write_report(
+    path: Path,
+    sequence: ImuSequence,
+    tracks: Mapping[str, Track],
+    config: NavigatorConfig,
+    metrics: Mapping[str, Metrics],
+    alignment: Alignment = "first",
+) -> Path:
+    """Write the report of one recording's tracks, whole or not at all.
+
+    Args:
+        path: the HTML file; its folder must exist.
+        sequence: the recording; its truth is drawn where it has one.
+        tracks: by name, as of `compare`, or the one of a run.
+        config: the filter's settings, for the gate.
+        metrics: figures by track, for the table.
+        alignment: of the tracks with the truth.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: plotly is not installed, or the folder does not exist.
+    """
+    optional_package("plotly", "report")
+    content = report_html(sequence, tracks, config, metrics, alignment)
+    with atomic_write(path) as file:
+        file.write(content)
+    return path
+
+
+def write_comparison_report(folder: Path, comparison: Comparison, config: NavigatorConfig) -> Path:
+    """`report.html` of a comparison's recording; errors as of `write_report`."""
+    return write_report(
+        folder / "report.html",
+        comparison.sequence,
+        comparison.tracks,
+        config,
+        comparison.metrics,
+        comparison.alignment,
+    )
+
+
+def report_html(
+    sequence: ImuSequence,
+    tracks: Mapping[str, Track],
+    config: NavigatorConfig,
+    metrics: Mapping[str, Metrics],
+    alignment: Alignment,
+) -> str:
+    """The report's text; arguments as of `write_report`."""
+    from plotly.offline import get_plotlyjs
+
+    from stario.fusion.report.figures import map_figure, time_figure
+    from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels
+    from stario.fusion.report.series import track_series, trajectory_series
+
+    start = float(sequence.time[np.isfinite(sequence.time)][0])
+    truth = sequence.truth
+    series = {
+        name: track_series(
+            track,
+            track.trajectory if truth is None else align(track.trajectory, truth, alignment),
+            start,
+        )
+        for name, track in tracks.items()
+    }
+    known = None if truth is None else trajectory_series(truth, start)
+    main = main_track(tracks)
+    # The IMU alone is kilometres off within a minute: no axis could hold it beside the others.
+    steady = {name: s for name, s in series.items() if name != "inertial"} or series
+    panels = motion_panels(steady, known) + bias_panels(main, series[main])
+    innovations = tracks[main].innovations or next(
+        (t.innovations for t in tracks.values() if t.innovations), None
+    )
+    if innovations is not None and len(innovations.time):
+        unit = "m" if config.filter.measurement == "displacement" else "m/s"
+        panels += innovation_panels(innovations, start, config.filter.gate, unit)
+    figures = {
+        "map": json.loads(map_figure(steady if truth is None else series, known).to_json()),
+        "time": json.loads(time_figure(panels).to_json()),
+    }
+    health = tracks[main].health
+    return _filled(
+        {
+            "TITLE": html.escape(sequence.name),
+            "FACTS": _facts(sequence, tracks[main], series[main]),
+            "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
+            "HEALTH": "" if health is None else _health(findings(health)),
+            "TABLE": "" if truth is None else _table(metrics, alignment),
+            "STYLE": asset("report.css"),
+            "SCRIPT": asset("report.js"),
+            "DATA": _script_json({**figures, "cursors": _cursors(steady, main), "main": main}),
+            "PLOTLY": get_plotlyjs(),
+        }
+    )
+
+
+def main_track(tracks: Mapping[str, Track]) -> str:
+    """The track that facts, health and innovations are told of."""
+    for name in ("ekf", "graph"):
+        if name in tracks:
+            return name
+    return next(iter(tracks))
+
+
+def asset(name: str) -> str:
+    """A text file of this package."""
+    return importlib.resources.files("stario.fusion.report").joinpath(name).read_text("utf-8")
+
+
+def _filled(parts: Mapping[str, str]) -> str:
+    """The template with its parts; split first, so that a part may hold anything."""
+    pieces = asset("report.html").split("%%")
+    return "".join(piece if k % 2 == 0 else parts[piece] for k, piece in enumerate(pieces))
+
+
+def _script_json(content: object) -> str:
+    """JSON for a script element, which `</script>` in a name must not end."""
+    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
+    duration = sequence.duration
+    facts = [
+        (_clock(duration), "min:s recorded"),
+        (f"{track.trajectory.path_length():.0f} m", "travelled by the estimate"),
+        (f"{len(sequence) / max(duration, 1e-9):.0f} Hz", "samples"),
+    ]
+    if series.horizontal_sigma is not None and series.yaw_sigma is not None:
+        facts.append((f"{series.horizontal_sigma[-1]:.2f} m", "1 sigma of position at the end"))
+        facts.append((f"{series.yaw_sigma[-1]:.1f} deg", "1 sigma of yaw at the end"))
+    end = track.trajectory.position_W[-1] - track.trajectory.position_W[0]
+    facts.append((f"{float(np.hypot(*end[:2])):.1f} m", "from start to end"))
+    return "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in facts)
+
+
+def _legend(names: Sequence[str]) -> str:
+    """A button for each track, with its line; it hides and shows the track everywhere."""
+    from stario.fusion.report.panels import style
+
+    dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
+    buttons = []
+    for name in names:
+        label, colour, dash = style(name)
+        line = (
+            '<svg width="28" height="8" aria-hidden="true"><line x1="0" y1="4" x2="28" y2="4" '
+            f'stroke="{colour}" stroke-width="3" stroke-dasharray="{dashes[dash]}"/></svg>'
+        )
+        buttons.append(
+            f'<button type="button" aria-pressed="true" data-track="{html.escape(name)}">'
+            f"{line}{html.escape(label)}</button>"
+        )
+    return "".join(buttons)
+
+
+def _health(found: Sequence[Finding]) -> str:
+    rows = []
+    for finding in found:
+        advice = f"<p>{html.escape(finding.advice)}</p>" if finding.advice else ""
+        word = _LEVEL_WORDS[finding.level]
+        text = f"<b>{word}</b><div>{html.escape(finding.text)}{advice}</div>"
+        rows.append(f'<li class="{finding.level}">{text}</li>')
+    return f"<ul>{''.join(rows)}</ul>"
+
+
+def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
+    from stario.fusion.evaluation.compare import metric_words
+    from stario.fusion.report.panels import style
+
+    head = "".join(f"<th>{title}</th>" for title, _ in _COLUMNS.values())
+    rows = []
+    for name, figures in metrics.items():
+        cells = []
+        for key, (_, digits) in _COLUMNS.items():
+            value = figures.get(key)
+            known = value is not None and np.isfinite(value)
+            cells.append(f"<td>{value:.{digits}f}</td>" if known else "<td>-</td>")
+        rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
+    words = metric_words(alignment)
+    told = "".join(
+        f"<li><b>{title.split()[0]}</b> {html.escape(words[key])}.</li>"
+        for key, (title, _) in _COLUMNS.items()
+    )
+    aligned = f"<li><b>Alignment</b> {html.escape(words['alignment'])}.</li>"
+    return (
+        "<h2>Against the truth</h2><div class='wide'><table>"
+        f"<tr><th></th>{head}</tr>{''.join(rows)}</table></div>"
+        f"<ul class='words'>{told}{aligned}</ul>"
+    )
+
+
+def _cursors(tracks: Mapping[str, Series], main: str) -> list[dict[str, Any]]:
+    """What the slider moves: place, ellipse and figures of each track over time, the main first."""
+    from stario.fusion.report.panels import style
+
+    cursors = []
+    for name in sorted(tracks, key=lambda name: name != main):
+        series = tracks[name]
+        label, colour, _ = style(name)
+        columns = {
+            "t": series.time,
+            "x": series.position[:, 0],
+            "y": series.position[:, 1],
+            "z": series.position[:, 2],
+            "speed": series.speed,
+            "yaw": series.yaw,
+        }
+        P = series.position_covariance
+        if P is not None:
+            columns |= {"xx": P[:, 0, 0], "xy": P[:, 0, 1], "yy": P[:, 1, 1]}
+        rounded = {key: _numbers(column) for key, column in columns.items()}
+        cursors.append({"name": name, "label": label, "colour": colour, **rounded})
+    return cursors
+
+
+def _numbers(column: np.ndarray[Any, np.dtype[np.float64]]) -> list[float | None]:
+    return [value if value == value else None for value in np.round(column, 4).tolist()]
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"

@@ -1,0 +1,244 @@
+"""The report's panels over time: each a quantity with its bands, one below the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from scipy.stats import chi2
+
+from stario.fusion.report.series import Series
+from stario.fusion.state import Innovations
+from stario.sequences.plots import TRACK_STYLES
+from stario.sequences.sequence import BoolArray, FloatArray
+
+INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
+AXIS_COLOURS = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
+TRUTH = "truth"
+_DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
+_MOST_INNOVATIONS = 1500
+
+
+Column = Callable[[Series], FloatArray | None]
+"""What a panel draws of a track."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One row of the figure over time.
+
+    Attributes:
+        title: with unit.
+        traces: of plotly.
+        layout: of its y axis.
+    """
+
+    title: str
+    traces: list[go.Scatter]
+    layout: dict[str, Any] = field(default_factory=dict)
+
+
+def style(name: str) -> tuple[str, str, str]:
+    """Label, colour and dash of a track."""
+    if name == TRUTH:
+        return TRUTH, "#000000", "solid"
+    label, colour = TRACK_STYLES.get(name, (name, "#7F5539"))
+    return label, colour, _DASHES.get(name, "solid")
+
+
+def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
+    """Height, speed and yaw of every track; the error where there is truth."""
+    shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
+    panels = [] if truth is None else [_error_panel(tracks, truth)]
+    columns: tuple[tuple[str, str, Column, Column], ...] = (
+        ("Height [m]", "m", lambda s: s.position[:, 2], lambda s: s.height_sigma),
+        ("Speed [m/s]", "m/s", lambda s: s.speed, lambda s: s.speed_sigma),
+        ("Yaw, turns counted [deg]", "deg", lambda s: s.yaw, lambda s: s.yaw_sigma),
+    )
+    for title, unit, value_of, sigma_of in columns:
+        traces = []
+        for name, series in shown.items():
+            value, sigma = value_of(series), sigma_of(series)
+            assert value is not None  # only a sigma may be unknown
+            if title.startswith("Yaw"):
+                value = value + _whole_turns(value, next(iter(shown.values())).yaw)
+            traces += curve(name, series.time, value, unit, sigma)
+        panels.append(Panel(f"{title}, band 3 sigma", traces, {"range": _limits(traces)}))
+    return panels
+
+
+def bias_panels(name: str, series: Series) -> list[Panel]:
+    """Both biases of a track by axis."""
+    panels = []
+    for title, unit, bias in (
+        ("Gyroscope bias", "deg/s", series.gyro_bias),
+        ("Accelerometer bias", "m/s^2", series.accel_bias),
+    ):
+        if bias is None:
+            continue
+        label, traces = style(name)[0], []
+        for k, axis in enumerate("xyz"):
+            look = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
+            value, sigma = bias[0][:, k], bias[1][:, k]
+            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, look)
+        words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
+        panels.append(Panel(words, traces, {"range": _limits(traces)}))
+    return panels
+
+
+def innovation_panels(
+    innovations: Innovations, start: float, gate: float, unit: str
+) -> list[Panel]:
+    """Innovations by axis within 3 sigma, and their NIS with the gate.
+
+    Args:
+        innovations: of an estimator's updates.
+        start: time of the recording's first sample [s].
+        gate: probability of the chi-square test.
+        unit: of the residuals.
+    """
+    count = len(innovations.time)
+    rows = np.unique(np.linspace(0, count - 1, min(count, _MOST_INNOVATIONS)).round().astype(int))
+    rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # each of these is drawn
+    time, gated = innovations.time[rows] - start, innovations.gated[rows]
+    panels = []
+    for k, axis in enumerate("xyz"):
+        residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
+        traces = _band("innovation", time, 0.0 * residual, sigma, FAINT)
+        traces += _dots(time, residual, gated, unit)
+        title = f"Innovation {axis} [{unit}], band 3 sigma"
+        panels.append(Panel(title, traces, {"range": _limits(traces)}))
+    limit = float(chi2.ppf(gate, 3))
+    nis = np.maximum(innovations.nis[rows], 1e-2)
+    ends = time[[0, -1]]
+    traces = _dots(time, nis, gated, "")
+    traces += [
+        _line(ends, limit, f"gate {limit:.1f} ({gate:.1%})", "dash"),
+        _line(ends, 3.0, "expected 3", "dot"),
+    ]
+    title = f"NIS [1]: dotted expected 3, dashed gate {limit:.1f}"
+    panels.append(Panel(title, traces, {"type": "log", "dtick": 1}))
+    return panels
+
+
+def curve(
+    name: str,
+    time: FloatArray,
+    value: FloatArray,
+    unit: str,
+    sigma: FloatArray | None = None,
+    look: tuple[str, str, str] | None = None,
+) -> list[go.Scatter]:
+    """A line with hover, and its band of 3 sigma where there is one."""
+    label, colour, dash = look or style(name)
+    line = go.Scatter(
+        x=_rounded(time),
+        y=_rounded(value),
+        name=label,
+        legendgroup=name.split()[0],
+        showlegend=False,
+        mode="lines",
+        line={"color": colour, "dash": dash, "width": 1.6},
+        customdata=None if sigma is None else _rounded(sigma),
+        hovertemplate=f"{label} %{{y:.3g}} {unit}"
+        + ("" if sigma is None else f", sigma %{{customdata:.2g}} {unit}")
+        + "<extra></extra>",
+    )
+    band = [] if sigma is None else _band(name.split()[0], time, value, sigma, colour)
+    return [*band, line]
+
+
+def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
+    traces = []
+    for name, series in tracks.items():
+        inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
+        known = np.isfinite(truth.position[:, 0])
+        at = np.stack(
+            [np.interp(series.time, truth.time[known], truth.position[known, k]) for k in (0, 1)],
+            axis=1,
+        )
+        error = np.linalg.norm(series.position[:, :2] - at, axis=1)
+        traces += curve(name, series.time, np.where(inside, error, np.nan), "m")
+    return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
+
+
+def _band(
+    group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
+) -> list[go.Scatter]:
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    quiet: dict[str, Any] = {
+        "x": _rounded(time),
+        "mode": "lines",
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+        "legendgroup": group,
+        "showlegend": False,
+    }
+    fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
+    return [
+        go.Scatter(y=_rounded(value - 3.0 * sigma), **quiet),
+        go.Scatter(y=_rounded(value + 3.0 * sigma), **quiet, **fill),
+    ]
+
+
+def _dots(
+    time: FloatArray,
+    value: FloatArray,
+    gated: BoolArray,
+    unit: str,
+) -> list[go.Scatter]:
+    looks: Sequence[tuple[Any, str, dict[str, Any]]] = (
+        (~gated, "used", {"color": "#0072B2", "size": 3}),
+        (gated, "gated", {"color": "#D55E00", "size": 7, "symbol": "x-thin-open"}),
+    )
+    return [
+        go.Scatter(
+            x=_rounded(time[rows]),
+            y=_rounded(value[rows]),
+            name=name,
+            showlegend=False,
+            mode="markers",
+            marker=marker,
+            hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
+        )
+        for rows, name, marker in looks
+        if rows.any()
+    ]
+
+
+def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
+    return go.Scatter(
+        x=_rounded(ends),
+        y=[value, value],
+        name=label,
+        showlegend=False,
+        mode="lines",
+        line={"color": INK, "dash": dash, "width": 1.2},
+        hoverinfo="skip",
+    )
+
+
+def _limits(traces: Sequence[go.Scatter]) -> list[float]:
+    """Of the axis: all curves, and of the bands what is not wide for moments only, as at first."""
+    curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
+    bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
+    low, high = np.nanmin(curves), np.nanmax(curves)
+    if np.isfinite(bands).any():
+        inner = np.nanpercentile(bands, [2.5, 97.5])
+        low, high = min(low, inner[0]), max(high, inner[1])
+    margin = 0.06 * max(float(high - low), 1e-3)
+    return [float(low - margin), float(high + margin)]
+
+
+def _whole_turns(yaw: FloatArray, reference: FloatArray) -> float:
+    """Degrees that bring a yaw to the turn of another one."""
+    off = np.nanmedian(yaw) - np.nanmedian(reference)
+    return -360.0 * float(np.round(off / 360.0)) if np.isfinite(off) else 0.0
+
+
+def _rounded(values: FloatArray) -> FloatArray:
+    """Digits beyond any screen's only make the file large."""
+    return np.round(values, 5).astype(np.float32)

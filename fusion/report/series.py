@@ -1,0 +1,156 @@
+"""What the report draws of a track: columns over time, thinned, with their standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.state import Track
+from stario.sequences.rotations import yaw_of
+from stario.sequences.sequence import FloatArray, Trajectory
+
+MOST_POINTS = 1500
+"""Poses drawn of a track; a screen shows no more, and the file stays small."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A track as columns of N rows, nan where poses are not valid.
+
+    Attributes:
+        time: [s] since the recording's first sample.
+        position: (N, 3) [m].
+        speed: [m/s].
+        yaw: [deg], without jumps of a turn.
+        position_covariance: (N, 3, 3) [m^2], or None.
+        speed_sigma: [m/s], or None.
+        yaw_sigma: [deg], or None.
+        gyro_bias: (N, 3) [deg/s] and its sigma, or None.
+        accel_bias: (N, 3) [m/s^2] and its sigma, or None.
+    """
+
+    time: FloatArray
+    position: FloatArray
+    speed: FloatArray
+    yaw: FloatArray
+    position_covariance: FloatArray | None = None
+    speed_sigma: FloatArray | None = None
+    yaw_sigma: FloatArray | None = None
+    gyro_bias: tuple[FloatArray, FloatArray] | None = None
+    accel_bias: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def height_sigma(self) -> FloatArray | None:
+        """Standard deviation of the height (N,) [m]."""
+        if self.position_covariance is None:
+            return None
+        return np.asarray(np.sqrt(self.position_covariance[:, 2, 2]), dtype=np.float64)
+
+    @property
+    def horizontal_sigma(self) -> FloatArray | None:
+        """The larger axis of the horizontal 1-sigma ellipse (N,) [m]."""
+        if self.position_covariance is None:
+            return None
+        largest = np.linalg.eigvalsh(self.position_covariance[:, :2, :2])[:, 1]
+        return np.asarray(np.sqrt(largest), dtype=np.float64)
+
+
+def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
+    """Columns of a track.
+
+    Args:
+        track: with biases and covariance where it has them.
+        aligned: its trajectory as it is drawn, pose by pose the same.
+        start: time of the recording's first sample [s].
+    """
+    rows = _thinned(len(track.time))
+    plain = trajectory_series(aligned, start)
+    if track.covariance is None:
+        return plain
+    P, velocity = track.covariance[rows], track.trajectory.velocity_W
+    sigma = np.sqrt(P[:, range(15), range(15)])
+    biases = [
+        None if bias is None else (scale * bias[rows], scale * sigma[:, part])
+        for bias, scale, part in (
+            (track.b_g, float(np.degrees(1.0)), slice(9, 12)),
+            (track.b_a, 1.0, slice(12, 15)),
+        )
+    ]
+    return Series(
+        plain.time,
+        plain.position,
+        plain.speed,
+        plain.yaw,
+        plain.position_covariance,
+        None if velocity is None else _speed_sigma(velocity[rows], P[:, 3:6, 3:6]),
+        np.degrees(sigma[:, 2]),
+        *biases,
+    )
+
+
+def trajectory_series(trajectory: Trajectory, start: float) -> Series:
+    """Columns of a trajectory; a speed that it does not hold is that of the positions."""
+    rows = _thinned(len(trajectory.time))
+    time = trajectory.time[rows] - start
+    valid = trajectory.valid[rows]
+    position = np.where(valid[:, None], trajectory.position_W[rows], np.nan)
+    yaw = np.degrees(np.unwrap(yaw_of(trajectory.attitude_WB[rows])))
+    covariance = trajectory.position_covariance_W
+    if trajectory.velocity_W is None:
+        speed = _speed_of(trajectory)[rows]
+    else:
+        speed = np.linalg.norm(trajectory.velocity_W[rows], axis=1)
+    return Series(
+        time,
+        position,
+        np.where(valid, speed, np.nan),
+        np.where(valid, yaw, np.nan),
+        None if covariance is None else covariance[rows],
+    )
+
+
+def ellipse(covariance: FloatArray, sigmas: float = 3.0, points: int = 49) -> FloatArray:
+    """Outline (points, 2) of the horizontal error ellipse about zero [m].
+
+    Args:
+        covariance: (3, 3) or (2, 2) [m^2].
+        sigmas: its size.
+        points: of the outline, the last equal to the first.
+    """
+    values, axes = np.linalg.eigh(covariance[:2, :2])
+    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    outline: FloatArray = (axes * sigmas * np.sqrt(np.maximum(values, 0.0))) @ circle
+    return outline.T
+
+
+def _thinned(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    rows = np.linspace(0, count - 1, min(count, MOST_POINTS))
+    return np.unique(np.round(rows).astype(np.intp))
+
+
+def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Of the norm of v: the root of u'Pu with u the direction of v, to first order."""
+    norm = np.linalg.norm(velocity, axis=1, keepdims=True)
+    # At rest there is no direction: the largest of all is what the norm may be off by.
+    largest = np.linalg.eigvalsh(covariance)[:, -1]
+    u = velocity / np.maximum(norm, 1e-9)
+    along = np.einsum("ni,nij,nj->n", u, covariance, u)
+    return np.sqrt(np.where(norm[:, 0] > 1e-6, along, largest))
+
+
+def _speed_of(trajectory: Trajectory) -> FloatArray:
+    """Central differences over half a second either way, so that noise of poses is no speed."""
+    t, half = trajectory.time, 0.5
+    known = np.flatnonzero(trajectory.valid)
+    if len(known) < 2:
+        return np.full(len(t), np.nan)
+    first, last = t[known[0]], t[known[-1]]
+    before, after = (np.clip(t + sign * half, first, last) for sign in (-1.0, 1.0))
+    ends = [
+        np.stack([np.interp(at, t[known], trajectory.position_W[known, k]) for k in range(3)], 1)
+        for at in (before, after)
+    ]
+    span = np.maximum(after - before, 1e-9)
+    return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / span)

@@ -1,0 +1,101 @@
+"""Writing StarIO's archive: many recordings in one HDF5 file, each a group under its name.
+
+The layout is the one that `stario.sequences.readers.archive` reads. Numbers are written as they
+are, in double precision and compressed, so that they come back bit for bit (attitudes to the last
+digit of their quaternions).
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_path
+from stario.sequences.readers.archive import SUFFIXES
+from stario.sequences.readers.checked import optional_package
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+
+_log = logging.getLogger(__name__)
+
+_COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+
+
+def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[str]:
+    """Write recordings into one archive, whole or not at all; one that is there is replaced.
+
+    Args:
+        path: the file, `.h5` or `.hdf5`.
+        sequences: taken one by one, so that they need not fit into memory together.
+
+    Returns:
+        The names under which they are stored: their own, with `-2`, `-3`, ... where one is taken
+        and `-` for a slash.
+
+    Raises:
+        InputError: the file's name has another suffix, its folder does not exist, there is no
+            recording, or h5py is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError("path", str(path), f"an archive's name, {' or '.join(SUFFIXES)}")
+    h5py = optional_package("h5py", "readers")
+    names: list[str] = []
+    with atomic_path(path) as temporary:
+        with h5py.File(temporary, "x") as file:
+            for sequence in sequences:
+                names.append(_free_name(sequence.name, file))
+                _write(file.create_group(names[-1]), sequence)
+        if not names:
+            raise InputError(str(path), "no recording", "at least one to write")
+    return names
+
+
+def _free_name(name: str, taken: Any) -> str:
+    name = name.replace("/", "-") or "recording"
+    candidates = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
+    return next(candidate for candidate in candidates if candidate not in taken)
+
+
+def _write(group: Any, sequence: ImuSequence) -> None:
+    columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
+    if sequence.magnetometer is not None:
+        columns["mag/t"] = sequence.magnetometer.time
+        columns["mag/field"] = sequence.magnetometer.field
+    if sequence.truth is not None:
+        columns |= _pose_columns(sequence.truth)
+    if sequence.positions is not None:
+        columns |= _position_columns(sequence, sequence.positions)
+    for name, values in columns.items():
+        group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
+    for key, value in sequence.attributes.items():
+        group.attrs[key] = value
+
+
+def _pose_columns(truth: Trajectory) -> dict[str, FloatArray]:
+    columns: dict[str, Any] = {
+        "truth/t": truth.time,
+        "truth/p": truth.position_W,
+        "truth/quat_xyzw": truth.quat_xyzw,
+        "truth/velocity": truth.velocity_W,
+        "truth/position_covariance": truth.position_covariance_W,
+        "truth/valid": None if truth.valid.all() else truth.valid,
+    }
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def _position_columns(sequence: ImuSequence, track: PositionTrack) -> dict[str, FloatArray]:
+    if track.kind == "waypoints":
+        stem, place = "waypoints", "xy" if track.position_W.shape[1] == 2 else "p"
+    elif sequence.truth is None:
+        stem, place = "truth", "p"
+    else:
+        _log.warning("%s: positions beside a pose truth are not written", sequence.name)
+        return {}
+    columns: dict[str, Any] = {f"{stem}/t": track.time, f"{stem}/{place}": track.position_W}
+    if not track.valid.all():
+        columns[f"{stem}/valid"] = track.valid
+    return columns

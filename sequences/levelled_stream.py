@@ -1,0 +1,88 @@
+"""A recording as a network sees it in use: 200 Hz in the frame N that the IMU levels by itself.
+
+N is gravity-aligned, its yaw zero at the start and drifting with the gyroscope
+(`stario.sequences.levelling`). No truth is needed, so this serves recordings with poses, positions
+or waypoints alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.sequences.levelling import levelled_attitudes
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import (
+    WINDOW_RATE,
+    WINDOW_SAMPLES,
+    clean_samples,
+    resample,
+    unbroken,
+)
+
+TICK_SAMPLES = 100
+"""Samples of a stream from one tick to the next: windows start at ticks."""
+
+TICK_SECONDS = TICK_SAMPLES / WINDOW_RATE
+"""Time from one tick to the next [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelledStream:
+    """An unbroken stretch of a recording at 200 Hz in N, ready to cut windows from.
+
+    Attributes:
+        start: time of the first sample [s].
+        imu_N: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] in N.
+        R_NB: (K, 3, 3) attitude at the ticks, one every `TICK_SECONDS` from `start`.
+    """
+
+    start: float
+    imu_N: NDArray[np.float32]
+    R_NB: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.imu_N)
+
+    @property
+    def ticks(self) -> FloatArray:
+        """Times (K,) of the ticks [s]."""
+        return np.asarray(self.start + TICK_SECONDS * np.arange(len(self.R_NB)))
+
+    @property
+    def window_count(self) -> int:
+        """Windows of a second that begin at a tick and are whole."""
+        return max(0, (len(self) - WINDOW_SAMPLES) // TICK_SAMPLES + 1)
+
+    def windows(self) -> NDArray[np.float32]:
+        """Windows (M, 6, 200) in N that begin at the first M ticks."""
+        rows = TICK_SAMPLES * np.arange(self.window_count)[:, None] + np.arange(WINDOW_SAMPLES)
+        return np.ascontiguousarray(self.imu_N[rows].transpose(0, 2, 1))
+
+
+def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[LevelledStream]:
+    """The unbroken stretches of a recording, each levelled from its own start.
+
+    Args:
+        sequence: the recording; its truth is not looked at.
+        min_seconds: shorter stretches are left out [s].
+
+    Raises:
+        InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
+    """
+    time, gyro, accel = clean_samples(sequence)
+    streams = []
+    for begin, end in unbroken(time):
+        if time[end - 1] - time[begin] < min_seconds:
+            continue
+        part = slice(begin, end)
+        R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
+        vectors = np.stack([gyro[part], accel[part]], axis=1)
+        imu = (vectors @ R_NB.transpose(0, 2, 1)).reshape(-1, 6)
+        grid = np.arange(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
+        at_tick = np.searchsorted(time[part], grid[::TICK_SAMPLES] - 1e-9)
+        imu_N = resample(time[part], imu, grid).astype(np.float32)
+        streams.append(LevelledStream(float(time[begin]), imu_N, R_NB[at_tick]))
+    return streams

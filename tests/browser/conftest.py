@@ -1,0 +1,64 @@
+"""Pages in a real browser, headless Chromium; tests skip and say so where it is absent."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+DESKTOP, PHONE = (1440, 900), (390, 844)
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+
+
+@dataclass
+class Shown:
+    """A page and what its console complained of."""
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)
+
+    def overflows(self) -> bool:
+        """Whether the page is wider than its window."""
+        return self.page.evaluate("document.documentElement.scrollWidth > window.innerWidth")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium: apt-get install chromium")
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def show(browser, tmp_path: Path):
+    """Open an address; without a network, so that a page that loads anything from afar fails."""
+    opened = []
+
+    def show(url: str, size: tuple[int, int] = DESKTOP, offline: bool = False) -> Shown:
+        width, height = size
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, has_touch=width < 600, offline=offline
+        )
+        context.set_default_timeout(120_000)  # a shared core draws a page slowly
+        opened.append(context)
+        shown = Shown(context.new_page())
+        shown.page.on(
+            "console",
+            lambda m: shown.complaints.append(m.text) if m.type in ("error", "warning") else None,
+        )
+        shown.page.on("pageerror", lambda error: shown.complaints.append(str(error)))
+        shown.page.on("requestfailed", lambda r: shown.complaints.append(f"failed: {r.url}"))
+        shown.page.goto(url)
+        shown.page.wait_for_selector("body[data-ready=yes]")
+        return shown
+
+    yield show
+    for context in opened:
+        context.close()
