@@ -183,16 +183,6 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
     return replace(world, usable=world.usable & truth.covers(world.time))
 
 
-def levelled_imu(sequence: ImuSequence) -> LevelledImu:
-    """The IMU at 200 Hz, levelled as in use; the yaw is arbitrary, and so after each gap.
-
-    Raises:
-        InputError: as for `clean_samples`.
-    """
-    time, gyro, accel = clean_samples(sequence)
-    return _even(time, gyro, accel, Rotation.from_matrix(_levelled_NB(time, gyro, accel)))
-
-
 def _even(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
 ) -> LevelledImu:

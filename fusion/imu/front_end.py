@@ -35,9 +35,9 @@ from stario.sequences.windows import (
     MAX_IMU_GAP,
     WINDOW_RATE,
     WINDOW_SECONDS,
-    resample,
     facing,
     mean_heading,
+    resample,
 )
 
 _TAIL = 4

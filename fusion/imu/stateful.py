@@ -64,8 +64,9 @@ class AlongTrack:
         """
         mean_H, covariance_H = self._stretch.predict(turned_windows(windows_N, -heading))
         R_NH = about_z(heading).as_matrix()
-        mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
-        return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
+        with np.errstate(invalid="ignore"):  # the estimator refuses what is not finite
+            mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
+            return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
     def checkpoint(self) -> Any:
         """What the network remembers, as a tree of arrays and numbers; None without memory."""

@@ -26,14 +26,9 @@ from torch import Tensor
 from stario.network.training.augment import Augmentation, WindowSampler, heading_of, show
 from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
 from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
-from stario.sequences.windows import (
-    HEADING_STEP,
-    WINDOW_RATE,
-    WINDOW_SAMPLES,
-    levelled_imu,
-    runs,
-)
+from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES
 
 VARIANCE_RATE = 0.05
 """Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
@@ -92,21 +87,19 @@ def leg_streams(sequence: ImuSequence, min_seconds: float) -> list[LegStream]:
     """
     if sequence.positions is None:
         raise InputError(f"{sequence.name}: positions", "none", "positions or waypoints")
-    imu = levelled_imu(sequence)
     start, stop, displacement, sigma = _legs(sequence.positions)
     streams = []
-    for first, last in runs(imu.usable):
-        begin, end = imu.time[first], imu.time[last - 1]
+    for stream in levelled_streams(sequence, min_seconds):
+        begin, end = stream.start, stream.start + len(stream) / WINDOW_RATE
         inside = (start >= begin) & (stop <= end)
-        if end - begin < min_seconds or inside.sum() < 2:
+        if inside.sum() < 2:
             continue
-        part = slice(first, last)
         streams.append(
             LegStream(
                 sequence.name,
                 sequence.positions.kind,
-                imu.imu[part],
-                imu.facing[part],
+                stream.imu_N,
+                stream.facing_N,
                 start[inside] - begin,
                 stop[inside] - begin,
                 displacement[inside],

@@ -17,8 +17,8 @@ from stario.sequences.windows import (
     facing,
     imu_in_world,
     mean_heading,
-    turned_windows,
     resample,
+    turned_windows,
     windows_of,
     world_streams,
 )

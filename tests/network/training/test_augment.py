@@ -15,8 +15,8 @@ from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, windows_of, world_streams
 
 NOTHING = Augmentation(
-    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
-    gyro_noise=0.0, accel_noise=0.0,
+    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,
+    accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
 )  # fmt: skip
 """No range at all, at any yaw; the mirror image is drawn always."""
 
