@@ -98,5 +98,6 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         grid = np.arange(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
         at_tick = np.searchsorted(time[part], grid[::TICK_SAMPLES] - 1e-9)
         even = resample(time[part], values, grid).astype(np.float32)
-        streams.append(LevelledStream(float(time[begin]), even[:, :6], even[:, 6:], R_NB[at_tick]))
+        imu_N, facing_N = (np.ascontiguousarray(part) for part in np.split(even, [6], axis=1))
+        streams.append(LevelledStream(float(time[begin]), imu_N, facing_N, R_NB[at_tick]))
     return streams
