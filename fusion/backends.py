@@ -14,7 +14,8 @@ from typing import Any, Literal, Protocol
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
-from stario.fusion.filter.estimator import Displacement, Estimator, IntervalMeasurements
+from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.estimator_state import Displacement, IntervalMeasurements
 from stario.fusion.filter.frame_transform import in_last_frame, smoothed_track
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix, FixQueue

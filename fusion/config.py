@@ -43,7 +43,7 @@ class FilterConfig:
         gate_seconds: outliers are left out, but not for longer than this in a row [s]: then the
             filter itself may be wrong, and their covariance is inflated; 0 inflates at once. On the
             training and validation recordings both give the same error, and 6 s bring the filter
-            through a block of wrong measurements (`stario faults`).
+            through a block of wrong measurements (`stario check faults`).
         tilt_sigma: of the first attitude when the device is moving [rad].
         yaw_sigma: of the first attitude's yaw [rad]; small, since the start defines the yaw.
         velocity_sigma: of the first velocity, taken as zero [m/s].

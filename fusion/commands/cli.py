@@ -34,23 +34,13 @@ app = typer.Typer(
     help="Inertial navigation: fused trajectories from IMU recordings.",
 )
 
-for command in (
-    run,
-    live,
-    compare,
-    evaluate,
-    simulate,
-    convert,
-    inspect,
-    train,
-    models,
-    export,
-    benchmark,
-    backends,
-    faults,
-    consistency,
-):
+for command in (run, live, compare, evaluate, inspect, convert, train, simulate, export):
     app.command()(command)
+
+check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
+for command in (models, backends, faults, consistency, benchmark):
+    check.command()(command)
+app.add_typer(check, name="check")
 
 
 def main() -> None:

@@ -19,7 +19,8 @@ from scipy.stats import chi2
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.error_state import CORE
 from stario.fusion.filter.estimate import Moments, moments
-from stario.fusion.filter.estimator import Displacement, Estimator
+from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval

@@ -7,17 +7,21 @@ right-invariant error (Barrau and Bonnabel 2017).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import GateMode
 from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.estimator_state import (
+    Displacement,
+    EstimatorState,
+    IntervalMeasurements,
+    Step,
+)
 from stario.fusion.filter.gyro_prior import GyroPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
@@ -46,62 +50,6 @@ second and 0.36 to 0.7 per second over three in the training and validation reco
 
 _ROUNDING = 1e-9
 """Of times [s]."""
-
-Displacement = tuple[FloatArray, FloatArray]
-"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
-
-
-class IntervalMeasurements(NamedTuple):
-    """An IMU interval and what became of what was measured in it."""
-
-    interval: ImuInterval
-    offered: Displacement | None
-    """What the network said of the window that ends here; None where there is none, or at rest."""
-    displacement: Displacement | None
-    """The same with its covariance as inflated, None where it was left out."""
-    zero_velocity: ZeroVelocity | None
-    """None where the device moved, or the measurement was refused."""
-    fixes: list[Accepted]
-    """Those taken in, in order."""
-    segment: Segment | None
-    """The samples, None where fixes cut them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A step that a late fix may ask to be taken again, and the state before it."""
-
-    before: EstimatorState
-    interval: ImuInterval
-    displacement: Displacement | None
-    fixes: Sequence[Fix]
-
-
-@dataclass(frozen=True, eq=False)
-class EstimatorState:
-    """Everything that an estimator knows between two intervals; nothing is changed in place.
-
-    Attributes:
-        ekf: pose, biases, clones and their covariance.
-        clones: slots of the clones, oldest first.
-        map_frame: where the fixes' frame lies.
-        stillness: the last second's sums (`StillnessDetector`).
-        counts: what became of the updates.
-        gated_since: time from which on displacements were outliers [s].
-        in_gap: whether the last interval had no samples.
-        oldest: the newest pose that left the window, corrected by all of it.
-        history: the steps of the last second of a stream.
-    """
-
-    ekf: EkfState
-    clones: tuple[int, ...]
-    map_frame: MapFrameState
-    stillness: tuple[FloatArray | None, ...]
-    counts: UpdateCounts
-    gated_since: float | None
-    in_gap: bool
-    oldest: Estimate | None
-    history: tuple[Step, ...] = ()
 
 
 class Estimator:

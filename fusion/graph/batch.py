@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import IntervalMeasurements
+from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.graph.builder import GraphBuilder

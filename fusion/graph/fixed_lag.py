@@ -16,7 +16,8 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimate import nav_states
-from stario.fusion.filter.estimator import Displacement, Estimator, EstimatorState
+from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
