@@ -83,20 +83,20 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
     boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
     if way_truth is not None and np.isfinite(way_truth[1]).any():
-        median = way_truth[1]
+        typical = way_truth[1]
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track that did not run away.
         by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
-        median = paths[by_size[(len(boxes) - 1) // 2]]
+        typical = paths[by_size[(len(boxes) - 1) // 2]]
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
-    home = box_of(median)
+    home = box_of(typical)
     near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
     frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
-    fine = 0.6 if rounds(median, home) > _CROWDED else 1.0
+    fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
     if way_truth is not None:
         _draw_way(axes, way_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
