@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import Displacement
+from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.imu.front_end import FrontEnd, cut_recording
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import Predictor, StatefulInference

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from stario.sequences.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from stario.sequences.batch import Skipped as Skipped
     from stario.sequences.checks import check_units as check_units
     from stario.sequences.conventions import with_conventions as with_conventions
     from stario.sequences.errors import ConfigError as ConfigError
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from stario.sequences.noise import ImuNoise as ImuNoise
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
+    from stario.sequences.readers.own_csv import write_csv as write_csv
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import ImuSequence as ImuSequence
     from stario.sequences.sequence import Magnetometer as Magnetometer
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from stario.sequences.simulation.walks import WalkStyle as WalkStyle
     from stario.sequences.simulation.walks import generate_walk as generate_walk
     from stario.sequences.units import with_units as with_units
+    from stario.sequences.windows import world_streams as world_streams
 
 _MODULES = {
     "ConfigError": "errors",
@@ -48,6 +51,7 @@ _MODULES = {
     "PositionTrack": "sequence",
     "ReadError": "errors",
     "STANDARD_GRAVITY": "sequence",
+    "Skipped": "batch",
     "StarioError": "errors",
     "Trajectory": "sequence",
     "WalkStyle": "simulation.walks",
@@ -64,36 +68,10 @@ _MODULES = {
     "simulate_imu": "simulation.imu",
     "with_conventions": "conventions",
     "with_units": "units",
+    "world_streams": "windows",
+    "write_csv": "readers.own_csv",
     "write_tum": "files",
 }
 
-__all__ = [
-    "GOOD_IMU",
-    "PERFECT_IMU",
-    "PHONE_IMU",
-    "STANDARD_GRAVITY",
-    "ConfigError",
-    "ImuErrors",
-    "ImuNoise",
-    "ImuSequence",
-    "InputError",
-    "ReadError",
-    "StarioError",
-    "Trajectory",
-    "WalkStyle",
-    "WeightsError",
-    "align",
-    "check_units",
-    "evaluate_track",
-    "find_recordings",
-    "generate_walk",
-    "inspect_recording",
-    "position_nees",
-    "read_recording",
-    "read_tum",
-    "simulate_imu",
-    "with_conventions",
-    "with_units",
-    "write_tum",
-]
+__all__ = [*_MODULES]
 __getattr__ = lazy_attributes("stario.sequences", _MODULES)

@@ -17,6 +17,7 @@ A sample written as `nan` is kept as such; other columns are ignored.
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -70,7 +71,12 @@ def read_own_csv(path: Path) -> ImuSequence:
     lines = read_lines(path)
     header = read_header(path, lines)
     columns = header.columns
-    rows = _rows_quickly(path, header) or _rows_carefully(path, lines, header)
+    if _ends_within_a_row(path, lines, header):
+        # A recorder was killed while it wrote: what it wrote before is whole.
+        _log.warning("%s: the last line, %d, is cut short and left out", path, len(lines))
+        rows = _rows_carefully(path, lines[:-1], header)
+    else:
+        rows = _rows_quickly(path, header) or _rows_carefully(path, lines, header)
     is_imu, table = rows.is_imu, rows.table
     factors = {
         sensor: np.array([unit_factor(path, columns[sensor[0] + axis], known) for axis in "xyz"])
@@ -99,6 +105,17 @@ class _Rows:
     time: FloatArray
     is_imu: BoolArray
     line_numbers: Sequence[int]
+
+
+def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
+    """Whether the last line has no end and fewer cells than the row before it."""
+    if len(lines) < header.lines + 2 or not _is_row(lines[-2]):
+        return False
+    if lines[-1].count(header.separator) >= lines[-2].count(header.separator):
+        return False
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read(1) not in b"\r\n"
 
 
 def _rows_quickly(path: Path, header: Header) -> _Rows | None:
