@@ -85,10 +85,11 @@ def displacements_of(
     network: StatefulInference, intervals: Sequence[ImuInterval]
 ) -> list[Displacement]:
     """The network's displacements of the intervals' windows, as far as it can be trusted."""
-    windows = np.stack([_window(interval) for interval in intervals])
+    windows_N = np.stack([_window(interval) for interval in intervals])
+    heading = np.array([interval.heading for interval in intervals])
     return [
         (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
-        for interval, d_N, C in zip(intervals, *network.predict(windows), strict=True)
+        for interval, d_N, C in zip(intervals, *network.predict(windows_N, heading), strict=True)
     ]
 
 

@@ -3,7 +3,7 @@
 filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
 `benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never changed in
-place: whoever holds an earlier one may go back to it.
+place: whoever holds an earlier one may go back to it. README.md, "Gates".
 """
 
 from __future__ import annotations

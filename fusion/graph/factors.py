@@ -3,7 +3,8 @@
 Every term gives its residual (measured minus predicted) and the Jacobians of what it predicts; the
 graph whitens them, weighs down what may be an outlier and hands gtsam a `JacobianFactor` in C++,
 anew in every round of the optimisation. gtsam's own factors would do for position and velocity
-alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt.
+alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt
+(README.md, "Graph factors").
 
 Tangent of a keyframe, as gtsam's: pose R exp(w), p + R dp in the order w, dp; velocity additive;
 biases additive, accelerometer first. Keys: x pose, v velocity, b biases.

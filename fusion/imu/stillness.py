@@ -3,7 +3,8 @@
 The scatter of both sensors over the last second is held against the white noise of a phone's IMU
 (`PHONE_IMU`), which a hand's tremor or a trolley's wheels exceed. The filter's own densities are no
 measure here: they stand for errors of scale and alignment, which only motion brings. That an even
-glide looks still as well is left to the zero-velocity update's own chi-square test.
+glide looks still as well is left to the zero-velocity update's own chi-square test (README.md,
+"Zero velocity").
 
 Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
 sensors); the scatter about the mean replaces their known gravity and bias.

@@ -6,6 +6,7 @@
   const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#7F5539"];
   const DASHES = ["solid", "dash", "dot", "dashdot"];
   const SYMBOLS = ["circle", "square", "diamond", "triangle-up"];
+  const BESIDE = ["top center", "bottom center", "middle right", "middle left"];
   const MOST_DRAWN = 1200;
   const MOST_KEPT = 24000;
   const devices = new Map();
@@ -28,7 +29,7 @@
     return `M${corners.join("L")}Z`;
   };
 
-  const axis = (title) => ({ title: { text: title, standoff: 4 }, gridcolor: "#E3E6EA", zeroline: false,
+  const axis = (title) => ({ title: { text: title, standoff: 4, font: { size: 13 } }, gridcolor: "#E3E6EA", zeroline: false,
     linecolor: "#767676", showline: true, ticks: "outside", ticklen: 4, tickcolor: "#767676" });
   const font = { family: "system-ui, sans-serif", size: 13, color: "#222222" };
   const base = { font, paper_bgcolor: "white", plot_bgcolor: "white", showlegend: false };
@@ -40,14 +41,20 @@
     annotations: rows.map(([text], k) => ({ text, x: 0, xanchor: "left", xref: "paper", yref: `y${k ? k + 1 : ""} domain`,
       y: 1.02, yanchor: "bottom", showarrow: false, font })) };
   rows.forEach((_, k) => {
-    timeLayout[`xaxis${k ? k + 1 : ""}`] = { ...axis(k === 2 ? "time since each track's first sample [s]" : ""), ...(k ? { matches: "x" } : {}) };
+    timeLayout[`xaxis${k ? k + 1 : ""}`] = { ...axis(k === 2 ? "time of each track [s]" : ""), ...(k ? { matches: "x" } : {}) };
     timeLayout[`yaxis${k ? k + 1 : ""}`] = { ...axis(""), ...(k === 2 ? { range: [-185, 185], dtick: 90 } : { rangemode: "tozero" }) };
   });
   const config = { responsive: true, displaylogo: false, displayModeBar: false, scrollZoom: true };
 
   let following = true;
   const fitted = () => {
-    const known = [...devices.values()].flatMap((d) => thinned(d.points).map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]));
+    const known = [...devices.values()].flatMap((d) => {
+      const points = thinned(d.points).map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]);
+      const last = points[points.length - 1];
+      if (!last) return [];
+      const reach = Math.min(50, 3 * sigmaOf(d.points[d.points.length - 1]));
+      return [...points, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
+    });
     const [xs, ys] = [0, 1].map((k) => known.map((p) => p[k]));
     const size = map.getBoundingClientRect();
     const [wide, high] = [size.width - 64, size.height - 48];
@@ -68,7 +75,7 @@
         text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
       const last = points[points.length - 1];
       mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [d.label],
-        textposition: "top center", hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
+        textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
       if (last) shapes.push({ type: "path", path: ellipse(last, d.origin), line: { color: d.colour, width: 1 }, fillcolor: d.colour + "22" });
       rows.forEach(([, value], k) => {
         let before = null;
@@ -164,7 +171,7 @@
     card.innerHTML = '<h2><svg width="30" height="10" aria-hidden="true"></svg><span class="name"></span><span class="state"></span></h2>' +
       '<div class="figures"></div><ul class="words"></ul><div class="tools"></div><p class="error" hidden></p><p class="file"></p>';
     const device = { id, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
-      dash: DASHES[Math.floor(n / COLOURS.length + n) % DASHES.length], symbol: SYMBOLS[n % SYMBOLS.length],
+      dash: DASHES[Math.floor(n / COLOURS.length + n) % DASHES.length], symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
       points: [], origin: [0, 0, 0], received: 0, running: true, card };
     const strokes = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
     card.querySelector("svg").innerHTML = `<line x1="0" y1="5" x2="30" y2="5" stroke="${device.colour}" stroke-width="3" stroke-dasharray="${strokes[device.dash]}"/>`;

@@ -79,7 +79,8 @@ class Phyphox:
 
     def _questions(self) -> list[str]:
         questions = []
-        for sensor, (t, *axes) in self._buffers.items():
+        for sensor, names in self._buffers.items():
+            t, *axes = map(quote, names)
             if sensor in self._newest:
                 since = repr(self._newest[sensor])
                 questions += [f"{t}={since}", *(f"{axis}={since}%7C{t}" for axis in axes)]
@@ -121,7 +122,7 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]
             continue
         outputs = {k: v for output in source.get("outputs", []) for k, v in output.items()}
         if all(isinstance(outputs.get(key), str) for key in "txyz"):
-            t, x, y, z = (quote(outputs[key]) for key in "txyz")
+            t, x, y, z = (outputs[key] for key in "txyz")
             found[sensor] = (t, x, y, z)
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
         have = ", ".join(found) or "neither"

@@ -95,7 +95,9 @@ def split_off(
 
 def _cut(stream: WorldStream, start: int, stop: int) -> WorldStream:
     part = slice(start, max(stop, start))
-    return WorldStream(stream.name, stream.imu_W[part], stream.position_W[part])
+    return WorldStream(
+        stream.name, stream.imu_W[part], stream.position_W[part], stream.facing_W[part]
+    )
 
 
 def simulated_streams(
