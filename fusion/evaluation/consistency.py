@@ -93,8 +93,7 @@ def consistency(
     """Run the filter on simulated walks whose errors are as large as it is told.
 
     Args:
-        config: of the filter. Its motion noise is left out: the simulated IMU is without the errors
-            of scale and alignment that it stands for.
+        config: of the filter; the simulated IMU is as noisy as it says.
         yaw_sigma: of the first yaw [rad].
         runs: number of walks.
         seconds: length of each [s].
