@@ -60,6 +60,22 @@ class LegStream:
     def __len__(self) -> int:
         return len(self.imu_N)
 
+    def part(self, start: int, stop: int) -> LegStream:
+        """Samples from start to before stop, with the legs that lie within."""
+        begin, end = start / WINDOW_RATE, max(stop, start) / WINDOW_RATE
+        inside = (self.start >= begin) & (self.stop <= end)
+        part = slice(start, max(stop, start))
+        return LegStream(
+            self.name,
+            self.kind,
+            self.imu_N[part],
+            self.facing_N[part],
+            self.start[inside] - begin,
+            self.stop[inside] - begin,
+            self.displacement[inside],
+            self.sigma[inside],
+        )
+
 
 def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStream]:
     """Cut a recording with known positions into unbroken stretches with two legs at least.

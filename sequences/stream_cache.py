@@ -87,8 +87,8 @@ def recorded(
 
 
 def cached(
-    key: Mapping[str, object], build: Callable[[], list[Stream]], folder: Path
-) -> list[Stream]:
+    key: Mapping[str, object], build: Callable[[], Sequence[Stream]], folder: Path
+) -> Sequence[Stream]:
     """What `build` returns, from the cache where something of this key is there.
 
     Args:
@@ -100,8 +100,8 @@ def cached(
     streams = _opened(file)
     if streams is not None:
         return streams
-    streams = build()
-    return (_opened(file) if _written(file, streams) else None) or streams
+    built = build()
+    return (_opened(file) if _written(file, built) else None) or built
 
 
 def recording_files(path: Path) -> list[Path]:
@@ -188,7 +188,7 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-def _written(file: Path, streams: list[Stream]) -> bool:
+def _written(file: Path, streams: Sequence[Stream]) -> bool:
     """Whether the streams could be put into the cache, which runs do without if need be."""
     if not streams:
         return False
