@@ -61,30 +61,30 @@ class Truth:
 
     def __init__(self, recording: ImuSequence) -> None:
         [self.stream] = leg_streams(recording)
+        [self.world] = world_streams(WALK, attitude="true")
 
     def __call__(self, batch: LegBatch) -> torch.Tensor:
         """(S, K, 3) in the frame that each window is shown in."""
         found = []
         for windows, R_NH in zip(batch.windows, batch.R_NH, strict=True):
-            begin = self._begin(windows[0].numpy(), R_NH[0].numpy())
+            begin = self._begin(windows[0].numpy())
             position = truth_of(WALK).at(begin + np.arange(SECONDS + 1.0)).position_W
             moved = np.diff(position, axis=0) @ self._R_NW(begin).T
             R_HN = R_NH.transpose(1, 2).double().numpy()
             found.append((R_HN @ moved[:, :, None])[:, :, 0])
         return torch.tensor(np.stack(found), dtype=torch.float32)
 
-    def _begin(self, window: FloatArray, R_NH: FloatArray) -> float:
-        shown = window[5]
-        starts = [np.abs(self.stream.imu_N[k : k + 200, 5] - shown).max()
-                  for k in range(len(self.stream) - 200)]  # fmt: skip
-        return int(np.argmin(starts)) / 200.0
+    def _begin(self, window: FloatArray) -> float:
+        """The vertical force tells where a window begins, whichever way it is turned."""
+        found = np.flatnonzero(np.abs(self.stream.imu_N[:-200, 5] - window[5, 0]) < 1e-4)
+        off = [np.abs(self.stream.imu_N[k : k + 200, 5] - window[5]).max() for k in found]
+        return float(found[np.argmin(off)]) / 200.0
 
     def _R_NW(self, begin: float) -> FloatArray:
         """Yaw between the levelled frame and the world, from one of the gyroscope's vectors."""
-        [world] = world_streams(WALK, attitude="true")
         k = round(begin * 200)
         part = slice(k, k + 2000)
-        a, b = (x[part, 3] + 1j * x[part, 4] for x in (world.imu_W, self.stream.imu_N))
+        a, b = (x[part, 3] + 1j * x[part, 4] for x in (self.world.imu_W, self.stream.imu_N))
         turn = np.angle(np.vdot(a, b))
         c, s = np.cos(turn), np.sin(turn)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
