@@ -35,7 +35,6 @@ class FilterConfig:
 
     Attributes:
         update_rate: network updates per second.
-        measurement: "displacement" between clones, or "velocity" (mean over the window, no clones).
         covariance_scale: factor on the network's covariance beyond update_rate x window length,
             which accounts for overlapping windows. Successive errors of the network are alike,
             so innovations are smaller than single errors; fitted to NIS and position NEES on the
@@ -61,12 +60,11 @@ class FilterConfig:
             [m/s^2/sqrt(Hz) per m/s^2].
         gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
         gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
-        rest_noise: factor on the white noise of a phone's IMU within which a second of samples
+        stillness_noise: factor on the white noise of a phone's IMU within which a second of samples
             counts as rest (`rest`); 0 never does.
     """
 
     update_rate: int = 2
-    measurement: str = "displacement"
     covariance_scale: float = 0.5
     gate: float = 0.997
     gate_seconds: float = 6.0
@@ -81,13 +79,11 @@ class FilterConfig:
     accel_motion_noise: float = 0.04
     gap_gyro_noise: float = 0.3
     gap_accel_noise: float = 1.0
-    rest_noise: float = 2.0
+    stillness_noise: float = 2.0
 
     def __post_init__(self) -> None:
         if self.update_rate not in UPDATE_RATES:
             raise ConfigError("update_rate", repr(self.update_rate), f"one of {UPDATE_RATES}")
-        if self.measurement not in ("displacement", "velocity"):
-            raise ConfigError("measurement", repr(self.measurement), "displacement or velocity")
         if not 0.5 <= self.gate < 1.0:
             raise ConfigError("gate", repr(self.gate), "a probability from 0.5 to below 1")
         if not 0.0 <= self.gyro_corrected < 1.0:
@@ -111,7 +107,7 @@ class FilterConfig:
         return max(LEAST_OUTPUT_RATE, self.update_rate)
 
     @property
-    def epochs_per_update(self) -> int:
+    def intervals_per_update(self) -> int:
         """States from one network update to the next."""
         return self.output_rate // self.update_rate
 

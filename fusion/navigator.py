@@ -1,40 +1,32 @@
-"""The navigator: one recipe for streams and recordings.
+"""The navigator: the same estimate of streams and recordings.
 
-Samples become epochs (`intake`), the windows of epochs become displacements (the network), and
-both move the filter (`recipe`). A stream does this sample by sample; a recording lets the network
-see many windows at once. As the intake does not depend on the filter both give the same track.
+Samples become IMU intervals (`imu.front_end`), the windows of intervals become displacements (the
+network), and both move an estimator (`filter.estimator`). A stream does this sample by sample; a
+recording lets the network see many windows at once. As the front end does not depend on the filter
+both give the same track.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from time import perf_counter
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion.checked import floored
+from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
-from stario.fusion.filter.estimator import FilterRecipe, Measurement, PriorPose
-from stario.fusion.filter.map_frame import in_last_world, smoothed_track
-from stario.fusion.fixes import Fix, FixQueue, heading_fix, position_fix, velocity_fix
-from stario.fusion.graph.batch import smooth
-from stario.fusion.graph.builder import Taken
-from stario.fusion.graph.fixed_lag import GraphRecipe
-from stario.fusion.imu.front_end import Intake, all_epochs
-from stario.fusion.imu.intervals import Epoch, Start
-from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
+from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import Predictor as Predictor
+from stario.fusion.imu.stateful import StatefulInference
+from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
+from stario.fusion.recording import Progress, displacements_of, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
-from stario.fusion.state import Health, NavState, SmoothedPose, Track, track_from_states
-from stario.sequences.checks import check_units
+from stario.fusion.state import Health, NavState, SmoothedPose, Track
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import WINDOW_SECONDS
 
 Vector = Sequence[float] | FloatArray
 """Three numbers."""
@@ -42,39 +34,9 @@ Vector = Sequence[float] | FloatArray
 _START_FORCE = (5.0, 15.0)
 """Average force [m/s^2] of a first second that may hold a jump, but neither g nor deg/s."""
 
-Backend = Literal["ekf", "graph"]
-"""The filter; or the factor graph, fixed-lag for streams and of the whole for recordings."""
 
-LEAST_SIGMA = 5e-3
-"""No network knows a second's displacement better than this [m], whatever it says."""
-
-SUSPECT_SCALE = 4.0
-"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
-
-_BATCH = 512
-"""Windows of a recording that the network is given at once."""
-
-Progress = Callable[[float], None]
-"""Called with the share of the work done, 0 to 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """A recording as the filter sees it: epochs, and the network's word on each window.
-
-    Attributes:
-        epochs: in order.
-        measurements: one for each epoch, None where there is no window.
-        intake: with its counts and the start.
-        seconds_intake: computing time [s].
-        seconds_network: computing time [s].
-    """
-
-    epochs: list[Epoch]
-    measurements: list[Measurement | None]
-    intake: Intake
-    seconds_intake: float
-    seconds_network: float
+def _silent(share: float) -> None:
+    """Progress that nobody watches."""
 
 
 class Navigator:
@@ -95,18 +57,18 @@ class Navigator:
         model: Predictor,
         config: NavigatorConfig | None = None,
         prior: PriorPose | None = None,
-        backend: Backend = "ekf",
+        backend: BackendName = "ekf",
     ) -> None:
-        if backend not in get_args(Backend):
-            raise InputError("backend", repr(backend), f"one of {', '.join(get_args(Backend))}")
+        if backend not in BACKENDS:
+            raise InputError("backend", repr(backend), f"one of {', '.join(BACKENDS)}")
         self.backend = backend
         self.model = model
         self.prior = prior
         self.config = config or NavigatorConfig()
-        self._intake = Intake(self.config)
-        self._recipe: FilterRecipe | GraphRecipe | None = None
         self._fixes = FixQueue()
-        self._network = self._along_track()
+        self._estimator: StreamEstimator | None
+        self._front_end: FrontEnd
+        self._begin_stream()
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
         """Take in one sample of a stream.
@@ -130,9 +92,9 @@ class Navigator:
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
-        for epoch in self._intake.push(sample):
-            self._check_gyro(epoch)
-            state = self._advance(epoch)
+        for interval in self._front_end.push(sample):
+            self._check_gyro(interval)
+            state = self._advance(interval)
         return state
 
     def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
@@ -141,8 +103,8 @@ class Navigator:
         It is taken in at its own time: up to a window (1 s) before the newest state, or later,
         when the stream gets there. Older ones, and values that are not finite or no covariance,
         are refused and counted in `health`. A track that started without a pose is moved to its
-        first position fix and turned by the second that is far enough away (see `world`): states
-        with another `world` must not be compared with those before.
+        first position fix and turned by the second that is far enough away (`filter.map_frame`):
+        states with another `map_frame` must not be compared with those before.
 
         Args:
             time: [s], on the samples' clock.
@@ -158,55 +120,51 @@ class Navigator:
         """A velocity fix (3,) [m/s] with covariance (3, 3); else as `update_position`."""
         self._take(velocity_fix(time, v_W, covariance))
 
-    def update_heading(self, time: float, yaw: float, sigma: float) -> None:
-        """A fix of the body's yaw [rad], that of `yaw_of`; else as `update_position`."""
-        self._take(heading_fix(time, yaw, sigma))
+    def update_yaw(self, time: float, yaw: float, sigma: float) -> None:
+        """A fix of the body's yaw [rad]; else as `update_position`.
+
+        Yaw counts counter-clockwise from the map's x axis (no compass heading); at any tilt it is
+        that of the twist about the vertical (`yaw.yaw_twist`).
+        """
+        self._take(yaw_fix(time, yaw, sigma))
 
     @property
     def state(self) -> NavState | None:
         """The newest state of the stream, None before the first second is over."""
-        return None if self._recipe is None else self._recipe.state()
+        return None if self._estimator is None else self._estimator.nav_state()
 
     @property
     def smoothed(self) -> SmoothedPose | None:
         """The stream's newest pose one window (1 s) late, corrected by all measured since.
 
-        It comes with each network update; None before the first, and where there are no clones
-        (`measurement` "velocity") or the back end is not the EKF.
+        It comes with each network update; None before the first, and for the graph.
         """
-        return self._recipe.smoothed if isinstance(self._recipe, FilterRecipe) else None
+        return None if self._estimator is None else self._estimator.smoothed
 
     @property
     def health(self) -> Health:
         """The stream's report so far."""
-        counts = self._intake.counts
-        health = counts.health() if self._recipe is None else self._recipe.health(counts)
-        return _with_refused(health, self._fixes)
+        counts = self._front_end.counts
+        return self._fixes.health(
+            counts.health() if self._estimator is None else self._estimator.health(counts)
+        )
 
     def snapshot(self) -> bytes:
         """The stream as it is now, to be continued by `restore`, in another process if need be.
 
         The bytes' format is documented in `stario.fusion.snapshot`; nothing in it is pickled. They
         hold neither configuration files nor weights, only what tells them.
-
-        Raises:
-            InputError: the back end cannot be continued.
         """
-        recipe = self._recipe
-        if recipe is not None and not isinstance(recipe, _Continued):
-            raise InputError(
-                "snapshot", f"the back end {self.backend}", "one that can be continued"
-            )
         return pack(
             {
                 "backend": self.backend,
                 "config": asdict(self.config),
                 "model": _fingerprint(self.model),
-                "prior": None if self.prior is None else vars(self.prior),
-                "intake": self._intake.checkpoint(),
-                "fixes": self._fixes.checkpoint(),
-                "network": self._network.checkpoint(),
-                "recipe": None if recipe is None else recipe.dump(),
+                "prior": self.prior,
+                "front end": self._front_end,
+                "fixes": self._fixes,
+                "network": self._network.memory,
+                "estimator": None if self._estimator is None else self._estimator.state,
             }
         )
 
@@ -224,24 +182,18 @@ class Navigator:
         check_same("backend", tree["backend"], self.backend)
         check_same("config", tree["config"], asdict(self.config))
         check_same("model", tree["model"], _fingerprint(self.model))
-        prior = None if tree["prior"] is None else PriorPose(**tree["prior"])
-        intake, fixes, recipe = Intake(self.config), FixQueue(), None
-        intake.rewind(tree["intake"])
-        fixes.rewind(tree["fixes"])
-        network = self._along_track()
-        network.rewind(tree["network"])
-        if tree["recipe"] is not None:
-            assert intake.start is not None  # there is no recipe without one
-            recipe = self._new_recipe(intake.start, prior)
-            recipe.load(tree["recipe"])
-        self.prior, self._intake, self._fixes, self._recipe = prior, intake, fixes, recipe
-        self._network = network
+        network = self._new_inference()
+        network.memory = tree["network"]
+        front_end, prior = tree["front end"], tree["prior"]
+        estimator: StreamEstimator | None = None
+        if tree["estimator"] is not None:
+            estimator = BACKENDS[self.backend].stream(self.config, front_end.start, prior)
+            estimator.state = tree["estimator"]
+        self.prior, self._fixes, self._front_end = prior, tree["fixes"], front_end
+        self._network, self._estimator = network, estimator
 
     def run(
-        self,
-        sequence: ImuSequence,
-        progress: Progress = lambda share: None,
-        fixes: Iterable[Fix] = (),
+        self, sequence: ImuSequence, progress: Progress = _silent, fixes: Iterable[Fix] = ()
     ) -> Track:
         """The fused track of a recording; its truth is never looked at.
 
@@ -250,8 +202,8 @@ class Navigator:
         Args:
             sequence: the recording.
             progress: called now and then with the share of the work done.
-            fixes: of position, heading or velocity, in any order; those outside the recording, or
-                without meaning, are refused and counted. The whole track is given in the world it
+            fixes: of position, yaw or velocity, in any order; those outside the recording, or
+                without meaning, are refused and counted. The whole track is given in the frame it
                 ends in.
 
         Raises:
@@ -259,135 +211,64 @@ class Navigator:
         """
         return self.track(self.observe(sequence, progress), progress, fixes)
 
-    def observe(self, sequence: ImuSequence, progress: Progress = lambda share: None) -> Observed:
+    def observe(self, sequence: ImuSequence, progress: Progress = _silent) -> PreprocessedRecording:
         """Prepare a recording and let the network see its windows.
 
         Raises:
             InputError: as for `run`.
         """
-        check_units(sequence)
-        began = perf_counter()
-        epochs, intake = all_epochs(sequence, self.config)
-        if intake.start is None or not any(e.window is not None for e in epochs):
-            raise InputError(
-                f"{sequence.name}: samples",
-                f"{intake.counts.used} usable over {sequence.duration:.2f} s",
-                f"an unbroken stretch of at least {WINDOW_SECONDS:g} s",
-            )
-        seconds_intake = perf_counter() - began
-        progress(0.1)
-        began = perf_counter()
-        measurements = self._measure(epochs, progress)
-        return Observed(epochs, measurements, intake, seconds_intake, perf_counter() - began)
+        return preprocess(sequence, self.model, self.config, progress)
 
     def track(
         self,
-        observed: Observed,
-        progress: Progress = lambda share: None,
+        preprocessed: PreprocessedRecording,
+        progress: Progress = _silent,
         fixes: Iterable[Fix] = (),
     ) -> Track:
         """The back end's track of a prepared recording; fixes as for `run`."""
-        began = perf_counter()
-        start = observed.intake.start
-        assert start is not None  # observe() refuses recordings without one
-        recipe = FilterRecipe(self.config, start, self.prior)
-        queue = FixQueue(fixes)
-        queue.start(start.time)
-        estimates, taken = [recipe.estimate()], []
-        clones: list[Estimate] = []
-        for k, (epoch, measurement) in enumerate(
-            zip(observed.epochs, observed.measurements, strict=True)
-        ):
-            due = queue.due(epoch.stop)
-            recipe.step(epoch, measurement, due)
-            estimates.append(recipe.estimate())
-            if recipe.oldest is not None and (not clones or recipe.oldest is not clones[-1]):
-                clones.append(recipe.oldest)
-            accepted = [fix for fix, _scale in recipe.accepted]
-            walked = measurement if recipe.held is None else None
-            taken.append(Taken(epoch, walked, accepted, recipe.held, recipe.segment))
-            if k % 500 == 0:
-                progress(0.6 + 0.4 * k / len(observed.epochs))
-        progress(1.0)
-        queue.refuse("after the end", len(queue.due(math.inf)))
-        changes, notes = recipe.world_changes, []
-        states: list[NavState] = []
-        if self.backend == "graph":
-            own, wide = recipe.filter_changes, nav_states(estimates)
-            filtered, expected = in_last_world(wide, own), recipe.expected_gyro_bias()
-            whole = smooth(filtered, wide[0], taken, own, self.config, expected)
-            notes, clones = [whole.note], []
-            states = [] if whole.fell_back else whole.states
-        if not states:
-            states = in_last_world(nav_states(estimates, recipe.gyro_prior), changes)
-        poses = smoothed_poses(clones, recipe.gyro_prior)
-        health = replace(recipe.health(observed.intake.counts, states[-1]), notes=notes)
-        track = track_from_states(
-            states,
-            recipe.innovations(),
-            _with_refused(health, queue),
-            seconds_network=observed.seconds_network,
-            seconds_filter=observed.seconds_intake + perf_counter() - began,
-        )
-        return replace(track, smoothed=smoothed_track(poses, changes))
+        backend = BACKENDS[self.backend]
+        return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 
-    def _measure(self, epochs: Sequence[Epoch], progress: Progress) -> list[Measurement | None]:
-        measurements: list[Measurement | None] = [None] * len(epochs)
-        network = self._along_track()
-        for part in _parts(epochs, unbroken=network.remembers):
-            if network.remembers and epochs[part[0]].gap:
-                network.restart()
-            known = [k for k in part if epochs[k].window is not None]
-            if not known:
-                continue
-            mean, covariance = network.predict(np.stack([_window(epochs[k]) for k in known]))
-            for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
-                measurements[k] = _measurement(epochs[k], d_N, cov_N)
-            progress(0.1 + 0.5 * (part[-1] + 1) / len(epochs))
-        return measurements
+    def _begin_stream(self) -> None:
+        self._front_end = FrontEnd(self.config)
+        self._estimator = None
+        self._network = self._new_inference()
 
-    def _along_track(self) -> AlongTrack:
-        return AlongTrack(self.model, self.config.filter.window_updates)
+    def _new_inference(self) -> StatefulInference:
+        return StatefulInference(self.model, self.config.filter.window_updates)
 
-    def _advance(self, epoch: Epoch) -> NavState:
-        if self._recipe is None:
+    def _advance(self, interval: ImuInterval) -> NavState:
+        if self._estimator is None:
             start = self._checked_start()
-            self._recipe = self._new_recipe(start, self.prior)
+            self._estimator = BACKENDS[self.backend].stream(self.config, start, self.prior)
             self._fixes.start(start.time)
-        measurement = None
-        if epoch.gap:
+        if interval.gap:
             self._network.restart()
-        if epoch.window is not None:
-            mean, covariance = self._network.predict(epoch.window[None])
-            measurement = _measurement(epoch, mean[0], covariance[0])
-        self._recipe.step(epoch, measurement, self._fixes.due(epoch.stop))
-        return self._recipe.state()
-
-    def _new_recipe(self, start: Start, prior: PriorPose | None) -> Any:
-        if self.backend == "graph":
-            return GraphRecipe(self.config, start, prior)
-        return FilterRecipe(self.config, start, prior, streaming=True)
+        displacement = None
+        if interval.window is not None:
+            (displacement,) = displacements_of(self._network, [interval])
+        self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
+        return self._estimator.nav_state()
 
     def _take(self, fix: Fix) -> None:
-        if self._recipe is None or fix.fault() or fix.time > self._recipe.time:
-            self._fixes.hold(fix)
-        elif not self._recipe.late_fix(fix):
+        if self._estimator is None or fix.fault() or fix.time > self._estimator.time:
+            self._fixes.add(fix)
+        elif self._estimator.late_fix(fix) is None:
             self._fixes.refuse("too late")
 
-    def _check_gyro(self, epoch: Epoch) -> None:
+    def _check_gyro(self, interval: ImuInterval) -> None:
         try:
-            self._intake.gyro_unit.look(epoch)
+            self._front_end.gyro_unit.look(interval)
         except InputError:
-            self._intake, self._recipe = Intake(self.config), None
-            self._network = self._along_track()
+            self._begin_stream()
             raise
 
     def _checked_start(self) -> Start:
         """A stream cannot be checked as a whole before it runs: its first second is."""
-        start = self._intake.start
-        assert start is not None  # set before the first epoch
+        start = self._front_end.start
+        assert start is not None  # set before the first interval
         if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-            self._intake = Intake(self.config)
+            self._begin_stream()
             raise InputError(
                 "accel",
                 f"an average of {start.force:.3g} over the first second",
@@ -397,46 +278,9 @@ class Navigator:
         return start
 
 
-def _parts(epochs: Sequence[Epoch], unbroken: bool) -> Iterator[range]:
-    """Runs of epochs whose windows the network sees at once; `unbroken` ones end at a gap."""
-    begin = windows = 0
-    for k, epoch in enumerate(epochs):
-        if windows == _BATCH or (unbroken and epoch.gap and k > begin):
-            yield range(begin, k)
-            begin, windows = k, 0
-        windows += epoch.window is not None
-    yield range(begin, len(epochs))
-
-
-def _with_refused(health: Health, queue: FixQueue) -> Health:
-    waiting = {"waiting": len(queue)} if len(queue) else {}
-    return replace(health, fixes=health.fixes | queue.refused | waiting)
-
-
-@runtime_checkable
-class _Continued(Protocol):
-    """A recipe that can be stopped and continued."""
-
-    def dump(self) -> dict[str, Any]: ...
-
-    def load(self, dump: dict[str, Any]) -> None: ...
-
-
 def _fingerprint(model: Predictor) -> str:
     """What tells a model's weights, empty where it has no card."""
     return str(getattr(getattr(model, "card", None), "sha256", ""))
-
-
-def _window(epoch: Epoch) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    assert epoch.window is not None  # only epochs that have one are asked
-    return epoch.window
-
-
-def _measurement(epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> Measurement:
-    """What the network says of a window, as far as it can be trusted."""
-    if epoch.suspect:
-        covariance_N = SUSPECT_SCALE * covariance_N
-    return d_N, floored(covariance_N, LEAST_SIGMA)
 
 
 def _seconds(time: float) -> float:

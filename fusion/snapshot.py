@@ -1,19 +1,22 @@
 """A stream stopped in one process and continued in another, as bytes without a pickle.
 
-Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON object in
-which `{"array": k}` stands for the member `a<k>`; not-a-number and infinity are written as NaN and
-Infinity. The object holds
+Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON value in
+which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
+`{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
+dictionary whose keys are no texts, and
+`{"is": name, "has": {...}}` for an object of one of the classes in `_CLASSES`; not-a-number and
+infinity are written as NaN and Infinity. The tree holds
 
-    format    "stario snapshot"
-    version   of this layout; another one is refused
-    backend   "ekf" or "graph"
-    config    the effective configuration, which must equal the restoring navigator's
-    model     checksum of the weights, likewise; empty for models without a card
-    prior     what was known of the first pose, or null
-    intake    samples, windows and counts (`Intake.checkpoint`)
-    network   what the network remembers of earlier windows, or null
-    fixes     those that wait, and counts of those refused
-    recipe    the estimator's state (its `dump`), or null before the first second is over
+    format     "stario snapshot"
+    version    of this layout; another one is refused
+    backend    "ekf" or "graph"
+    config     the effective configuration, which must equal the restoring navigator's
+    model      checksum of the weights, likewise; empty for models without a card
+    prior      what was known of the first pose, or null
+    front end  samples, windows and counts
+    network    what the network remembers of earlier windows, or null
+    fixes      those that wait, and counts of those refused
+    estimator  the back end's state, or null before the first second is over
 
 Arrays and numbers are kept to the last bit, so the continued stream gives the same states.
 """
@@ -23,40 +26,86 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections import deque
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 5
+FORMAT, VERSION = "stario snapshot", 6
+
+
+@cache
+def _classes() -> dict[str, type]:
+    """Every class that a snapshot may hold: plain data, made anew from its attributes."""
+    from stario.fusion import config, fixes
+    from stario.fusion.filter import (
+        ekf_state,
+        estimate,
+        estimator,
+        frame_transform,
+        initial,
+        innovations,
+        map_frame,
+        zero_velocity,
+    )
+    from stario.fusion.graph import builder, factors, fixed_lag, keyframes
+    from stario.fusion.imu import front_end, gyro_unit, intervals, outliers, preintegration
+    from stario.sequences import levelling, noise
+
+    classes: tuple[type, ...] = (
+        *(config.FilterConfig, config.GraphConfig, config.NavigatorConfig, noise.ImuNoise),
+        *(front_end.FrontEnd, gyro_unit.GyroUnitWatch, intervals.ImuInterval),
+        *(intervals.SampleCounts, intervals.Start, outliers.Flags, outliers.OutlierDetector),
+        *(levelling.LevelledAttitude, preintegration.Segment),
+        *(fixes.Fix, fixes.Accepted, fixes.FixQueue, initial.PriorPose),
+        *(ekf_state.EkfState, estimate.Estimate, estimator.EstimatorState, estimator.Step),
+        *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
+        *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
+        *(keyframes.KeyframeGraph, keyframes.Whitened, factors.KeyframeState),
+        *factors.KINDS,
+    )
+    return {each.__name__: each for each in classes}
 
 
 def pack(tree: dict[str, Any]) -> bytes:
-    """A tree of dictionaries, lists, arrays, numbers, text and None as bytes."""
-    arrays: list[np.ndarray[Any, Any]] = []
+    """A tree of dictionaries, sequences, arrays, numbers, text, None and known objects as bytes."""
+    # By identity: states share what did not change.
+    arrays: dict[int, tuple[int, np.ndarray[Any, Any]]] = {}
 
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            arrays.append(value)
-            return {"array": len(arrays) - 1}
+            k, _ = arrays.setdefault(id(value), (len(arrays), value))
+            return {"array": k}
         if isinstance(value, np.generic):
             return value.item()
-        if isinstance(value, dict):
-            return {str(key): plain(entry) for key, entry in value.items()}
-        if isinstance(value, (list, tuple)):
+        name = type(value).__name__
+        if name in _classes():
+            has = value._asdict() if hasattr(value, "_asdict") else value.__getstate__()
+            return {"is": name, "has": {key: plain(entry) for key, entry in has.items()}}
+        if isinstance(value, deque):
+            return {"deque": [plain(entry) for entry in value], "maxlen": value.maxlen}
+        if isinstance(value, tuple):
+            return {"tuple": [plain(entry) for entry in value]}
+        if isinstance(value, list):
             return [plain(entry) for entry in value]
+        if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+            return {key: plain(entry) for key, entry in value.items()}
+        if isinstance(value, dict):
+            return {"map": [[plain(key), plain(entry)] for key, entry in value.items()]}
         return value
 
     text = json.dumps(plain({"format": FORMAT, "version": VERSION, **tree}))
-    members = {f"a{k}": array for k, array in enumerate(arrays)}
+    members = {f"a{k}": array for k, array in arrays.values()}
     file = io.BytesIO()
     np.savez(file, tree=np.frombuffer(text.encode(), dtype=np.uint8), **members)  # type: ignore[arg-type]
     return file.getvalue()
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The tree that `pack` was given; tuples have become lists.
+    """The tree that `pack` was given.
 
     Raises:
         InputError: the bytes are no snapshot, or one of another version.
@@ -69,23 +118,42 @@ def unpack(data: bytes) -> dict[str, Any]:
         tree = json.loads(arrays["tree"].tobytes().decode())
         if tree["format"] != FORMAT:
             raise ValueError(f"the format {tree['format']!r}")
+        if tree["version"] != VERSION:
+            raise InputError("snapshot: version", repr(tree["version"]), str(VERSION))
+        return {key: _whole(value, arrays) for key, value in tree.items()}
+    except InputError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("snapshot", found, f"bytes of a {FORMAT}, whole") from error
-    if tree["version"] != VERSION:
-        raise InputError("snapshot: version", repr(tree["version"]), str(VERSION))
 
-    def whole(value: Any) -> Any:
-        if isinstance(value, dict):
-            if value.keys() == {"array"}:
-                return arrays[f"a{value['array']}"]
-            return {key: whole(entry) for key, entry in value.items()}
-        if isinstance(value, list):
-            return [whole(entry) for entry in value]
+
+def _whole(value: Any, arrays: dict[str, Any]) -> Any:
+    if isinstance(value, list):
+        return [_whole(entry, arrays) for entry in value]
+    if not isinstance(value, dict):
         return value
+    match value:
+        case {"array": k}:
+            return arrays[f"a{k}"]
+        case {"is": name, "has": has}:
+            return _rebuilt(_classes()[name], {k: _whole(v, arrays) for k, v in has.items()})
+        case {"deque": entries, "maxlen": most}:
+            return deque((_whole(entry, arrays) for entry in entries), maxlen=most)
+        case {"tuple": entries}:
+            return tuple(_whole(entry, arrays) for entry in entries)
+        case {"map": entries}:
+            return {_whole(key, arrays): _whole(entry, arrays) for key, entry in entries}
+    return {key: _whole(entry, arrays) for key, entry in value.items()}
 
-    result: dict[str, Any] = whole(tree)
-    return result
+
+def _rebuilt(kind: type, has: dict[str, Any]) -> Any:
+    if issubclass(kind, tuple):
+        return kind(**has)
+    new = kind.__new__(kind)
+    put = getattr(new, "__setstate__", vars(new).update)
+    put(has)
+    return new
 
 
 def check_same(name: str, found: object, expected: object) -> None:

@@ -37,7 +37,7 @@ class NavState:
     b_a: FloatArray
     covariance: FloatArray
     in_gap: bool = False
-    world: int = 0
+    map_frame: int = 0
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -65,7 +65,7 @@ class SmoothedPose:
     R_WB: FloatArray
     p_W: FloatArray
     covariance: FloatArray
-    world: int = 0
+    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Health:
         mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
         fixes: absolute fixes applied (of these gated), and left out by reason.
-        rests: measurements of rest (one per state at rest) applied, and left out by reason.
+        zero_velocity: measurements of rest (one per state at rest) applied, and left out by reason.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.
@@ -120,7 +120,7 @@ class Health:
     mean_nis: float = float("nan")
     nis_expected: int = 3
     fixes: dict[str, int] = field(default_factory=dict)
-    rests: dict[str, int] = field(default_factory=dict)
+    zero_velocity: dict[str, int] = field(default_factory=dict)
     final_sigma: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -138,8 +138,8 @@ class Health:
         )
         if self.fixes:
             text.append(f"fixes {_counted(self.fixes)}")
-        if self.rests:
-            text.append(f"at rest {_counted(self.rests)}")
+        if self.zero_velocity:
+            text.append(f"at rest {_counted(self.zero_velocity)}")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}", *self.notes]
 
@@ -204,8 +204,9 @@ def track_from_states(
     states: list[NavState],
     innovations: Innovations,
     health: Health,
-    seconds_network: float,
-    seconds_filter: float,
+    smoothed: Trajectory | None = None,
+    seconds_network: float = 0.0,
+    seconds_filter: float = 0.0,
 ) -> Track:
     """Stack states into a track; the first state behind a gap is marked not valid."""
     covariance = np.array([s.covariance for s in states])
@@ -224,6 +225,7 @@ def track_from_states(
         covariance=covariance,
         innovations=innovations,
         health=health,
+        smoothed=smoothed,
         seconds_network=seconds_network,
         seconds_filter=seconds_filter,
     )

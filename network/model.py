@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors
@@ -51,7 +50,7 @@ class DisplacementModel:
         """
         return self._engine.training_form
 
-    def along_track(self, updates: int = 1) -> DisplacementModel | TrackModel:
+    def stateful_inference(self, updates: int = 1) -> DisplacementModel | StatefulModel:
         """What predicts the windows of one unbroken track, in the order of time.
 
         Args:
@@ -59,9 +58,9 @@ class DisplacementModel:
                 before it.
 
         Returns:
-            The model itself, or a `TrackModel` if the network remembers earlier windows.
+            The model itself, or a `StatefulModel` if the network remembers earlier windows.
         """
-        return TrackModel(self, updates) if self._engine.remembers else self
+        return StatefulModel(self, updates) if self._engine.remembers else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Displacement over each window, from its start to one second later.
@@ -117,39 +116,39 @@ class DisplacementModel:
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
-class TrackModel:
+Memory = tuple[int, tuple[NDArray[np.float32] | None, ...]]
+"""Of a network along a track: windows so far, and what each series of them left."""
+
+
+class StatefulModel:
     """A model whose network remembers earlier windows, along one track.
 
     Args:
         model: whose network remembers.
         updates: windows that begin within the length of one; each such series of windows, one
             second apart, has a memory of its own, as in training.
+
+    Attributes:
+        memory: how many windows there were, and what each series remembers; may be put back.
     """
 
     def __init__(self, model: DisplacementModel, updates: int) -> None:
         self._model = model
-        self._states: list[NDArray[np.float32] | None] = [None] * updates
-        self._count = 0
+        self.memory: Memory = (0, (None,) * updates)
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The track's next windows; arguments, results and errors as of `DisplacementModel`."""
         batch = _checked_windows(windows)
         mean, covariance = np.zeros((len(batch), 3)), np.zeros((len(batch), 3, 3))
+        count, (*states,) = self.memory
         for k in range(len(batch)):
-            series = self._count % len(self._states)
-            mean[k : k + 1], covariance[k : k + 1], self._states[series] = (
-                self._model.predict_after(batch[k : k + 1], self._states[series])
+            series = count % len(states)
+            mean[k : k + 1], covariance[k : k + 1], states[series] = self._model.predict_after(
+                batch[k : k + 1], states[series]
             )
-            self._count += 1
+            count += 1
+        self.memory = count, tuple(states)
         return mean, covariance
-
-    def checkpoint(self) -> dict[str, Any]:
-        """What is remembered, as plain values and arrays."""
-        return {"count": self._count, "states": list(self._states)}
-
-    def rewind(self, memory: dict[str, Any]) -> None:
-        """Take up what `checkpoint` gave."""
-        self._count, self._states = int(memory["count"]), list(memory["states"])
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:

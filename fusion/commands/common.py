@@ -18,7 +18,7 @@ from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
-    from stario.fusion.navigator import Progress
+    from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
     from stario.sequences.batch import Skipped
     from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -31,7 +31,7 @@ FixesOption = Annotated[
     Path | None,
     typer.Option(
         "--fixes",
-        help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or heading.",
+        help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or yaw.",
     ),
 ]
 JobsOption = Annotated[

@@ -44,7 +44,7 @@ def compare(
     from stario.fusion.evaluation.compare import compare as compare_tracks
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import comparison_dict, write_comparison
-    from stario.fusion.fixes import read_fixes
+    from stario.fusion.fix_file import read_fixes
     from stario.sequences.readers.checked import optional_package
 
     if report:

@@ -42,7 +42,7 @@ def run(
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
     from stario.fusion.evaluation.many import distinct_name
-    from stario.fusion.fixes import read_fixes
+    from stario.fusion.fix_file import read_fixes
     from stario.fusion.navigator import Navigator
     from stario.sequences.batch import Skipped, each
     from stario.sequences.readers.checked import optional_package
@@ -84,7 +84,7 @@ def _run(
     """Write one recording's track, tell of it on stdout, return its record for programs."""
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
     from stario.fusion.evaluation.results import write_run
-    from stario.fusion.fixes import check_within
+    from stario.fusion.fix_file import check_within
     from stario.sequences.metrics import align
 
     check_within(fixes, sequence)

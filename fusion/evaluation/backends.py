@@ -12,8 +12,11 @@ from numpy.typing import ArrayLike
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.faults import with_true_displacements
-from stario.fusion.graph.fixed_lag import GraphRecipe
-from stario.fusion.navigator import Navigator, Observed, Predictor
+from stario.fusion.filter.innovations import stacked
+from stario.fusion.graph.fixed_lag import FixedLagEstimator
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track, track_from_states
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import evaluate_track, position_nees
@@ -72,9 +75,9 @@ def score_walk(seed: int, seconds: float) -> Score:
     config = NavigatorConfig(noise=errors.noise, filter=known)
     walk = generate_walk(seed, seconds)
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
-    observed = Navigator(_Silent(), config).observe(sequence)
-    observed = with_true_displacements(observed, walk, config, seed, DISPLACEMENT_NOISE)
-    return _scored(sequence.name, observed, walk, config)
+    preprocessed = Navigator(_Silent(), config).observe(sequence)
+    preprocessed = with_true_displacements(preprocessed, walk, config, seed, DISPLACEMENT_NOISE)
+    return _scored(sequence.name, preprocessed, walk, config)
 
 
 def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> Score:
@@ -85,8 +88,8 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
-    observed = Navigator(model, config).observe(sequence)
-    return _scored(sequence.name, observed, sequence.truth, config)
+    preprocessed = Navigator(model, config).observe(sequence)
+    return _scored(sequence.name, preprocessed, sequence.truth, config)
 
 
 def summary(scores: Sequence[Score]) -> dict[str, object]:
@@ -143,17 +146,19 @@ def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
     return mean, mean * logs.std(axis=0) / math.sqrt(max(len(logs) - 1, 1))
 
 
-def _scored(name: str, observed: Observed, truth: Trajectory, config: NavigatorConfig) -> Score:
+def _scored(
+    name: str, preprocessed: PreprocessedRecording, truth: Trajectory, config: NavigatorConfig
+) -> Score:
     model = _Silent()
     tracks: dict[str, Track] = {}
     seconds: dict[str, float] = {}
     began = process_time()
-    tracks["ekf"] = Navigator(model, config).track(observed)
+    tracks["ekf"] = Navigator(model, config).track(preprocessed)
     seconds["ekf"] = process_time() - began
     began = process_time()
-    tracks["graph"] = Navigator(model, config, backend="graph").track(observed)
+    tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed)
     seconds["graph"] = process_time() - began
-    tracks["fixed_lag"], times = _streamed(observed, config)
+    tracks["fixed_lag"], times = _streamed(preprocessed, config)
     seconds["fixed_lag"] = float(times.sum())
     duration = float(tracks["ekf"].time[-1] - tracks["ekf"].time[0])
     return Score(
@@ -166,20 +171,23 @@ def _scored(name: str, observed: Observed, truth: Trajectory, config: NavigatorC
     )
 
 
-def _streamed(observed: Observed, config: NavigatorConfig) -> tuple[Track, FloatArray]:
+def _streamed(
+    preprocessed: PreprocessedRecording, config: NavigatorConfig
+) -> tuple[Track, FloatArray]:
     """The newest states of the fixed-lag graph, and the processor time of each step [s]."""
-    start = observed.intake.start
+    start = preprocessed.front_end.start
     assert start is not None  # observe() refuses recordings without one
-    recipe = GraphRecipe(config, start)
-    states, times = [recipe.state()], []
-    for epoch, measurement in zip(observed.epochs, observed.measurements, strict=True):
+    estimator = FixedLagEstimator(config, start)
+    states, times = [estimator.nav_state()], []
+    for interval, measurement in zip(
+        preprocessed.intervals, preprocessed.measurements, strict=True
+    ):
         began = process_time()
-        recipe.step(epoch, measurement)
-        states.append(recipe.state())
+        estimator.step(interval, measurement)
+        states.append(estimator.nav_state())
         times.append(process_time() - began)
-    health = recipe.health(observed.intake.counts)
-    track = track_from_states(states, recipe.innovations(), health, 0.0, 0.0)
-    return track, np.array(times)
+    health = estimator.health(preprocessed.front_end.counts)
+    return track_from_states(states, stacked([]), health), np.array(times)
 
 
 def _table(scores: Sequence[Score], by: Callable[[Score], dict[str, float]]) -> FloatArray:

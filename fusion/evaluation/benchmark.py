@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.error_state import CORE
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.jacobians import Block
-from stario.fusion.imu.preintegration import CORE, Segment, preintegrate
+from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import FloatArray
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -22,10 +23,11 @@ from stario.sequences.sequence import STANDARD_GRAVITY
 class DenseEkf(StateCloningEkf):
     """The same filter through filterpy's own `predict` and `update` on the full matrices."""
 
-    def _propagate_covariance(self, transition: FloatArray, noise: FloatArray) -> None:
+    def _propagated(self, P: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
         self.F[:CORE, :CORE] = transition
         self.Q[:CORE, :CORE] = noise
         self.predict()
+        return self.P
 
     def _correct(
         self,
@@ -119,10 +121,10 @@ class _SwayingDevice:
         zero = np.zeros(3)
         ekf.initialise(0.0, np.eye(3), zero, zero, zero, zero, np.eye(CORE) * 1e-4)
         covariance = np.eye(3) * 0.01 * self.per_window
-        held = [ekf.clone(0.0)]
+        held = [ekf.clone()]
         for k, displacement in enumerate(self.displacements):
-            ekf.propagate(self._segment(k * self.per_segment, ekf.b_g, ekf.b_a))
-            held.append(ekf.clone(ekf.time))
+            ekf.propagate(self._segment(k * self.per_segment, ekf.state.b_g, ekf.state.b_a))
+            held.append(ekf.clone())
             if len(held) > self.per_window:
                 ekf.update_displacement(held[0], held[-1], displacement, covariance, gate=16.3)
                 ekf.release(held.pop(0))

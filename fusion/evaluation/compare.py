@@ -12,8 +12,11 @@ from stario.fusion.evaluation.tracks import (
     network_track,
     network_track_true_attitude,
 )
-from stario.fusion.fixes import Fix, check_within
-from stario.fusion.navigator import Navigator, Predictor, Progress
+from stario.fusion.fix_file import check_within
+from stario.fusion.fixes import Fix
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.recording import Progress
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import CONVENTIONS, Alignment, align, evaluate_track, position_nees
@@ -121,18 +124,18 @@ def compare(
     """
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
-    observed = navigator.observe(sequence, progress)
+    preprocessed = navigator.observe(sequence, progress)
     tracks = {
-        "inertial": inertial_track(observed, config),
-        "network": network_track(observed),
+        "inertial": inertial_track(preprocessed, config),
+        "network": network_track(preprocessed),
     }
     if sequence.truth is not None:
         try:
             tracks["network_true_attitude"] = network_track_true_attitude(model, sequence, config)
         except InputError as error:
             log.warning("no track with true attitude: %s", error)
-    tracks["ekf"] = navigator.track(observed, progress, fixes)
-    tracks["graph"] = Navigator(model, config, backend="graph").track(observed, fixes=fixes)
+    tracks["ekf"] = navigator.track(preprocessed, progress, fixes)
+    tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed, fixes=fixes)
     alignment = alignment_with(fixes)
     metrics = {name: measure(track, sequence.truth, alignment) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics, alignment)

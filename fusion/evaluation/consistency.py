@@ -17,12 +17,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimate import Settled, settled
-from stario.fusion.filter.estimator import FilterRecipe, Measurement, PriorPose, yaw_between
-from stario.fusion.imu.front_end import all_epochs
-from stario.fusion.imu.intervals import Epoch
-from stario.fusion.imu.preintegration import CORE
+from stario.fusion.error_state import CORE
+from stario.fusion.filter.estimate import Moments, moments
+from stario.fusion.filter.estimator import Displacement, Estimator
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray, exp_so3, log_se23
+from stario.fusion.yaw import yaw_rotation
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
@@ -202,17 +204,17 @@ def _run(
     gyro = walk.gyro + b_g + noise.gyro_noise * white * rng.normal(size=b_g.shape)
     accel = walk.accel + b_a + noise.accel_noise * white * rng.normal(size=b_a.shape)
 
-    epochs, intake = all_epochs(ImuSequence("walk", walk.time, gyro, accel), config)
-    assert intake.start is not None  # two seconds are enough
-    recipe = FilterRecipe(config, intake.start, prior)
+    intervals, front_end = cut_recording(ImuSequence("walk", walk.time, gyro, accel), config)
+    assert front_end.start is not None  # two seconds are enough
+    estimator = Estimator(config, front_end.start, prior)
     rows = []
-    for count, epoch in enumerate(epochs, 1):
-        recipe.step(epoch, _seen(walk, epoch, config, rng))
+    for count, interval in enumerate(intervals, 1):
+        estimator.step(interval, _seen(walk, interval, config, rng))
         if count % config.filter.output_rate == 0:
-            k = round(epoch.stop * RATE)
-            now = settled([recipe.estimate()], recipe.gyro_prior)
+            k = round(interval.stop * RATE)
+            now = moments([estimator.estimate()], estimator.gyro_prior)
             rows.append(_errors(now, walk, k, b_g[k], b_a[k]))
-    return np.array(rows), float(recipe.innovations().nis.mean())
+    return np.array(rows), float(estimator.innovations().nis.mean())
 
 
 def _first_errors(
@@ -239,21 +241,23 @@ def _first_errors(
 
 
 def _seen(
-    walk: AnalyticWalk, epoch: Epoch, config: NavigatorConfig, rng: np.random.Generator
-) -> Measurement | None:
-    """The displacement of the epoch's window in its levelled frame, as wrong as its covariance."""
-    if epoch.window is None:
+    walk: AnalyticWalk, interval: ImuInterval, config: NavigatorConfig, rng: np.random.Generator
+) -> Displacement | None:
+    """The displacement of a window in its levelled frame, as wrong as its covariance says."""
+    if interval.R_NB_window is None:
         return None
-    stop = round(epoch.stop * RATE)
+    stop = round(interval.stop * RATE)
     start = stop - round(WINDOW_SECONDS * RATE)
-    d_N = yaw_between(walk.R_WB[start], epoch.R_NB_window).T @ (walk.p_W[stop] - walk.p_W[start])
+    d_N = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T).T @ (
+        walk.p_W[stop] - walk.p_W[start]
+    )
     # The filter takes overlapping windows for less certain than each one is.
     sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
     return d_N + sigma * rng.normal(size=3), _DISPLACEMENT_SIGMA**2 * np.eye(3)
 
 
 def _errors(
-    now: Settled, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
+    now: Moments, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
 ) -> tuple[float, float, float]:
     X, P = now.X[0], now.P[0]
     R = walk.R_WB[k] @ X[:, :3].T

@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.navigator import Backend, Navigator, Observed, Predictor
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Health, Track
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import align, evaluate_track
@@ -120,7 +123,7 @@ def run_faults(
     config: NavigatorConfig,
     model: Predictor | None = None,
     seed: int = 0,
-    backends: Sequence[Backend] = get_args(Backend),
+    backends: Sequence[BackendName] = get_args(BackendName),
     only: Sequence[Fault] | None = None,
 ) -> list[FaultResult]:
     """Run a recording with each fault through each back end.
@@ -175,17 +178,17 @@ def _run(
     config: NavigatorConfig,
     model: Predictor | None,
     seed: int,
-    backend: Backend,
+    backend: BackendName,
 ) -> Track:
     rng = np.random.default_rng(seed)
     spoilt = sequence if fault.spoil is None else fault.spoil(sequence, rng)
     navigator = Navigator(model or _Silent(), config, backend=backend)
-    observed = navigator.observe(spoilt)
+    preprocessed = navigator.observe(spoilt)
     if model is None and sequence.truth is not None:
-        observed = with_true_displacements(observed, sequence.truth, config, seed)
+        preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
     if fault.corrupt is not None:
-        observed = _corrupted(observed, fault.corrupt, rng)
-    return navigator.track(observed)
+        preprocessed = _corrupted(preprocessed, fault.corrupt, rng)
+    return navigator.track(preprocessed)
 
 
 class _Silent:
@@ -197,51 +200,55 @@ class _Silent:
 
 
 def with_true_displacements(
-    observed: Observed,
+    preprocessed: PreprocessedRecording,
     truth: Trajectory,
     config: NavigatorConfig,
     seed: int,
     noise: float = WHITE_NOISE,
-) -> Observed:
+) -> PreprocessedRecording:
     """A prepared recording measured by its true displacements under white noise.
 
     Like a network's they are given in each window's frame, off by the yaw of the attitude the
     window was prepared with, and with the covariance that the filter then takes at its word.
 
     Args:
-        observed: the prepared recording.
+        preprocessed: the prepared recording.
         truth: of its poses.
         config: of the navigator.
         seed: of the noise; a window draws the same one whatever happened before it.
         noise: per axis [m].
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
-    known = [k for k, epoch in enumerate(observed.epochs) if epoch.window is not None]
-    epochs = [observed.epochs[k] for k in known]
-    stop = np.array([epoch.stop for epoch in epochs])
+    known = [k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None]
+    intervals = [preprocessed.intervals[k] for k in known]
+    stop = np.array([interval.stop for interval in intervals])
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
-    seen = [epoch.R_NB_window for epoch in epochs if epoch.R_NB_window is not None]
+    seen = [interval.R_NB_window for interval in intervals if interval.R_NB_window is not None]
     R_NB = Rotation.from_matrix(np.stack(seen))
     turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
     displacement_N = turn.apply(last.position_W - first.position_W)
-    measurements = list(observed.measurements)
+    measurements = list(preprocessed.measurements)
     for k, d_N, time in zip(known, displacement_N, stop - truth.time[0], strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
         measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
-    return replace(observed, measurements=measurements)
+    return replace(preprocessed, measurements=measurements)
 
 
-def _corrupted(observed: Observed, corrupt: Corrupt, rng: np.random.Generator) -> Observed:
+def _corrupted(
+    preprocessed: PreprocessedRecording, corrupt: Corrupt, rng: np.random.Generator
+) -> PreprocessedRecording:
     """What the fault makes of the measurements, all of them at once."""
-    known = [k for k, measurement in enumerate(observed.measurements) if measurement is not None]
-    pairs = [measurement for measurement in observed.measurements if measurement is not None]
+    known = [
+        k for k, measurement in enumerate(preprocessed.measurements) if measurement is not None
+    ]
+    pairs = [measurement for measurement in preprocessed.measurements if measurement is not None]
     mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
     corrupt((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
-    measurements = list(observed.measurements)
+    measurements = list(preprocessed.measurements)
     for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
         measurements[k] = (d_N, cov_N)
-    return replace(observed, measurements=measurements)
+    return replace(preprocessed, measurements=measurements)
 
 
 def _result(

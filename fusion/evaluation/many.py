@@ -11,7 +11,8 @@ from pathlib import Path
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare
 from stario.fusion.fixes import Fix
-from stario.fusion.navigator import Predictor, Progress
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.recording import Progress
 from stario.network.model import DisplacementModel, load_model
 from stario.sequences.batch import Skipped, each
 from stario.sequences.errors import InputError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.evaluation.prepared import Prepared
-from stario.fusion.imu.stateful import AlongTrack, Predictor
+from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -52,7 +52,7 @@ def answers(model: Predictor, prepared: Prepared) -> list[Answers]:
         model: may remember; its memory begins anew at every piece.
         prepared: the recording.
     """
-    network = AlongTrack(model, UPDATES)
+    network = StatefulInference(model, UPDATES)
     found = []
     for piece in prepared.pieces:
         network.restart()
@@ -60,7 +60,7 @@ def answers(model: Predictor, prepared: Prepared) -> list[Answers]:
     return found
 
 
-def _along(network: AlongTrack, stream: LevelledStream) -> Answers:
+def _along(network: StatefulInference, stream: LevelledStream) -> Answers:
     windows = stream.windows()
     parts = [
         network.predict(windows[first : first + _BATCH]) for first in range(0, len(windows), _BATCH)

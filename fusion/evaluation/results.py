@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, Metrics
 from stario.fusion.evaluation.summary import Scores, scores_of
-from stario.fusion.navigator import Backend
 from stario.fusion.state import Innovations, Track
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
@@ -26,7 +26,7 @@ def write_run(
     metrics: Metrics,
     words: dict[str, str],
     config: NavigatorConfig,
-    backend: Backend = "ekf",
+    backend: BackendName = "ekf",
 ) -> list[Path]:
     """Write one fused track; returns the files.
 
@@ -152,7 +152,7 @@ def _figures(
             3,
             filtered.gated,
             title=f"{name}: innovations",
-            unit="m" if config.filter.measurement == "displacement" else "m/s",
+            unit="m",
         )
     for file, figure in figures.items():
         save_figure(figure, folder / file)

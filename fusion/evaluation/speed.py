@@ -33,12 +33,12 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
     runs: dict[str, list[float]] = {"run": [], "run_network": [], "filter_20_hz": []}
     default = Navigator(model, NavigatorConfig())
     fast = Navigator(model, NavigatorConfig(filter=FilterConfig(update_rate=20)))
-    observed = fast.observe(sequence)
+    preprocessed = fast.observe(sequence)
     for _ in range(_RUNS):
         seconds, track = _timed(lambda: default.run(sequence))
         runs["run"].append(seconds / minutes)
         runs["run_network"].append(track.seconds_network / minutes)
-        seconds, _track = _timed(lambda: fast.track(observed))
+        seconds, _track = _timed(lambda: fast.track(preprocessed))
         runs["filter_20_hz"].append(seconds / minutes)
     medians = {name: float(np.median(values)) for name, values in runs.items()}
     return {

@@ -267,7 +267,7 @@ def _of_protocols(
     model: DisplacementModel, sequence: ImuSequence, config: NavigatorConfig
 ) -> Iterator[tuple[str, Trajectory]]:
     navigator = Navigator(model, config)
-    observed = navigator.observe(sequence)
+    preprocessed = navigator.observe(sequence)
     yield "network_true_attitude", network_track_true_attitude(model, sequence, config).trajectory
-    yield "network", network_track(observed).trajectory
-    yield "ekf", navigator.track(observed).trajectory
+    yield "network", network_track(preprocessed).trajectory
+    yield "ekf", navigator.track(preprocessed).trajectory

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.preintegration import preintegrate
-from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.lie import exp_so3
-from stario.fusion.navigator import Observed, Predictor
+from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -29,23 +29,29 @@ from stario.sequences.windows import (
 )
 
 
-def inertial_track(observed: Observed, config: NavigatorConfig) -> Track:
+def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
     """Strapdown integration alone, from the levelled start at rest, biases taken as zero."""
     began = perf_counter()
-    start = observed.intake.start
+    start = preprocessed.front_end.start
     assert start is not None  # observe() refuses recordings without one
     zero = np.zeros(3)
     R, v, p = start.R_WB, zero, zero
     rows = [(start.time, R, v, p)]
-    for epoch in observed.epochs:
-        if epoch.gap:
-            p = p + v * (epoch.stop - epoch.start)
+    for interval in preprocessed.intervals:
+        if interval.gap:
+            p = p + v * (interval.stop - interval.start)
         else:
             segment = preintegrate(
-                epoch.time, epoch.gyro, epoch.accel, zero, zero, config.noise, config.gravity
+                interval.time,
+                interval.gyro,
+                interval.accel,
+                zero,
+                zero,
+                config.noise,
+                config.gravity,
             )
             R, v, p = segment.predict(R, v, p, zero, zero)
-        rows.append((epoch.stop, R, v, p))
+        rows.append((interval.stop, R, v, p))
     trajectory = Trajectory(
         time=np.array([row[0] for row in rows]),
         position_W=np.array([row[3] for row in rows]),
@@ -55,21 +61,25 @@ def inertial_track(observed: Observed, config: NavigatorConfig) -> Track:
     return Track(trajectory, seconds_filter=perf_counter() - began)
 
 
-def network_track(observed: Observed) -> Track:
+def network_track(preprocessed: PreprocessedRecording) -> Track:
     """Displacements chained along the attitude that is levelled from the IMU, without truth."""
     began = perf_counter()
-    start = observed.intake.start
+    start = preprocessed.front_end.start
     assert start is not None  # observe() refuses recordings without one
-    time = np.array([start.time, *(e.stop for e in observed.epochs)])
-    attitude = np.stack([start.R_WB, *(e.R_NB for e in observed.epochs)])
-    known = [(e, m[0]) for e, m in zip(observed.epochs, observed.measurements, strict=True) if m]
+    time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
+    attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
+    known = [
+        (e, m[0])
+        for e, m in zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+        if m
+    ]
     middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in known])
     velocity = np.array([d for _, d in known]) / WINDOW_SECONDS
     trajectory = _chained(time, Rotation.from_matrix(attitude), middle, velocity)
     return Track(
         trajectory,
-        seconds_network=observed.seconds_network,
-        seconds_filter=observed.seconds_intake + perf_counter() - began,
+        seconds_network=preprocessed.seconds_network,
+        seconds_filter=preprocessed.seconds_front_end + perf_counter() - began,
     )
 
 
@@ -110,7 +120,7 @@ def _along(
     updates: int,
 ) -> FloatArray:
     """Displacements (M, 3) of windows that start at `time` (M,), a memory ending at each gap."""
-    network = AlongTrack(model, updates)
+    network = StatefulInference(model, updates)
     if not network.remembers:
         return network.predict(windows)[0]
     displacements = []

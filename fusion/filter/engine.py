@@ -1,8 +1,9 @@
-"""Structured algebra on filterpy's `ExtendedKalmanFilter`: an error state, updated in place.
+"""Structured algebra on filterpy's `ExtendedKalmanFilter` for an error state.
 
 filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
-`benchmark.DenseEkf` runs filterpy's own algebra for comparison.
+`benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never changed in
+place: whoever holds an earlier one may go back to it.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
+from stario.fusion.error_state import CORE
 from stario.fusion.filter.jacobians import Block
-from stario.fusion.imu.preintegration import CORE
 from stario.fusion.lie import FloatArray
 
 GateMode = Literal["inflate", "reject"]
@@ -61,7 +62,6 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
     """
 
     def __init__(self, dim: int) -> None:
-        self._last_downdate: FloatArray | None = None
         super().__init__(dim_x=dim, dim_z=3)
         self.P = np.zeros((dim, dim))
         self.Q = np.zeros((dim, dim))
@@ -117,23 +117,10 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         """Move the error's mean `x` into the state and set it to zero."""
         raise NotImplementedError
 
-    # --- filterpy's record of the last step ------------------------------------------------------
-
-    @property
-    def P_prior(self) -> FloatArray:
-        """Covariance before the last update; computed when asked, for a copy per step is dear."""
-        if self._last_downdate is None:
-            return np.array(self.P)
-        return np.asarray(self.P + self._last_downdate.T @ self._last_downdate)
-
-    @P_prior.setter
-    def P_prior(self, value: FloatArray) -> None:  # filterpy assigns it
-        pass
-
     @property
     def P_post(self) -> FloatArray:
         """Covariance after the last step."""
-        return np.array(self.P)
+        return self.P
 
     @P_post.setter
     def P_post(self, value: FloatArray) -> None:  # filterpy assigns it
@@ -141,13 +128,13 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     # --- structured algebra ----------------------------------------------------------------------
 
-    def _propagate_covariance(self, transition: FloatArray, noise: FloatArray) -> None:
-        P = self.P
+    def _propagated(self, P: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
+        P = P.copy()
         P[:CORE] = transition @ P[:CORE]
         P[CORE:, :CORE] = P[:CORE, CORE:].T
         core = P[:CORE, :CORE] @ transition.T + noise
         P[:CORE, :CORE] = 0.5 * (core + core.T)
-        self._last_downdate = None
+        return P
 
     def _correct(
         self,
@@ -165,13 +152,12 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.K = (whitener.T @ W).T
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
-        self.x_post = self.x
+        self.x_post, self.P_prior = self.x, self.P
         if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
             self._correct_as_joseph(blocks)
         else:
-            # P is symmetric: its transpose is the same matrix in the order BLAS updates in place.
-            self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1, overwrite_c=1).T
-        self._last_downdate = W
+            # P is symmetric: its transpose is the same matrix in the order of BLAS.
+            self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
         self._log_likelihood = self._likelihood = self._mahalanobis = None
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:

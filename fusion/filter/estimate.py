@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stario.fusion.error_state import plain_covariance
 from stario.fusion.filter.gyro_prior import GyroPrior
-from stario.fusion.filter.jacobians import in_plain_terms
 from stario.fusion.lie import FloatArray, exp_times
 from stario.fusion.state import NavState, SmoothedPose
 
@@ -49,10 +49,10 @@ class Estimate:
     P_g: FloatArray
     P_gg: FloatArray
     in_gap: bool = False
-    world: int = 0
+    map_frame: int = 0
 
 
-class Settled(NamedTuple):
+class Moments(NamedTuple):
     """N estimates by both priors; the names are those of `Estimate`."""
 
     X: FloatArray
@@ -63,26 +63,26 @@ class Settled(NamedTuple):
     @property
     def plain_covariance(self) -> FloatArray:
         """(N, n, n) of errors about the world's axes, each true minus estimate."""
-        return in_plain_terms(self.P, self.X[:, :, 3:].transpose(0, 2, 1))
+        return plain_covariance(self.P, self.X[:, :, 3:].transpose(0, 2, 1))
 
 
-def settled(estimates: Sequence[Estimate], prior: GyroPrior | None) -> Settled:
+def moments(estimates: Sequence[Estimate], prior: GyroPrior | None) -> Moments:
     """Estimates by both of the gyroscope's priors; None leaves them to the wide one."""
     X, b_g, b_a, P, P_g, P_gg = (
         np.array([getattr(e, name) for e in estimates])
         for name in ("X", "b_g", "b_a", "P", "P_g", "P_gg")
     )
     time = np.array([e.time for e in estimates])
-    belief = None if prior is None else prior.believe(time, b_g, P_gg)
-    if belief is None:
-        return Settled(X, b_g, b_a, P)
-    dx, P = belief.settle(P, P_g)
+    posterior = None if prior is None else prior.posterior(time, b_g, P_gg)
+    if posterior is None:
+        return Moments(X, b_g, b_a, P)
+    dx, P = posterior.moments(P, P_g)
     first = X.shape[2] * 3 - 6  # theta and a rho for each vector come before the biases
     rho = dx[:, 3:first].reshape(len(X), -1, 3).transpose(0, 2, 1)
     X = exp_times(dx[:, :3], rho, X)
     if dx.shape[1] > first:
         b_g, b_a = b_g + dx[:, first : first + 3], b_a + dx[:, first + 3 :]
-    return Settled(X, b_g, b_a, P)
+    return Moments(X, b_g, b_a, P)
 
 
 def nav_states(estimates: Sequence[Estimate], prior: GyroPrior | None = None) -> list[NavState]:
@@ -92,11 +92,19 @@ def nav_states(estimates: Sequence[Estimate], prior: GyroPrior | None = None) ->
 
 
 def _nav_states(estimates: Sequence[Estimate], prior: GyroPrior | None) -> list[NavState]:
-    table = settled(estimates, prior)
+    table = moments(estimates, prior)
     rows = zip(estimates, *table, table.plain_covariance, strict=True)
     return [
         NavState(
-            e.time, X[:, :3], X[:, 3], X[:, 4] + e.origin_W, b_g, b_a, covariance, e.in_gap, e.world
+            e.time,
+            X[:, :3],
+            X[:, 3],
+            X[:, 4] + e.origin_W,
+            b_g,
+            b_a,
+            covariance,
+            e.in_gap,
+            e.map_frame,
         )
         for e, X, b_g, b_a, _, covariance in rows
     ]
@@ -106,9 +114,9 @@ def smoothed_poses(clones: Sequence[Estimate], prior: GyroPrior) -> list[Smoothe
     """Clones as callers get them."""
     if not clones:
         return []
-    table = settled(clones, prior)
+    table = moments(clones, prior)
     rows = zip(clones, table.X, table.plain_covariance, strict=True)
     return [
-        SmoothedPose(e.time, X[:, :3], X[:, 3] + e.origin_W, covariance, e.world)
+        SmoothedPose(e.time, X[:, :3], X[:, 3] + e.origin_W, covariance, e.map_frame)
         for e, X, covariance in rows
     ]

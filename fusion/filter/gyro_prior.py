@@ -40,7 +40,7 @@ _LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class GyroBelief:
+class GyroPosterior:
     """What the mixture says of a filter's errors beyond the filter itself.
 
     Attributes:
@@ -54,7 +54,7 @@ class GyroBelief:
     to_zero: FloatArray
     information: FloatArray
 
-    def settle(self, P: FloatArray, P_g: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def moments(self, P: FloatArray, P_g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (..., n) of an error whose mean is zero to the filter, and its covariance.
 
         Args:
@@ -63,8 +63,8 @@ class GyroBelief:
         """
         move = P_g @ self.to_zero[..., None]
         w = self.weight[..., None, None]
-        settled = P - (w * (P_g @ self.information)) @ P_g.swapaxes(-1, -2)
-        return -(w * move)[..., 0], settled + (w * (1.0 - w) * move) * move.swapaxes(-1, -2)
+        moments = P - (w * (P_g @ self.information)) @ P_g.swapaxes(-1, -2)
+        return -(w * move)[..., 0], moments + (w * (1.0 - w) * move) * move.swapaxes(-1, -2)
 
 
 class GyroPrior:
@@ -88,7 +88,9 @@ class GyroPrior:
         odds = f.gyro_corrected / (1.0 - f.gyro_corrected)
         self._log_odds = math.log(odds) + 3.0 * math.log(wide / narrow) + 1.5 * math.log(self._r)
 
-    def believe(self, time: FloatArray, b_g: FloatArray, P_gg: FloatArray) -> GyroBelief | None:
+    def posterior(
+        self, time: FloatArray, b_g: FloatArray, P_gg: FloatArray
+    ) -> GyroPosterior | None:
         """The belief where a filter has these biases; None: as the filter.
 
         Args:
@@ -104,7 +106,7 @@ class GyroPrior:
         to_zero = (information @ b_g[..., None])[..., 0]
         log_odds = self._log_odds + 0.5 * np.log(np.linalg.det(information))
         log_odds = log_odds - 0.5 * (b_g * to_zero).sum(axis=-1)
-        return GyroBelief(0.5 * (1.0 + np.tanh(0.5 * log_odds)), to_zero, information)
+        return GyroPosterior(0.5 * (1.0 + np.tanh(0.5 * log_odds)), to_zero, information)
 
     def covariance(self, weight: float) -> FloatArray | None:
         """Of a measurement of zero (3, 3) that counts as likely as it is; None for hardly at all.

@@ -1,73 +1,67 @@
-"""Innovations of an estimator's updates and their statistics, in memory that need not grow."""
+"""What became of an estimator's measurements, and its innovations."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.imu.intervals import IntakeCounts
+from stario.fusion.imu.intervals import SampleCounts
 from stario.fusion.state import Health, Innovations, NavState
 
 
-class InnovationLog:
-    """What became of the network's measurements, the fixes and the rests.
+@dataclass(frozen=True)
+class UpdateCounts:
+    """Updates by what became of them; every one of `add_...` gives a new value.
 
-    Args:
-        keep_rows: False for streams, whose memory must not grow.
+    Attributes:
+        offered: network measurements.
+        gated: of these, outliers: left out or inflated.
+        refused: network measurements left out, by reason.
+        fixes: applied (of these gated), and left out by reason.
+        zero_velocity: likewise, of measurements at rest.
+        nis_sum: of the network measurements that could be judged.
+        nis_count: how many these are.
     """
 
-    def __init__(self, keep_rows: bool) -> None:
-        self._rows: list[tuple[float, ...]] = []
-        self._keep_rows = keep_rows
-        self.offered = self.gated = 0
-        self.refused: dict[str, int] = {}
-        self.fixes: dict[str, int] = {}
-        self.rests: dict[str, int] = {}
-        self._nis_sum, self._nis_count = 0.0, 0
+    offered: int = 0
+    gated: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    fixes: Mapping[str, int] = field(default_factory=dict)
+    zero_velocity: Mapping[str, int] = field(default_factory=dict)
+    nis_sum: float = 0.0
+    nis_count: int = 0
 
-    def add(self, time: float, result: UpdateResult) -> None:
-        """Note what became of a network measurement at a time [s]."""
-        self.offered += 1
-        if result.residual is None or result.sigma is None:
-            count(self.refused, result.reason)
-            return
-        gated = is_gated(result)
-        self.gated += gated
-        self._nis_sum += result.nis
-        self._nis_count += 1
-        if self._keep_rows:
-            self._rows.append((time, *result.residual, *result.sigma, result.nis, float(gated)))
-
-    def add_fix(self, result: UpdateResult) -> None:
-        """Note what became of a fix."""
-        if not result.accepted:
-            count(self.fixes, result.reason)
-            return
-        count(self.fixes, "applied")
-        if result.scale > 1.0:
-            count(self.fixes, "gated")
-
-    def add_rest(self, result: UpdateResult) -> None:
-        """Note what became of a measurement at rest."""
-        count(self.rests, "applied" if result.accepted else result.reason)
-
-    def stacked(self) -> Innovations:
-        """Every innovation kept."""
-        table = np.array(self._rows).reshape(-1, 9)
-        return Innovations(
-            time=table[:, 0],
-            residual_W=table[:, 1:4],
-            sigma=table[:, 4:7],
-            nis=table[:, 7],
-            gated=table[:, 8] > 0.5,
+    def add_displacement(self, result: UpdateResult) -> UpdateCounts:
+        """One more measurement of the network's."""
+        offered = self.offered + 1
+        if result.residual is None:
+            return replace(self, offered=offered, refused=counted(self.refused, result.reason))
+        return replace(
+            self,
+            offered=offered,
+            gated=self.gated + is_gated(result),
+            nis_sum=self.nis_sum + result.nis,
+            nis_count=self.nis_count + 1,
         )
 
-    def health(self, counts: IntakeCounts, state: NavState) -> Health:
-        """The report so far: what the intake counted, what is noted here, the state's sigmas."""
+    def add_fix(self, result: UpdateResult) -> UpdateCounts:
+        """One more fix."""
+        fixes = counted(self.fixes, "applied" if result.accepted else result.reason)
+        if result.accepted and result.scale > 1.0:
+            fixes = counted(fixes, "gated")
+        return replace(self, fixes=fixes)
+
+    def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
+        """One more measurement at rest."""
+        what = "applied" if result.accepted else result.reason
+        return replace(self, zero_velocity=counted(self.zero_velocity, what))
+
+    def health(self, counts: SampleCounts, state: NavState) -> Health:
+        """The report: what became of the samples, of the updates, and the state's sigmas."""
         sigma = np.sqrt(np.diag(state.covariance))
         groups = {
             "tilt_rad": sigma[0:2],
@@ -82,36 +76,37 @@ class InnovationLog:
             updates=self.offered,
             gated=self.gated,
             refused=dict(self.refused),
-            mean_nis=self._nis_sum / self._nis_count if self._nis_count else math.nan,
+            mean_nis=self.nis_sum / self.nis_count if self.nis_count else math.nan,
             fixes=dict(self.fixes),
-            rests=dict(self.rests),
+            zero_velocity=dict(self.zero_velocity),
             final_sigma={name: float(np.max(values)) for name, values in groups.items()},
         )
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Everything that `rewind` needs; rows are not among it, for streams keep none."""
-        return {
-            "offered": self.offered,
-            "gated": self.gated,
-            "refused": dict(self.refused),
-            "fixes": dict(self.fixes),
-            "rests": dict(self.rests),
-            "nis": [self._nis_sum, self._nis_count],
-        }
 
-    def rewind(self, checkpoint: dict[str, Any]) -> None:
-        """Go back to a checkpoint."""
-        self.offered, self.gated = checkpoint["offered"], checkpoint["gated"]
-        self.refused = dict(checkpoint["refused"])
-        self.fixes, self.rests = dict(checkpoint["fixes"]), dict(checkpoint["rests"])
-        self._nis_sum, self._nis_count = checkpoint["nis"]
+def innovation_row(time: float, result: UpdateResult) -> tuple[float, ...] | None:
+    """A row for `stacked`; None of a measurement that made no sense."""
+    if result.residual is None or result.sigma is None:
+        return None
+    return time, *result.residual, *result.sigma, result.nis, float(is_gated(result))
+
+
+def stacked(rows: list[tuple[float, ...]]) -> Innovations:
+    """Innovations from their rows."""
+    table = np.array(rows).reshape(-1, 9)
+    return Innovations(
+        time=table[:, 0],
+        residual_W=table[:, 1:4],
+        sigma=table[:, 4:7],
+        nis=table[:, 7],
+        gated=table[:, 8] > 0.5,
+    )
 
 
 def is_gated(result: UpdateResult) -> bool:
-    """Whether a measurement was taken for an outlier, left out or inflated."""
+    """Whether a measurement counts as an outlier, left out or inflated."""
     return result.reason == "gated" or result.scale > 1.0
 
 
-def count(counts: dict[str, int], reason: str) -> None:
-    """One more of a reason."""
-    counts[reason] = counts.get(reason, 0) + 1
+def counted(counts: Mapping[str, int], reason: str) -> dict[str, int]:
+    """The counts with one more of a reason."""
+    return {**counts, reason: counts.get(reason, 0) + 1}

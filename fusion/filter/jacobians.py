@@ -7,15 +7,11 @@ zero. All are derived in FUSION's notation: v = v^ + rho_v - [v^]x theta, likewi
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from stario.fusion.imu.preintegration import CORE
+from stario.fusion.error_state import CLONE, CORE
 from stario.fusion.lie import FloatArray, skew
-
-CLONE = 6
-"""Size of the error state of one clone."""
+from stario.fusion.yaw import twist
 
 Block = tuple[int, FloatArray]
 """First column of the error state a Jacobian block stands at, and the block (m, width)."""
@@ -78,47 +74,13 @@ def velocity_jacobian(v_W: FloatArray) -> list[Block]:
     return [(0, H)]
 
 
-def heading_jacobian(R_WB: FloatArray) -> list[Block]:
+def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
     """Jacobian (1, 3) of `yaw_twist` by theta.
 
     With s = R10 - R01, c = R00 + R11 and R = (I + [theta]x) R^:
     d yaw = theta_z + (theta_x (s R21 - c R20) - theta_y (c R21 + s R20)) / (s^2 + c^2).
     """
-    s, c = _twist(R_WB)
+    s, c = twist(R_WB)
     r20, r21 = float(R_WB[2, 0]), float(R_WB[2, 1])
     n = s * s + c * c
     return [(0, np.array([[(s * r21 - c * r20) / n, -(c * r21 + s * r20) / n, 1.0]]))]
-
-
-def yaw_twist(R_WB: FloatArray) -> float:
-    """Yaw [rad] of the twist about the vertical, as `sequences.rotations.yaw_of`.
-
-    It stays defined when a device stands upright; not-a-number close to upside down, where it is
-    not defined.
-    """
-    s, c = _twist(R_WB)
-    return math.atan2(s, c) if s * s + c * c > _UPSIDE_DOWN else math.nan
-
-
-def in_plain_terms(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
-    """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
-
-    Args:
-        P: (..., n, n) of theta, then a rho for each vector, then whatever does not change.
-        vectors_W: (..., k, 3) velocity and position, or one of them.
-    """
-    A = skew(vectors_W).reshape(*vectors_W.shape[:-2], -1, 3)
-    stop = 3 + A.shape[-2]
-    plain = P.copy()
-    plain[..., 3:stop, :] -= A @ P[..., :3, :]
-    plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
-    # Far from the origin the products' rounding would leave it asymmetric.
-    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
-
-
-_UPSIDE_DOWN = 0.01
-"""s^2 + c^2 = (1 + cos tilt)^2 below which yaw means nothing: within 26 degrees of upside down."""
-
-
-def _twist(R: FloatArray) -> tuple[float, float]:
-    return float(R[1, 0] - R[0, 1]), float(R[0, 0] + R[1, 1])

@@ -1,41 +1,39 @@
-"""Which world a track is in: its start's own, until fixes say where it is and how it is turned.
+"""The map frame: where the fixes' frame lies against the track's own, told by the fixes.
 
-A track that starts without a pose calls its first position zero and its first yaw zero: that is its
-world. The first position fix moves this world so that the track passes through the fix; what is
-known of the absolute position is then the fix's covariance. The first fix that tells the direction
-turns it about that point: a second position far enough away, a velocity, or a heading. Neither is
-a small correction, so neither goes through the filter's linearisation: the world is moved and
-turned exactly (the right-invariant error turns with it), then the filter is told that this shift or
-turn was not known at all, then the fix is an ordinary measurement.
+A track that starts without a pose calls its first position zero and its first yaw zero. The first
+position fix moves this frame so that the track passes through the fix; what is known of the
+absolute position is then the fix's covariance. The first fix that tells the direction turns it
+about that point: a second position far enough away, a velocity, or a yaw. Neither is a small
+correction, so neither goes through the filter's linearisation: the frame is transformed exactly
+(the right-invariant error turns with it), then the covariance is inflated as if nothing were known
+of this shift or turn, then the fix is an ordinary measurement (README.md, "Fixes").
 
 Behind a gap in which the direction was lost the same holds of the track from there on: the next
 position places it, the next direction turns it, and what was before the gap stays where it is.
 
 The filter knows the wide one of the gyroscope's two priors, callers see both (`gyro_prior`): two
-tracks that a drifting yaw may lead far apart until a fix brings them together. So a change is two,
-one for the states that the filter holds and one for those given out, which also decide whether the
-direction is known.
+tracks that a drifting yaw may lead far apart until a fix brings them together. So a transform is
+two, one for the states that the filter holds and one for those given out, which also decide whether
+the direction is known.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
+from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimate import nav_states
+from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.gyro_prior import GyroPrior
-from stario.fusion.filter.jacobians import yaw_twist
 from stario.fusion.fixes import Fix
-from stario.fusion.lie import FloatArray, exp_so3, skew
-from stario.fusion.state import NavState, SmoothedPose
-from stario.sequences.sequence import Trajectory
+from stario.fusion.lie import FloatArray, exp_so3
+from stario.fusion.state import NavState
+from stario.fusion.yaw import yaw_twist
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 """Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
@@ -51,34 +49,32 @@ _MUCH_LARGER, _LARGEST = 1e3, 1e5
 """An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
 beyond, the covariance keeps no digits for the fix."""
 
+_ORIGINS = (np.zeros(3), np.zeros(3))
+
 
 @dataclass(frozen=True, eq=False)
-class WorldChange:
-    """A new world: p <- R p + shift.
+class MapFrameState:
+    """What is known of the map frame.
 
     Attributes:
-        time: of the fix that told it [s].
-        R: (3, 3) rotation about the vertical.
-        shift: (3,) [m].
-        pivot: (3,) the point of the new world that a wrong turn would leave where it is [m].
-        placed: whether it is the shift of a position fix, not a turn.
-        since: states before this time [s] are none of its, for they were in the new world already.
-        yaw_sigma: of the turn [rad].
-        position_covariance: (3, 3) of the shift [m^2].
+        placed: whether the track's position in it is known.
+        oriented: whether its yaw is.
+        transforms: of the states given out.
+        filter_transforms: of the states as the filter holds them; as many.
+        pivots: (3,) each, about which the filter's track and the one given out may be turned [m].
+        since: time from which on the track is placed and turned anew [s].
     """
 
-    time: float
-    R: FloatArray
-    shift: FloatArray
-    pivot: FloatArray
     placed: bool
-    since: float
-    yaw_sigma: float = 0.0
-    position_covariance: FloatArray | None = None
+    oriented: bool
+    transforms: tuple[FrameTransform, ...] = ()
+    filter_transforms: tuple[FrameTransform, ...] = ()
+    pivots: tuple[FloatArray, FloatArray] = _ORIGINS
+    since: float = -math.inf
 
 
-class WorldFrame:
-    """Applies fixes to a filter, and moves and turns the filter's world where it must.
+class MapFrame:
+    """Applies fixes to a filter, and transforms the filter's frame where it must.
 
     Args:
         placed: whether the first position was given.
@@ -87,116 +83,105 @@ class WorldFrame:
         prior: by which the filter's states are given out.
 
     Attributes:
-        changes: of the states given out.
-        filter_changes: of the states as the filter holds them; as many.
+        state: what is known of the frame.
     """
 
     def __init__(self, placed: bool, oriented: bool, gate: float, prior: GyroPrior) -> None:
-        self.placed, self.oriented = placed, oriented
-        self.changes: list[WorldChange] = []
-        self.filter_changes: list[WorldChange] = []
-        self._prior = prior
-        self._pivots, self._since = [np.zeros(3), np.zeros(3)], -math.inf
-        self._gates = {n: float(chi2.ppf(gate, n)) for n in (1, 3)}
+        self.state = MapFrameState(placed, oriented)
+        self._gate, self._prior = gate, prior
 
-    def apply(self, ekf: StateCloningEkf, fix: Fix) -> tuple[UpdateResult, WorldChange | None]:
-        """Take in a fix at the filter's time; also the change it brought to the filter's world."""
-        if fix.kind == "position" and not self.placed:
-            changes = self._place(ekf, fix)
-        elif self.oriented:
-            return self._update(ekf, fix), None
+    def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+        """Take in a fix at the filter's time."""
+        if fix.kind == "position" and not self.state.placed:
+            transforms = self._place(ekf, fix)
+        elif self.state.oriented:
+            return self._update(ekf, fix)
         else:
-            changes = self._orient(ekf, fix)
-        if not changes:
-            return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known"), None
+            transforms = self._orient(ekf, fix)
+        if not transforms:
+            return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known")
         result = self._update(ekf, fix)
         own, seen = (
-            self._with_what_is_left(change, state)
-            for change, state in zip(changes, self._states(ekf), strict=True)
+            self._with_uncertainty(transform, state)
+            for transform, state in zip(transforms, self._nav_states(ekf), strict=True)
         )
-        self.filter_changes.append(own)
-        self.changes.append(seen)
-        return result, own
+        s = self.state
+        self.state = replace(
+            s,
+            filter_transforms=(*s.filter_transforms, own),
+            transforms=(*s.transforms, seen),
+        )
+        return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
-        if not self.oriented:
+        if not self.state.oriented:
             return
-        own, seen = self._states(ekf)
+        own, seen = self._nav_states(ekf)
         if seen.covariance[2, 2] > KNOWN_YAW**2:
-            self.placed = self.oriented = False
-            self._pivots, self._since = [own.p_W, seen.p_W], ekf.time
+            self.state = replace(
+                self.state,
+                placed=False,
+                oriented=False,
+                pivots=(own.p_W, seen.p_W),
+                since=ekf.state.time,
+            )
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Everything that `rewind` needs."""
-        return {
-            "placed": self.placed,
-            "oriented": self.oriented,
-            "pivots": list(self._pivots),
-            "since": self._since,
-            "changes": [vars(change) for change in self.changes],
-            "filter_changes": [vars(change) for change in self.filter_changes],
-        }
-
-    def rewind(self, checkpoint: dict[str, Any]) -> None:
-        """Go back to a checkpoint."""
-        self.placed, self.oriented = checkpoint["placed"], checkpoint["oriented"]
-        self._pivots, self._since = list(checkpoint["pivots"]), checkpoint["since"]
-        self.changes = [WorldChange(**change) for change in checkpoint["changes"]]
-        self.filter_changes = [WorldChange(**change) for change in checkpoint["filter_changes"]]
-
-    def _states(self, ekf: StateCloningEkf) -> list[NavState]:
+    def _nav_states(self, ekf: StateCloningEkf) -> list[NavState]:
         """The newest state as the filter holds it, and as it is given out."""
-        now = ekf.estimate()
+        now = ekf.state.estimate()
         return [*nav_states([now]), *nav_states([now], self._prior)]
 
-    def _place(self, ekf: StateCloningEkf, fix: Fix) -> list[WorldChange]:
-        changes = [
-            WorldChange(fix.time, np.eye(3), fix.value - s.p_W, fix.value, True, self._since)
-            for s in self._states(ekf)
+    def _place(self, ekf: StateCloningEkf, fix: Fix) -> list[FrameTransform]:
+        since = self.state.since
+        transforms = [
+            FrameTransform(fix.time, np.eye(3), fix.value - s.p_W, fix.value, True, since)
+            for s in self._nav_states(ekf)
         ]
-        ekf.move_world(np.eye(3), changes[0].shift)
-        left = np.trace(fix.covariance) + np.trace(ekf.world_covariance()[6:9, 6:9])
-        ekf.loosen_position(min(_MUCH_LARGER * math.sqrt(left), _LARGEST))
-        self.placed, self._pivots = True, [fix.value, fix.value]
-        return changes
+        ekf.state = ekf.state.transformed(np.eye(3), transforms[0].shift)
+        left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
+        sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
+        ekf.state = ekf.state.with_position_inflated(sigma)
+        self.state = replace(self.state, placed=True, pivots=(fix.value, fix.value))
+        return transforms
 
-    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> list[WorldChange]:
+    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> list[FrameTransform]:
         """Empty where the fix does not tell the direction."""
-        states = zip(self._states(ekf), self._pivots, strict=True)
+        pivots, since = self.state.pivots, self.state.since
+        states = zip(self._nav_states(ekf), pivots, strict=True)
         turns, sigmas = zip(*(_turn(s, pivot, fix) for s, pivot in states), strict=True)
-        if not (np.isfinite(turns).all() and (sigmas[1] < FAR_ENOUGH or fix.kind == "heading")):
+        if not (np.isfinite(turns).all() and (sigmas[1] < FAR_ENOUGH or fix.kind == "yaw")):
             return []
-        changes = []
-        for turn, pivot in zip(turns, self._pivots, strict=True):
+        transforms = []
+        for turn, pivot in zip(turns, pivots, strict=True):
             R = exp_so3(np.array([0.0, 0.0, turn]))
-            changes.append(WorldChange(fix.time, R, pivot - R @ pivot, pivot, False, self._since))
-        ekf.move_world(changes[0].R, changes[0].shift)
-        ekf.loosen_yaw(self._pivots[0], UNKNOWN_YAW)
-        self.oriented = True
-        return changes
+            transforms.append(FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since))
+        moved = ekf.state.transformed(transforms[0].R, transforms[0].shift)
+        ekf.state = moved.with_yaw_inflated(pivots[0], UNKNOWN_YAW)
+        self.state = replace(self.state, oriented=True)
+        return transforms
 
-    def _with_what_is_left(self, change: WorldChange, state: NavState) -> WorldChange:
-        """A change with what is not known of it, by the state behind it."""
-        P = state.covariance
+    def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
+        """A transform with what is not known of it, by the state behind it."""
+        P, oriented = state.covariance, self.state.oriented
         return replace(
-            change,
-            yaw_sigma=math.sqrt(P[2, 2]) if self.oriented else 0.0,
-            position_covariance=np.zeros((3, 3)) if self.oriented else P[6:9, 6:9],
+            transform,
+            yaw_sigma=math.sqrt(P[2, 2]) if oriented else 0.0,
+            position_covariance=np.zeros((3, 3)) if oriented else P[6:9, 6:9],
         )
 
     def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
-        gate = self._gates[len(fix.value)]
+        gate = chi2_quantile(self._gate, len(fix.value))
         if fix.kind == "position":
             return ekf.update_position_W(fix.value, fix.covariance, gate)
         if fix.kind == "velocity":
             return ekf.update_velocity_W(fix.value, fix.covariance, gate)
-        return ekf.update_heading(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+        return ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
 
 
 def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
-    """Turn of the world about a point that a fix asks for, and how well it tells it [rad]."""
-    if fix.kind == "heading":
+    """Turn of the frame about a point that a fix asks for, and how well it tells it [rad]."""
+    if fix.kind == "yaw":
         return float(fix.value[0]) - yaw_twist(state.R_WB), math.sqrt(fix.covariance[0, 0])
     first, seen, ours = 3, fix.value, state.v_W
     if fix.kind == "position":
@@ -209,65 +194,3 @@ def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
     across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
     turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
     return turn, across / arm if arm > 0.0 else math.inf
-
-
-def in_last_world(states: list[NavState], changes: list[WorldChange]) -> list[NavState]:
-    """States of a track with every one of them given in the world the track ends in.
-
-    What is not known of a change is added to the covariance of the states before it, as if it were
-    independent of theirs; that is on the safe side, for the fix saw the track's own errors too.
-    """
-    for change in changes:
-        states = [_after(state, change) for state in states]
-    return states
-
-
-def smoothed_track(poses: list[SmoothedPose], changes: list[WorldChange]) -> Trajectory | None:
-    """Smoothed poses as a track, in the world it ends in; None where there is none."""
-    if not poses:
-        return None
-    rows = []
-    for pose in poses:
-        R_WB, p_W, covariance = pose.R_WB, pose.p_W, pose.covariance[3:, 3:]
-        for change in (c for c in changes[pose.world :] if pose.time >= c.since):
-            R_WB, p_W = change.R @ R_WB, change.R @ p_W + change.shift
-            covariance = change.R @ covariance @ change.R.T
-            across = skew(p_W - change.pivot) @ [0.0, 0.0, -change.yaw_sigma]
-            covariance = covariance + np.outer(across, across)
-            if change.position_covariance is not None:
-                covariance = covariance + change.position_covariance
-        rows.append((pose.time, p_W, R_WB, covariance))
-    time, position, attitude, covariances = zip(*rows, strict=True)
-    return Trajectory(
-        time=np.array(time),
-        position_W=np.array(position),
-        attitude_WB=Rotation.from_matrix(np.array(attitude)),
-        position_covariance_W=np.array(covariances),
-    )
-
-
-def _after(state: NavState, change: WorldChange) -> NavState:
-    if state.time >= change.time:
-        return state
-    if state.time < change.since:
-        return replace(state, world=state.world + 1)
-    return _moved(state, change)
-
-
-def _moved(state: NavState, change: WorldChange) -> NavState:
-    R = change.R
-    v_W, p_W = R @ state.v_W, R @ state.p_W + change.shift
-    A = np.eye(15)
-    for first in (0, 3, 6):
-        A[first : first + 3, first : first + 3] = R
-    covariance = A @ state.covariance @ A.T
-    turn = np.zeros((15, 1))
-    turn[2] = 1.0
-    turn[3:6, 0] = skew(v_W) @ [0.0, 0.0, -1.0]
-    turn[6:9, 0] = skew(p_W - change.pivot) @ [0.0, 0.0, -1.0]
-    covariance += change.yaw_sigma**2 * (turn @ turn.T)
-    if change.position_covariance is not None:
-        covariance[6:9, 6:9] += change.position_covariance
-    return replace(
-        state, R_WB=R @ state.R_WB, v_W=v_W, p_W=p_W, covariance=covariance, world=state.world + 1
-    )

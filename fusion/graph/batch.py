@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.map_frame import UNKNOWN_YAW, WorldChange
-from stario.fusion.graph.builder import GraphBuilder, Taken
+from stario.fusion.filter.estimator import IntervalMeasurements
+from stario.fusion.filter.frame_transform import FrameTransform
+from stario.fusion.filter.map_frame import UNKNOWN_YAW
+from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
@@ -37,18 +39,18 @@ class Smoothed:
 def smooth(
     filtered: Sequence[NavState],
     prior: NavState,
-    taken: Sequence[Taken],
-    changes: Sequence[WorldChange],
+    measurements: Sequence[IntervalMeasurements],
+    transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_covariance: FloatArray | None = None,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
     Args:
-        filtered: the filter's states in one world: the start and one for each epoch.
-        prior: the start before any fix moved or turned the world.
-        taken: what the filter took in, epoch by epoch.
-        changes: how fixes moved and turned the world since the start.
+        filtered: the filter's states in one frame: the start and one for each interval.
+        prior: the start before any frame transform.
+        measurements: what the filter took in, interval by interval.
+        transforms: of the frame since the start.
         config: noise, filter and graph settings.
         gyro_covariance: (3, 3) to which the gyroscope's bias is taken for zero beside the prior
             (`gyro_prior`), None for not at all.
@@ -57,12 +59,12 @@ def smooth(
         The graph's states with their marginal covariances; those given where the graph does not
         determine one.
     """
-    origin = filtered[0].p_W  # near the track: see `StateCloningEkf`
+    origin = filtered[0].p_W  # near the track: see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
-    builder = GraphBuilder(config, _loosened(local[0], prior, changes))
-    for (epoch, measurement, fixes, held, segment), state in zip(taken, local[1:], strict=True):
-        near = [fix.shifted(-origin) for fix in fixes]
-        builder.step(epoch, measurement, near, held, state, segment)
+    builder = GraphBuilder(config, _inflated(local[0], prior, transforms))
+    for taken, state in zip(measurements, local[1:], strict=True):
+        near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
+        builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
     builder.close(local[-1])
     if gyro_covariance is not None:
         builder.expect_gyro_bias(gyro_covariance)
@@ -72,7 +74,8 @@ def smooth(
         return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
     solved = {state.time: state for state in filled(builder.graph, builder.segments)}
     states = [
-        replace(solved[f.time], in_gap=f.in_gap, world=f.world).shifted(origin) for f in filtered
+        replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
+        for f in filtered
     ]
     note = (
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
@@ -81,18 +84,18 @@ def smooth(
     return Smoothed(states, note)
 
 
-def _loosened(first: NavState, prior: NavState, changes: Sequence[WorldChange]) -> NavState:
-    """The prior in the last world: what fixes told of position and yaw is theirs to tell again."""
-    changes = [change for change in changes if change.since <= first.time]
-    if not changes:
+def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:
+    """The prior in the last frame: what fixes told of position and yaw is theirs to tell again."""
+    transforms = [transform for transform in transforms if transform.since <= first.time]
+    if not transforms:
         return replace(first, covariance=prior.covariance)
     turn = first.R_WB @ prior.R_WB.T
     to_last = np.kron(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), turn)
     to_last[9:, 9:] = np.eye(6)
     covariance = to_last @ prior.covariance @ to_last.T
-    if any(change.placed for change in changes):
+    if any(transform.placed for transform in transforms):
         covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
-    if not all(change.placed for change in changes):
+    if not all(transform.placed for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)
 

@@ -1,26 +1,25 @@
-"""From epochs to a graph: when a keyframe is made, what binds and what measures it."""
+"""From intervals to a graph: when a keyframe is made, what binds and what measures it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import Held
-from stario.fusion.filter.history import Measurement
-from stario.fusion.filter.jacobians import yaw_twist
+from stario.fusion.filter.estimator import Displacement as Measured
+from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
-from stario.fusion.graph.factors import Displacement, GyroBias, Heading, Position, Term, Velocity
+from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
-from stario.fusion.imu.intervals import Epoch
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.segments import segment_of, segment_of_all
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.state import NavState
+from stario.fusion.yaw import yaw_twist
 from stario.sequences.windows import WINDOW_SECONDS
 
 _SAME_TIME = 1e-6
@@ -30,18 +29,8 @@ Pose = tuple[FloatArray, FloatArray, FloatArray]
 """R_WB (3, 3), v_W (3,), p_W (3,)."""
 
 
-class Taken(NamedTuple):
-    """An epoch and what was measured in it."""
-
-    epoch: Epoch
-    measurement: Measurement | None
-    fixes: Sequence[Fix]
-    held: Held | None
-    segment: Segment | None
-
-
 class GraphBuilder:
-    """Feeds epochs to a `KeyframeGraph`.
+    """Feeds intervals to a `KeyframeGraph`.
 
     Keyframes stand where windows begin and end and at both ends of a gap. More of them bring
     nothing: the IMU binds them as well over half a second as over a tenth, and tells what lies
@@ -52,7 +41,7 @@ class GraphBuilder:
     Args:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
-        count: epochs since the start or the last gap, where a graph is begun anew.
+        count: intervals since the start or the last gap, where a graph is begun anew.
         streaming: take two windows of a second where updates come as often, and fixes as the
             filter judged them; displacements too, where it gives them the same weight. A loss of
             the graph's own starts from what the IMU says: while the speed is not yet known it took
@@ -61,8 +50,8 @@ class GraphBuilder:
 
     Attributes:
         graph: the graph so far.
-        segments: by keyframe, the epochs' segments from it to the next (or to now).
-        count: epochs since the start or the last gap.
+        segments: by keyframe, the intervals' segments from it to the next (or to now).
+        count: intervals since the start or the last gap.
         starts: the keyframes that nothing binds to the one before.
     """
 
@@ -78,12 +67,11 @@ class GraphBuilder:
         self._streaming = streaming
         self._overlap = 2 if streaming and f.update_rate % 2 == 0 else 1
         # The filter weighs every window of a second, the graph one or two of them.
-        same_weight = f.measurement == "displacement" and f.update_rate == self._overlap
-        self._judged = streaming and same_weight
-        self._window = round(f.output_rate * WINDOW_SECONDS)  # epochs
-        self._spacing = self._window // self._overlap  # epochs
-        self._pending: list[Epoch] = []
-        # Keyframes where windows end and begin, by the count of epochs; a gap ends them all.
+        self._judged = streaming and f.update_rate == self._overlap
+        self._window = round(f.output_rate * WINDOW_SECONDS)  # intervals
+        self._spacing = self._window // self._overlap  # intervals
+        self._pending: list[ImuInterval] = []
+        # Keyframes where windows end and begin, by the count of intervals; a gap ends them all.
         self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
 
     @property
@@ -93,20 +81,20 @@ class GraphBuilder:
 
     def step(
         self,
-        epoch: Epoch,
-        measurement: Measurement | None,
+        interval: ImuInterval,
+        displacement: Measured | None,
         fixes: Sequence[Fix] = (),
-        held: Held | None = None,
+        zero_velocity: ZeroVelocity | None = None,
         guess: NavState | None = None,
         segment: Segment | None = None,
     ) -> bool:
-        """Take in an epoch and what was measured in it.
+        """Take in an interval and what was measured in it.
 
         Args:
-            epoch: the next one.
-            measurement: of the window that ends with it, None where there is none.
-            fixes: within the epoch, in order.
-            held: what was measured at rest, None where the device moved.
+            interval: the next one.
+            displacement: of the window that ends with it, None where there is none.
+            fixes: within the interval, in order.
+            zero_velocity: what was measured at rest, None where the device moved.
             guess: state at its end from where the optimisation starts, None: by the IMU.
             segment: its samples, where they are already folded.
 
@@ -114,29 +102,29 @@ class GraphBuilder:
             Whether a keyframe was made.
         """
         before = self.graph.last
-        if epoch.gap:
+        if interval.gap:
             self.close()
             self._joints.clear()
-        if epoch.anew is not None and guess is not None:
+        if interval.anew is not None and guess is not None:
             self._begin_apart(guess)
             return True
-        self.count = 0 if epoch.gap else self.count + 1
-        self._append(epoch, segment)
+        self.count = 0 if interval.gap else self.count + 1
+        self._append(interval, segment)
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
             began = self._joints.get(self.count - self._window)
-            if measurement is not None and began is not None:
-                self._measure(began, epoch, *measurement)
+            if displacement is not None and began is not None:
+                self._add_displacement(began, interval, *displacement)
             self._joints[self.count] = self.graph.last
-            if held is not None:
-                self._hold_still(held)
+            if zero_velocity is not None:
+                self._add_zero_velocity(zero_velocity)
         for fix in fixes:
             self.fix(fix)
         return self.graph.last > before
 
     def close(self, guess: NavState | None = None) -> None:
-        """Make a keyframe of the epochs since the last one, where there are any."""
+        """Make a keyframe of the intervals since the last one, where there are any."""
         if not self._pending:
             return
         graph = self.graph
@@ -176,24 +164,6 @@ class GraphBuilder:
         self._joints = {n: k for n, k in self._joints.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
 
-    def dump(self) -> dict[str, Any]:
-        """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
-        return {
-            "count": self.count,
-            "joints": [[n, k] for n, k in self._joints.items()],
-            "pending": [epoch.dump() for epoch in self._pending],
-            "segments": [[k, [s.dump() for s in pieces]] for k, pieces in self.segments.items()],
-            "graph": self.graph.dump(),
-        }
-
-    def load(self, dump: dict[str, Any]) -> None:
-        """Become what was dumped."""
-        self.count = dump["count"]
-        self._joints = {n: k for n, k in dump["joints"]}
-        self._pending = [Epoch.loaded(epoch) for epoch in dump["pending"]]
-        self.segments = {k: [Segment.loaded(s) for s in pieces] for k, pieces in dump["segments"]}
-        self.graph.load(dump["graph"])
-
     def reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
         R, v, p, b_g, b_a = self.graph.pose(k)
@@ -213,27 +183,29 @@ class GraphBuilder:
         self.segments[k] = []
         self._joints[0] = k
 
-    def _append(self, epoch: Epoch, segment: Segment | None = None) -> None:
-        if segment is None or epoch.gap:
+    def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
+        if segment is None or interval.gap:
             R, _, _, b_g, b_a = self.graph.pose(self.graph.last)
-            segment = segment_of(epoch, R, b_g, b_a, self._config)
+            segment = segment_of(interval, R, b_g, b_a, self._config)
         self.segments[self.graph.last].append(segment)
-        self._pending.append(epoch)
+        self._pending.append(interval.without_window())
 
-    def _measure(self, i: int, epoch: Epoch, d_N: FloatArray, covariance_N: FloatArray) -> None:
+    def _add_displacement(
+        self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
+    ) -> None:
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if not _usable(d_N, covariance):
             return
-        assert epoch.R_NB_window is not None  # a window always comes with its first attitude
-        way = Displacement(i, self.graph.last, d_N, epoch.R_NB_window, covariance)
-        self.graph.add(way, gated=not self._judged)
+        assert interval.R_NB_window is not None  # a window always comes with its first attitude
+        term = Displacement(i, self.graph.last, d_N, interval.R_NB_window, covariance)
+        self.graph.add(term, gated=not self._judged)
 
-    def _hold_still(self, held: Held) -> None:
+    def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:
         zero, k = np.zeros(3), self.graph.last
-        # One keyframe stands for the epochs since the one before.
-        covariance = held.covariance / self._spacing
+        # One keyframe stands for the intervals since the one before.
+        covariance = zero_velocity.covariance / self._spacing
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
-        self.graph.add(GyroBias(k, held.b_g, covariance[3:, 3:]))
+        self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
 
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph
@@ -247,7 +219,7 @@ class GraphBuilder:
         if fix.kind == "velocity":
             return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
         turn = np.array([0.0, 0.0, fix.value[0] - yaw_twist(R)])
-        return Heading(k, exp_so3(turn) @ R_k, fix.covariance)
+        return Yaw(k, exp_so3(turn) @ R_k, fix.covariance)
 
 
 def _usable(value: FloatArray, covariance: FloatArray) -> bool:

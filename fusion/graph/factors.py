@@ -19,9 +19,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from stario.fusion.filter.estimator import yaw_between
-from stario.fusion.imu.preintegration import CORE
+from stario.fusion.error_state import CORE
 from stario.fusion.lie import FloatArray, log_se23, skew
+from stario.fusion.yaw import twist, yaw_rotation
 
 _EYE = np.eye(3)
 
@@ -176,14 +176,14 @@ class Displacement:
     def linearise(self, values: Any) -> Linearised:
         """In the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
-        R_NW = yaw_between(R_i, self.R_NB).T
-        way = p_j - p_i
+        R_NW = yaw_rotation(R_i @ self.R_NB.T).T
+        d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
-        sideways = np.array([-way[1], way[0], 0.0])  # e3 x (p_j - p_i)
+        sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)
         H_i[:, :3] = -np.outer(R_NW @ sideways, R_i[2])
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
-        return Linearised(self.d_N - R_NW @ way, [(X(self.i), H_i), (X(self.j), H_j)])
+        return Linearised(self.d_N - R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +246,7 @@ class Velocity:
 
 
 @dataclass(frozen=True, eq=False)
-class Heading:
+class Yaw:
     """A yaw some time after a keyframe, at any attitude of the device.
 
     Attributes:
@@ -268,8 +268,7 @@ class Heading:
     def linearise(self, values: Any) -> Linearised:
         """About the vertical."""
         R, _ = _pose(values, self.k)
-        turn = self.R_WB @ R.T
-        residual = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        residual = math.atan2(*twist(self.R_WB @ R.T))
         H = np.zeros((1, 6))
         H[0, :3] = R[2]
         return Linearised(np.array([residual]), [(X(self.k), H)])
@@ -277,7 +276,7 @@ class Heading:
 
 @dataclass(frozen=True, eq=False)
 class GyroBias:
-    """The gyroscope's bias, read while the device rests.
+    """The gyroscope's bias, read while the device zero_velocity.
 
     Attributes:
         k: keyframe.
@@ -300,25 +299,8 @@ class GyroBias:
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
 
 
-_KINDS: dict[str, Any] = {
-    kind.__name__: kind for kind in (Prior, Displacement, Position, Velocity, Heading, GyroBias)
-}
-
-
-def dumped(term: Term) -> tuple[str, dict[str, Any]]:
-    """A term's kind and fields: arrays, numbers and, for a prior, the list of its states."""
-    values = {n: [list(s) for s in v] if n == "about" else v for n, v in vars(term).items()}
-    return type(term).__name__, values
-
-
-def loaded(kind: str, values: dict[str, Any]) -> Term:
-    """A term from what `dumped` gave."""
-    known = {
-        name: tuple(KeyframeState(*s) for s in v) if name == "about" else v
-        for name, v in values.items()
-    }
-    term: Term = _KINDS[kind](**known)
-    return term
+KINDS: tuple[type, ...] = (Prior, Displacement, Position, Velocity, Yaw, GyroBias)
+"""Every kind of term."""
 
 
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:

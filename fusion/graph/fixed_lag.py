@@ -8,28 +8,50 @@ its own, or where a late fix has changed what was judged.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimate import nav_states
-from stario.fusion.filter.estimator import FilterRecipe, PriorPose
-from stario.fusion.filter.history import Measurement
-from stario.fusion.fixes import Fix
+from stario.fusion.filter.estimator import Displacement, Estimator, EstimatorState
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.keyframes import IndeterminateError
-from stario.fusion.imu.intervals import Epoch, IntakeCounts, Start
-from stario.fusion.state import Health, Innovations, NavState
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
+from stario.fusion.lie import FloatArray
+from stario.fusion.state import Health, NavState
 
 _ROUNDS = 3
 """Of each optimisation: the next keyframe's goes on from there."""
 
 
-class GraphRecipe:
-    """A `FilterRecipe` whose states are those of a fixed-lag graph.
+@dataclass(frozen=True, eq=False)
+class FixedLagState:
+    """Everything that a `FixedLagEstimator` knows between two intervals.
+
+    Attributes:
+        estimator: of the filter alongside.
+        builder: the graph.
+        ahead: the newest state, carried on by the IMU from the last keyframe.
+        origin_W: (3,) of the graph's positions [m]: see `EkfState`.
+        map_frame: frame transforms before the graph began.
+        fallbacks: how often the graph fell back to the filter, and why it last did.
+    """
+
+    estimator: EstimatorState
+    builder: GraphBuilder
+    ahead: EkfState
+    origin_W: FloatArray
+    map_frame: int
+    fallbacks: tuple[int, str]
+
+
+class FixedLagEstimator:
+    """An `Estimator` whose states are those of a fixed-lag graph.
 
     Between keyframes the state is that of the last one, carried on by the IMU.
 
@@ -39,93 +61,95 @@ class GraphRecipe:
         prior: what is known of the first pose; None starts level, at rest, at the origin.
     """
 
+    smoothed = None
+
     def __init__(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None = None
     ) -> None:
         self._config = config
-        self._filter = FilterRecipe(config, start, prior, streaming=True)
-        self._fallbacks = 0
-        self._why = ""
+        self._filter = Estimator(config, start, prior, streaming=True)
+        self._fallbacks = (0, "")
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
-        self._origin_W = np.zeros(3)  # of the graph's positions: see `StateCloningEkf`
+        self._origin_W = np.zeros(3)
+        self._map_frame = 0
         self._builder: GraphBuilder
-        self._begin(self._filter.filtered(), 0)
+        self._begin(0)
 
     def step(
-        self, epoch: Epoch, measurement: Measurement | None, fixes: Sequence[Fix] = ()
+        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> None:
-        """Move to the epoch's end and take in what was measured; as `FilterRecipe.step`."""
-        self._filter.step(epoch, measurement, fixes)
-        if self._filter.world != self._world or epoch.anew is not None:
-            self._begin(self._filter.filtered(), 0 if epoch.gap else self._builder.count + 1)
+        """Move to the interval's end and take in what was measured; as `Estimator.step`."""
+        taken = self._filter.step(interval, displacement, fixes)
+        if self._filter.map_frame != self._map_frame or interval.anew is not None:
+            self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        accepted = [fix.inflated.shifted(-self._origin_W) for fix in self._filter.accepted]
-        if self._builder.step(epoch, self._filter.taken, accepted, self._filter.held):
+        near = [self._near(accepted) for accepted in taken.fixes]
+        if self._builder.step(interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
 
-    def late_fix(self, fix: Fix) -> bool:
-        """Take in a fix at a time before now; False where it is more than a window late."""
+    def late_fix(self, fix: Fix) -> list[Accepted] | None:
+        """Take in a fix at a time before now; as `Estimator.late_fix`."""
         judged = self._filter.judged
-        if not self._filter.late_fix(fix):
-            return False
-        if self._filter.world != self._world or self._filter.judged != judged:
-            self._begin(self._filter.filtered(), self._builder.count)
-            return True
-        for taken in self._filter.accepted:
-            if taken.fix is fix and self._builder.fix(taken.inflated.shifted(-self._origin_W)):
+        accepted = self._filter.late_fix(fix)
+        if accepted is None:
+            return None
+        if self._filter.map_frame != self._map_frame or self._filter.judged != judged:
+            self._begin(self._builder.count)
+            return accepted
+        for taken in accepted:
+            if taken.fix is fix and self._builder.fix(self._near(taken)):
                 self._solve()
-        return True
+        return accepted
+
+    @property
+    def state(self) -> FixedLagState:
+        """All that varies; it may be put back."""
+        return FixedLagState(
+            self._filter.state,
+            self._builder,
+            self._ahead.state,
+            self._origin_W,
+            self._map_frame,
+            self._fallbacks,
+        )
+
+    @state.setter
+    def state(self, s: FixedLagState) -> None:
+        self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
+        self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
 
     @property
     def time(self) -> float:
         """Of the newest state [s]."""
-        return self._ahead.time
+        return self._ahead.state.time
 
-    def state(self) -> NavState:
+    def nav_state(self) -> NavState:
         """The newest state."""
-        ahead = self._ahead.estimate(self._filter.in_gap, self._world)
+        ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
         return nav_states([ahead], self._filter.gyro_prior)[0].shifted(self._origin_W)
 
-    def innovations(self) -> Innovations:
-        """Those of the filter alongside."""
-        return self._filter.innovations()
-
-    def health(self, counts: IntakeCounts) -> Health:
+    def health(self, counts: SampleCounts) -> Health:
         """The filter's report with the graph's sigmas, and how often the graph fell back."""
-        health = self._filter.health(counts, self.state())
-        if self._fallbacks == 0:
+        health = self._filter.health(counts, self.nav_state())
+        times, why = self._fallbacks
+        if times == 0:
             return health
-        note = f"graph fell back to the filter {self._fallbacks} times, last for {self._why}"
+        note = f"graph fell back to the filter {times} times, last for {why}"
         return replace(health, notes=[*health.notes, note])
 
-    def dump(self) -> dict[str, Any]:
-        """A stream's recipe for `load`: arrays, numbers, text, lists and dictionaries."""
-        return {
-            "filter": self._filter.dump(),
-            "builder": self._builder.dump(),
-            "ahead": self._ahead.checkpoint(),
-            "origin": self._origin_W,
-            "world": self._world,
-            "fallbacks": self._fallbacks,
-            "why": self._why,
-        }
+    def _near(self, accepted: Accepted) -> Fix:
+        """A fix as the filter inflated it, from the graph's origin."""
+        return accepted.inflated.shifted(-self._origin_W)
 
-    def load(self, dump: dict[str, Any]) -> None:
-        """Become what was dumped by a recipe of the same configuration."""
-        self._filter.load(dump["filter"])
-        self._builder.load(dump["builder"])
-        self._ahead.rewind(dump["ahead"])
-        self._world, self._origin_W = dump["world"], dump["origin"]
-        self._fallbacks, self._why = dump["fallbacks"], dump["why"]
-
-    def _begin(self, first: NavState, count: int) -> None:
-        """A new graph from a state of the filter."""
-        self._world, self._origin_W = first.world, first.p_W
+    def _begin(self, count: int) -> None:
+        """A new graph from the filter's state."""
+        first = self._filter.filtered()
+        self._map_frame, self._origin_W = first.map_frame, first.p_W
         first = first.shifted(-self._origin_W)
         self._builder = GraphBuilder(self._config, first, count, streaming=True)
-        self._take(first)
+        self._restart_from(first)
 
     def _solve(self) -> None:
         builder = self._builder
@@ -135,13 +159,12 @@ class GraphRecipe:
             newest = graph.state(graph.last)
             builder.forget(newest.time - self._config.graph.lag)
         except IndeterminateError as error:
-            self._fallbacks += 1
-            self._why = str(error)
-            self._begin(self._filter.filtered(), builder.count)
+            self._fallbacks = (self._fallbacks[0] + 1, str(error))
+            self._begin(builder.count)
             return
-        self._take(newest)
+        self._restart_from(newest)
         for segment in builder.segments[graph.last]:
             self._ahead.propagate(segment)
 
-    def _take(self, s: NavState) -> None:
+    def _restart_from(self, s: NavState) -> None:
         self._ahead.initialise(s.time, s.R_WB, s.v_W, s.p_W, s.b_g, s.b_a, s.covariance)

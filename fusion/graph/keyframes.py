@@ -1,7 +1,7 @@
 """A factor graph over keyframes on gtsam: IMU, prior and measurements, solved and marginalised.
 
 A keyframe is a pose, a velocity and the biases. gtsam's `CombinedImuFactor` binds each to the next
-through the same preintegration as the filter's; the measurements are those of `graph_terms`,
+through the same preintegration as the filter's; the measurements are those of `factors`,
 linearised anew in every round. No factor calls back into Python.
 
 Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
@@ -13,24 +13,17 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
-from stario.fusion.graph.factors import (
-    Displacement,
-    KeyframeState,
-    Prior,
-    Term,
-    dumped,
-    loaded,
-)
-from stario.fusion.imu.preintegration import CORE, Segment
+from stario.fusion.chi_square import chi2_quantile
+from stario.fusion.error_state import CORE
+from stario.fusion.graph.factors import Displacement, KeyframeState, Prior, Term
+from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
 
@@ -48,6 +41,7 @@ cost 0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with the hal
 _LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
 
+_GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
 
 
@@ -79,15 +73,18 @@ class KeyframeGraph:
 
     def __init__(self, first: NavState, gate: float) -> None:
         self._gate = gate
-        self._values = gtsam.Values()
-        self._factors: list[tuple[int, Any]] = []  # with the first keyframe each touches
-        self._segments: dict[int, Segment] = {}  # by the keyframe each begins at
-        self._terms: list[_Whitened] = []
+        self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
-        self._tree: Any = None
+        self._segments: dict[int, Segment] = {}  # by the keyframe each begins at
+        self._terms: list[Whitened] = []
+        self._tree: Any = None  # of the last solution
         self.last = -1
         self._insert(first)
         self.add(_prior(0, first), gated=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the solution: `solve` comes before `state` then."""
+        return vars(self) | {"_tree": None}
 
     @property
     def keyframes(self) -> list[int]:
@@ -100,10 +97,9 @@ class KeyframeGraph:
 
     def add_keyframe(self, segment: Segment, guess: NavState) -> int:
         """Bind a new keyframe to the last one by a segment; returns its number."""
-        i, j = self.last, self.last + 1
+        self._segments[self.last] = segment
         self._insert(guess)
-        self._bind(i, segment)
-        return j
+        return self.last
 
     def add_apart(self, state: NavState) -> int:
         """A new keyframe that nothing binds to the last one; its covariance is its prior."""
@@ -113,8 +109,8 @@ class KeyframeGraph:
 
     def add(self, term: Term, gated: bool = True) -> None:
         """Take in a measurement, of positive definite covariance; `gated` ones may be outliers."""
-        limit = _quantile(self._gate, len(term.covariance)) if gated else math.inf
-        self._terms.append(_Whitened.of(term, limit))
+        limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
+        self._terms.append(Whitened.of(term, limit))
         self._tree = None
 
     def solve(self, most_rounds: int = 10) -> Solution:
@@ -127,22 +123,22 @@ class KeyframeGraph:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
                 keyframes stay as they were.
         """
-        start = self._values
+        start = self._states
         try:
-            rounds = self._optimise(most_rounds)
+            rounds, values = self._optimise(most_rounds)
+            self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._check_determined()
-            light = sum(term.weigh(self._values)[2] < 1.0 for term in self._terms)
-        except RuntimeError as error:  # gtsam's way to report it
-            self._values, self._tree = start, None
-            raise IndeterminateError(self._named(str(error))) from error
-        except IndeterminateError:
-            self._values, self._tree = start, None
-            raise
+            light = sum(term.weigh(values)[2] < 1.0 for term in self._terms)
+        except (RuntimeError, IndeterminateError) as error:
+            self._states, self._tree = start, None
+            if isinstance(error, IndeterminateError):
+                raise
+            raise IndeterminateError(self._named(str(error))) from error  # gtsam's way to tell
         return Solution(rounds, light)
 
     def pose(self, k: int) -> KeyframeState:
         """A keyframe without its covariance."""
-        return KeyframeState.of(self._values, k)
+        return self._states[k]
 
     def state(self, k: int) -> NavState:
         """A keyframe with its marginal covariance, after `solve`."""
@@ -160,57 +156,39 @@ class KeyframeGraph:
         old = [k for k in self._time if k < before]
         if not old:
             return
-        touched = gtsam.NonlinearFactorGraph()
-        for _first, factor in (item for item in self._factors if item[0] < before):
-            touched.add(factor)
-        linear = touched.linearize(self._values)
+        values = self._values()
+        linear = self._imu_factors(before).linearize(values)
         reached = [before]
         for term in self._terms:
             if term.first < before:
-                linear.push_back(term.factor(self._values))
+                linear.push_back(term.factor(values))
                 reached += [k for k in term.term.keyframes if k > before]
         keys = [key(k) for k in old for key in (X, V, B)]
         try:
             _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
             raise IndeterminateError(self._named(str(error))) from error
-        self._factors = [item for item in self._factors if item[0] >= before]
         self._terms = [term for term in self._terms if term.first >= before]
         self.add(self._marginal(range(before, max(reached) + 1), rest), gated=False)
-        for key in keys:
-            self._values.erase(key)
         for k in old:
-            del self._time[k]
+            del self._time[k], self._states[k]
             self._segments.pop(k, None)
         self._tree = None
 
-    def dump(self) -> dict[str, Any]:
-        """Everything that `load` needs: arrays, numbers, text, lists and dictionaries."""
-        return {
-            "keyframes": [[k, time, list(self.pose(k))] for k, time in self._time.items()],
-            "segments": [[i, segment.dump()] for i, segment in self._segments.items()],
-            "terms": [[*dumped(term.term), term.limit] for term in self._terms],
-        }
+    def _values(self) -> Any:
+        values = gtsam.Values()
+        for k, state in self._states.items():
+            state.insert_into(values, k)
+        return values
 
-    def load(self, dump: dict[str, Any]) -> None:
-        """Become what was dumped; `solve` comes before `state`."""
-        self._values, self._time, self._tree = gtsam.Values(), {}, None
-        for k, time, state in dump["keyframes"]:
-            self._time[k] = time
-            KeyframeState(*state).insert_into(self._values, k)
-        self.last = max(self._time)
-        self._factors, self._segments = [], {}
-        for i, segment in dump["segments"]:
-            self._bind(i, Segment.loaded(segment))
-        self._terms = []
-        for name, fields, limit in dump["terms"]:
-            self._terms.append(_Whitened.of(loaded(name, fields), limit))
-
-    def _bind(self, i: int, segment: Segment) -> None:
-        j = i + 1
-        imu = gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), segment.pim)
-        self._factors.append((i, imu))
-        self._segments[i] = segment
+    def _imu_factors(self, before: float = math.inf) -> Any:
+        """What binds each keyframe before one to the next."""
+        factors = gtsam.NonlinearFactorGraph()
+        for i, segment in self._segments.items():
+            if i < before:
+                j, pim = i + 1, segment.pim
+                factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
+        return factors
 
     def _marginal(self, reached: range, rest: Any) -> Prior:
         """What elimination left of the keyframes that it reached."""
@@ -226,36 +204,32 @@ class KeyframeGraph:
         self.last += 1
         k = self.last
         self._time[k] = state.time
-        about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-        about.insert_into(self._values, k)
+        self._states[k] = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
         self._tree = None
 
-    def _optimise(self, most_rounds: int) -> int:
+    def _optimise(self, most_rounds: int) -> tuple[int, Any]:
         """Full steps of Gauss and Newton, which follow the IMU's stiff factors as a filter does.
 
         A step may raise their error by its second order and yet be right, where a start was askew:
         Levenberg and Marquardt's damping then creeps, and a stream gives out what has not arrived.
         """
-        factors = gtsam.NonlinearFactorGraph()
-        for _first, factor in self._factors:
-            factors.add(factor)
-        ordering = self._ordering()
+        factors, values, ordering = self._imu_factors(), self._values(), self._ordering()
         for _round in range(most_rounds):
-            linear = factors.linearize(self._values)
+            linear = factors.linearize(values)
             for term in self._terms:
-                linear.push_back(term.factor(self._values))
+                linear.push_back(term.factor(values))
             self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
-            before = self._positions()
-            self._values = self._values.retract(self._tree.optimize())
-            moved = float(np.abs(self._positions() - before).max())
+            before = self._positions(values)
+            values = values.retract(self._tree.optimize())
+            moved = float(np.abs(self._positions(values) - before).max())
             if not moved > _MOVED:
                 break
         if not np.isfinite(moved):
             raise IndeterminateError("the optimisation diverged")
-        return _round + 1
+        return _round + 1, values
 
-    def _positions(self) -> FloatArray:
-        return np.array([self._values.atPose3(X(k)).translation() for k in self._time])
+    def _positions(self, values: Any) -> FloatArray:
+        return np.array([values.atPose3(X(k)).translation() for k in self._time])
 
     def _ordering(self) -> Any:
         """Time's: the graph is a chain whose longest link is a window."""
@@ -265,15 +239,8 @@ class KeyframeGraph:
         for k in (next(iter(self._time)), self.last):
             sigma = np.sqrt(np.diag(self.state(k).covariance))
             if not (sigma < _LOST_SIGMA).all():
-                groups = (
-                    "attitude",
-                    "velocity",
-                    "position",
-                    "gyroscope bias",
-                    "accelerometer bias",
-                )
                 worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
-                raise IndeterminateError(f"{groups[worst // 3]} at {self._time[k]:.1f} s")
+                raise IndeterminateError(f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s")
 
     def _named(self, message: str) -> str:
         """The state that gtsam's message is about."""
@@ -284,7 +251,7 @@ class KeyframeGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitened:
+class Whitened:
     """A term with its covariance's whitener (m, m) and the squared norm that is an outlier's."""
 
     term: Term
@@ -292,7 +259,7 @@ class _Whitened:
     limit: float
 
     @classmethod
-    def of(cls, term: Term, limit: float) -> _Whitened:
+    def of(cls, term: Term, limit: float) -> Whitened:
         """A term with the squared norm of its white residual from which it is an outlier."""
         return cls(term, np.linalg.inv(np.linalg.cholesky(term.covariance)), limit)
 
@@ -365,8 +332,3 @@ def _ordering(keys: list[int]) -> Any:
     for key in keys:
         ordering.push_back(key)
     return ordering
-
-
-@cache
-def _quantile(probability: float, dof: int) -> float:
-    return float(chi2.ppf(probability, dof))

@@ -1,7 +1,7 @@
-"""From raw samples to epochs: what stands before network and filter, alike in stream and batch.
+"""From raw samples to intervals: what stands before network and filter, alike in stream and batch.
 
 Samples are checked, brought into strictly increasing time and cut at an even grid of times, with
-the IMU interpolated exactly there (so that nothing is integrated twice or left out). Each epoch
+the IMU interpolated exactly there (so that nothing is integrated twice or left out). Each interval
 carries its samples; at the times of a network update also the window that ends there, once a
 second of unbroken samples is there.
 Samples that jump ahead in time wait until others confirm them, so that one wild timestamp does not
@@ -17,16 +17,15 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
-from stario.fusion.imu.intervals import Epoch, IntakeCounts, Start
-from stario.fusion.imu.outliers import Flags, Screen
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
+from stario.fusion.imu.outliers import Flags, OutlierDetector
 from stario.sequences.errors import InputError
 from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -39,7 +38,7 @@ from stario.sequences.windows import (
 )
 
 _TAIL = 4
-"""Samples kept of the epoch before: half a step of the window's grid at the fastest rate."""
+"""Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
 
 _ALONE = 20
 """Samples in a row that stand alone: then their times are not in seconds."""
@@ -51,8 +50,8 @@ Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
 
-class Intake:
-    """Collects samples and yields epochs.
+class FrontEnd:
+    """Collects samples and yields intervals.
 
     Args:
         config: update rate and levelling.
@@ -62,7 +61,7 @@ class Intake:
         self._config = config
         rate = config.filter.output_rate
         self._period = 1.0 / rate
-        self._blocks = round(rate * WINDOW_SECONDS)  # epochs in a window
+        self._blocks = round(rate * WINDOW_SECONDS)  # intervals in a window
         self._block_grid = np.arange(round(WINDOW_RATE / rate)) / WINDOW_RATE
         self._samples: list[Sample] = []
         self._attitude: LevelledAttitude | None = None
@@ -71,17 +70,17 @@ class Intake:
         self._newest = -math.inf
         self._window: deque[NDArray[np.float32]] = deque(maxlen=self._blocks)
         self._starts: deque[FloatArray] = deque(maxlen=self._blocks)
-        self._suspect: deque[bool] = deque(maxlen=self._blocks)
-        self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the epoch
+        self._flagged: deque[bool] = deque(maxlen=self._blocks)
+        self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
-        self._screen = Screen()
+        self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
-        self.counts = IntakeCounts()
+        self.counts = SampleCounts()
         self.start: Start | None = None
 
-    def push(self, sample: Sample) -> list[Epoch]:
-        """Take one sample in; returns the epochs it completes (mostly none, seldom several)."""
+    def push(self, sample: Sample) -> list[ImuInterval]:
+        """Take one sample in; returns the intervals it completes (mostly none, seldom several)."""
         time = sample[0]
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < _ABSURD):
             self.counts.not_finite += 1
@@ -114,7 +113,7 @@ class Intake:
             ahead.pop()
         self.counts.future += known - len(ahead)
 
-    def _confirm(self, sample: Sample) -> list[Epoch]:
+    def _confirm(self, sample: Sample) -> list[ImuInterval]:
         """A jump ahead in time, or a sample after one: enough of them confirm the jump."""
         ahead = self._ahead
         ahead.append(sample)
@@ -122,9 +121,9 @@ class Intake:
         if len(ahead) < (CONFIRMED_FAR if far else CONFIRMED):
             return []
         self._ahead = []
-        return [epoch for waiting in ahead for epoch in self._accept(waiting)]
+        return [interval for waiting in ahead for interval in self._accept(waiting)]
 
-    def _accept(self, sample: Sample) -> list[Epoch]:
+    def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
         gap = time - self._newest > MAX_IMU_GAP and bool(self._samples)
         self._newest = time
@@ -136,7 +135,7 @@ class Intake:
             return []
         return self._begin() if self._attitude is None else self._complete()
 
-    def _begin(self) -> list[Epoch]:
+    def _begin(self) -> list[ImuInterval]:
         """Level the first attitude once its stretch is there, then catch up."""
         first = self._samples[0][0]
         # One sample alone: its time is so large that a second does not count beside it.
@@ -148,14 +147,14 @@ class Intake:
         start = Start(first, gravity.R_WB, gravity.still, gravity.force)
         self._attitude = LevelledAttitude(gravity.R_WB, self._config.levelling_rate)
         self._restart_grid(first)
-        epochs = []
+        intervals = []
         if self.start is None:
             self.start = start
         elif self._before_long_gap is not None:
             ends = np.array([self._before_long_gap, self._samples[0]])
-            epochs.append(replace(_epoch(ends, self._attitude, gap=True), anew=start))
+            intervals.append(replace(_interval(ends, self._attitude, gap=True), anew=start))
             self._before_long_gap = None
-        return epochs + self._complete()
+        return intervals + self._complete()
 
     def _check_pace(self) -> None:
         """Refuse a stream of which every sample from the first on stands alone."""
@@ -166,49 +165,49 @@ class Intake:
                 "time", f"samples {step:.3g} s apart", "50 to 1000 in a second", "give times in s"
             )
 
-    def _bridge_gap(self, sample: Sample) -> list[Epoch]:
-        """End the epoch in progress, span the gap by one of its own, start the grid anew."""
+    def _bridge_gap(self, sample: Sample) -> list[ImuInterval]:
+        """End the interval in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
         self.counts.add_gap(before[-1][0], sample[0] - before[-1][0])
         self._check_pace()
         self._window.clear()
         self._starts.clear()
-        self._suspect.clear()
+        self._flagged.clear()
         self._tail = None
         if self._attitude is None:
             self._next = -math.inf
             return []
-        epochs = []
+        intervals = []
         if len(before) > 1:
             table = np.array(before)
-            flags = self._look(table)
-            epochs.append(replace(_epoch(table, self._attitude), flags=flags))
+            flags = self._flag_outliers(table)
+            intervals.append(replace(_interval(table, self._attitude), flags=flags))
         if sample[0] - before[-1][0] > LONG_GAP:
             self._attitude, self._before_long_gap = None, before[-1]
             self._next = -math.inf
-            return epochs
+            return intervals
         self._attitude.restart()
-        epochs.append(_epoch(np.array([before[-1], sample]), self._attitude, gap=True))
+        intervals.append(_interval(np.array([before[-1], sample]), self._attitude, gap=True))
         self._restart_grid(sample[0])
-        return epochs
+        return intervals
 
     def _restart_grid(self, origin: float) -> None:
         self._origin, self._index = origin, 1
         self._next = origin + self._period
 
-    def _complete(self) -> list[Epoch]:
-        epochs = []
+    def _complete(self) -> list[ImuInterval]:
+        intervals = []
         while self._newest >= self._next:
-            epochs.append(self._with_window(*self._cut()))
-        return epochs
+            intervals.append(self._with_window(*self._cut()))
+        return intervals
 
     def _cut(self) -> tuple[FloatArray, Flags]:
         """Samples of one period, the last one interpolated at its end; the rest stays."""
         stop = self._next
         later = next(k for k, sample in enumerate(self._samples) if sample[0] >= stop)
         table = np.array(self._samples[: later + 1])
-        flags = self._look(table)
+        flags = self._flag_outliers(table)
         if flags.spikes:
             self._samples[later] = tuple(table[later].tolist())
         after = self._samples[later]
@@ -220,96 +219,59 @@ class Intake:
         table[later] = end
         return table, flags
 
-    def _look(self, table: FloatArray) -> Flags:
-        flags = self._screen.look(table)
+    def _flag_outliers(self, table: FloatArray) -> Flags:
+        flags = self._outliers.look(table)
         self.counts.spike += flags.spikes
         self.counts.saturated += flags.saturated
         return flags
 
-    def _with_window(self, table: FloatArray, flags: Flags) -> Epoch:
+    def _with_window(self, table: FloatArray, flags: Flags) -> ImuInterval:
         attitude = self._attitude
-        assert attitude is not None  # no epoch is cut before the start
+        assert attitude is not None  # no interval is cut before the start
         self._starts.append(attitude.R_NB)
-        self._suspect.append(flags.gyro or flags.accel)
-        # _cut() has counted this epoch already.
-        update = (self._index - 1) % self._config.filter.epochs_per_update == 0
-        epoch = replace(_epoch(table, attitude), update=update, flags=flags)
-        self._window.append(self._block(epoch))
+        self._flagged.append(flags.gyro or flags.accel)
+        # _cut() has counted this interval already.
+        update = (self._index - 1) % self._config.filter.intervals_per_update == 0
+        interval = replace(_interval(table, attitude), update=update, flags=flags)
+        self._window.append(self._block(interval))
         if not update or len(self._window) < self._blocks:
-            return epoch
+            return interval
         window = np.concatenate(self._window, axis=1)
-        suspect = any(self._suspect)
-        return replace(epoch, window=window, R_NB_window=self._starts[0], suspect=suspect)
+        window_flagged = any(self._flagged)
+        return replace(
+            interval, window=window, R_NB_window=self._starts[0], window_flagged=window_flagged
+        )
 
-    def _block(self, epoch: Epoch) -> NDArray[np.float32]:
-        """The epoch's part (6, n) of a window; averages reach half a step back, hence the tail."""
-        imu_N = _turned(epoch.attitudes, epoch.gyro, epoch.accel)
-        time, tail = epoch.time, self._tail
+    def _block(self, interval: ImuInterval) -> NDArray[np.float32]:
+        """An interval's part (6, n) of a window; averages reach half a step back: the tail."""
+        imu_N = _turned(interval.attitudes, interval.gyro, interval.accel)
+        time, tail = interval.time, self._tail
         self._tail = np.column_stack([time[-_TAIL - 1 : -1], imu_N[-_TAIL - 1 : -1]])
         if tail is not None:
             time, imu_N = np.append(tail[:, 0], time), np.vstack([tail[:, 1:], imu_N])
-        grid = epoch.start + self._block_grid
+        grid = interval.start + self._block_grid
         return resample(time, imu_N, grid).astype(np.float32).T
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Everything that `rewind` needs: arrays, numbers, text, lists and dictionaries."""
-        return {
-            "samples": np.array(self._samples).reshape(-1, 7),
-            "ahead": np.array(self._ahead).reshape(-1, 7),
-            "before_long_gap": self._before_long_gap and list(self._before_long_gap),
-            "attitude": self._attitude and vars(self._attitude),
-            "grid": [self._origin, self._index, self._next, self._newest],
-            "window": list(self._window),
-            "starts": list(self._starts),
-            "suspect": list(self._suspect),
-            "tail": self._tail,
-            "largest": self._screen.largest,
-            "gyro_unit": self.gyro_unit.checkpoint(),
-            "counts": asdict(self.counts),
-            "start": self.start and vars(self.start),
-        }
 
-    def rewind(self, checkpoint: dict[str, Any]) -> None:
-        """Go back to a checkpoint."""
-        self._samples, self._ahead = (
-            [tuple(row) for row in checkpoint[name].tolist()] for name in ("samples", "ahead")
-        )
-        last = checkpoint["before_long_gap"]
-        self._before_long_gap = None if last is None else tuple(last)
-        self._attitude = None
-        if checkpoint["attitude"] is not None:
-            self._attitude = LevelledAttitude(np.eye(3), self._config.levelling_rate)
-            vars(self._attitude).update(checkpoint["attitude"])
-        self._origin, self._index, self._next, self._newest = checkpoint["grid"]
-        for name in ("window", "starts", "suspect"):
-            values = getattr(self, f"_{name}")
-            values.clear()
-            values.extend(checkpoint[name])
-        self._tail, self._screen.largest = checkpoint["tail"], checkpoint["largest"]
-        self.gyro_unit.rewind(checkpoint["gyro_unit"])
-        counts = checkpoint["counts"]
-        gaps = [(float(start), float(length)) for start, length in counts["gaps"]]
-        self.counts = IntakeCounts(**(counts | {"gaps": gaps}))
-        self.start = None if checkpoint["start"] is None else Start(**checkpoint["start"])
-
-
-def all_epochs(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[Epoch], Intake]:
-    """Every epoch of a recording, and the intake with its counts and start."""
-    intake = Intake(config)
-    epochs: list[Epoch] = []
+def cut_recording(
+    sequence: ImuSequence, config: NavigatorConfig
+) -> tuple[list[ImuInterval], FrontEnd]:
+    """Every interval of a recording, and the front end with its counts and start."""
+    front_end = FrontEnd(config)
+    intervals: list[ImuInterval] = []
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        epochs += intake.push(tuple(sample))
-    intake.finish()
-    return epochs, intake
+        intervals += front_end.push(tuple(sample))
+    front_end.finish()
+    return intervals, front_end
 
 
-def _epoch(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) -> Epoch:
+def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) -> ImuInterval:
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:7]
     if gap:
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)
-    return Epoch(time, gyro, accel, gap, attitudes, attitude.R_NB)
+    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB)
 
 
 def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:

@@ -7,11 +7,9 @@ no calm one in between, are needed to refuse the stream.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from stario.fusion.imu.intervals import Epoch
+from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.checks import average_force, check_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -32,26 +30,26 @@ in deg/s; the second by hardly any walk (recorded are 4.2 at most), but by all r
 
 
 class GyroUnitWatch:
-    """Looks at a stream's epochs until the unit of the gyroscope is beyond doubt."""
+    """Looks at a stream's intervals until the unit of the gyroscope is beyond doubt."""
 
     def __init__(self) -> None:
         self._tables: list[FloatArray] = []  # time, gyro, accel (k, 7) of the piece so far
         self._wrong = self._turned = 0
 
-    def look(self, epoch: Epoch) -> None:
-        """Take in the stream's next epoch.
+    def look(self, interval: ImuInterval) -> None:
+        """Take in the stream's next interval.
 
         Raises:
             InputError: the gyroscope cannot be in rad/s.
         """
-        if epoch.gap:
+        if interval.gap:
             self._tables = []
             return
         if self._turned >= _TURNED:
             return
-        table = np.column_stack([epoch.time, epoch.gyro, epoch.accel])
+        table = np.column_stack([interval.time, interval.gyro, interval.accel])
         self._tables.append(table[1:] if self._tables else table)
-        if epoch.stop - self._tables[0][0, 0] > _PIECE_S - 1e-6:
+        if interval.stop - self._tables[0][0, 0] > _PIECE_S - 1e-6:
             piece, self._tables = np.vstack(self._tables), []
             self._judge(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 
@@ -68,15 +66,6 @@ class GyroUnitWatch:
             if speed < _DOUBTFUL_RAD_S:
                 self._wrong = 0
                 self._turned += int(speed > _TURNING_RAD_S)
-
-    def checkpoint(self) -> dict[str, Any]:
-        """Everything that `rewind` needs."""
-        return {"tables": list(self._tables), "wrong": self._wrong, "turned": self._turned}
-
-    def rewind(self, checkpoint: dict[str, Any]) -> None:
-        """Go back to a checkpoint."""
-        self._tables = list(checkpoint["tables"])
-        self._wrong, self._turned = checkpoint["wrong"], checkpoint["turned"]
 
 
 def _check_piece(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:

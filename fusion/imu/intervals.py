@@ -1,14 +1,13 @@
-"""What the intake hands on: epochs of samples, where they start, and what became of the rest."""
+"""What the front end hands on: intervals of samples, their start, and counts of the others."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.fusion.imu.outliers import FINE, Flags
+from stario.fusion.imu.outliers import NO_FLAGS, Flags
 from stario.fusion.state import Health
 from stario.sequences.sequence import FloatArray
 
@@ -24,7 +23,7 @@ class Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Epoch:
+class ImuInterval:
     """The stretch between two times of the grid.
 
     Attributes:
@@ -37,7 +36,7 @@ class Epoch:
         suspect: whether samples of the window's are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
-        update: whether windows begin and end at this epoch's end.
+        update: whether windows begin and end at this interval's end.
         window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
     """
@@ -52,22 +51,12 @@ class Epoch:
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
     anew: Start | None = None
-    flags: Flags = FINE
-    suspect: bool = False
+    flags: Flags = NO_FLAGS
+    window_flagged: bool = False
 
-    def dump(self) -> dict[str, Any]:
-        """What an estimator needs of it, as arrays, numbers and None, for `loaded`."""
-        known = {item.name: getattr(self, item.name) for item in fields(self)}
-        anew = None if self.anew is None else vars(self.anew)
-        dropped = {"attitudes": None, "window": None}
-        return known | {"anew": anew, "flags": list(self.flags)} | dropped
-
-    @staticmethod
-    def loaded(dump: dict[str, Any]) -> Epoch:
-        """The epoch of a `dump`; its window and attitudes, which the network saw, are gone."""
-        anew = None if dump["anew"] is None else Start(**dump["anew"])
-        seen = {"anew": anew, "flags": Flags(*dump["flags"]), "attitudes": np.empty((0, 3, 3))}
-        return Epoch(**(dump | seen))
+    def without_window(self) -> ImuInterval:
+        """What an estimator needs of it, without what only the network sees."""
+        return replace(self, window=None, attitudes=_NONE_KEPT)
 
     @property
     def start(self) -> float:
@@ -80,12 +69,14 @@ class Epoch:
         return float(self.time[-1])
 
 
+_NONE_KEPT = np.empty((0, 3, 3))
+
 GAPS_LISTED = 100
 """How many gaps are kept one by one: an endless stream may have any number."""
 
 
 @dataclass
-class IntakeCounts:
+class SampleCounts:
     """What became of the samples.
 
     Attributes:

@@ -38,8 +38,8 @@ class Flags(NamedTuple):
     saturated: int = 0
 
 
-class Screen:
-    """Looks through the samples of one stream, epoch by epoch."""
+class OutlierDetector:
+    """Looks through the samples of one stream, interval by interval."""
 
     def __init__(self) -> None:
         self.largest = np.zeros(6)
@@ -60,7 +60,7 @@ class Screen:
             stuck = self._stuck(values)
         wrong = (spikes + stuck) > 0
         if not wrong.any():
-            return FINE
+            return NO_FLAGS
         return Flags(
             bool(wrong[:3].any()), bool(wrong[3:].any()), int(spikes.max()), int(stuck.max())
         )
@@ -89,7 +89,7 @@ class Screen:
         return np.asarray(repeated.sum(axis=0), dtype=np.float64)
 
 
-FINE = Flags()
+NO_FLAGS = Flags()
 """Nothing is wrong."""
 
 _NO_AXES = np.zeros(6)

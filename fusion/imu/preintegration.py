@@ -6,14 +6,8 @@ samples are therefore first turned into the equivalent constants (`corrected_inc
 gtsam accumulates the rotation as one rotation vector, to first order per step: segments of a tenth
 of a second lose nothing (4e-6 rad per second in lively motion at 200 Hz), whole seconds do (1e-3).
 
-Error state, its order and its meaning (right-invariant, first order):
-    theta [rad], rho_v [m/s], rho_p [m], d_bg [rad/s], d_ba [m/s^2]
-    R = (I + [theta]x) R^,  v = v^ + rho_v - [v^]x theta,  p = p^ + rho_p - [p^]x theta
-where ^ marks the estimate. The transition of theta, rho_v, rho_p does not depend on the state, so
-the filter cannot learn yaw or position by linearising at different estimates.
-
 Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
-2017; A. Barrau, S. Bonnabel, 2017 (invariant error); P. Savage, "Strapdown inertial navigation
+2017; P. Savage, "Strapdown inertial navigation
 integration algorithm design", 1998 (coning, sculling).
 """
 
@@ -23,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -32,27 +26,9 @@ from stario.fusion.lie import FloatArray, skew
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 
-CORE = 15
-"""Size of the error state of one navigation state."""
-
 # gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
 # the graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
-
-
-class Propagation(NamedTuple):
-    """State at a segment's end and its linearisation, order theta, rho_v, rho_p, d_bg, d_ba."""
-
-    R_WB: FloatArray
-    """(3, 3)."""
-    v_W: FloatArray
-    """(3,) [m/s]."""
-    p_W: FloatArray
-    """(3,) [m]."""
-    transition: FloatArray
-    """(15, 15)."""
-    noise: FloatArray
-    """(15, 15)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +52,14 @@ class Segment:
         """Length of the segment [s]."""
         return self.stop - self.start
 
-    def dump(self) -> dict[str, Any]:
-        """Everything that `loaded` needs; the samples folded as gtsam's own text archive."""
-        head = {"start": self.start, "stop": self.stop, "gravity": self.gravity}
-        return {**head, "pim": self.pim.serialize()}
+    def __getstate__(self) -> dict[str, Any]:
+        """The samples folded as gtsam's own text archive, equal to the last bit."""
+        return vars(self) | {"pim": self.pim.serialize()}
 
-    @classmethod
-    def loaded(cls, dump: dict[str, Any]) -> Segment:
-        """A segment from its `dump`, equal to the last bit."""
-        pim = gtsam.PreintegratedCombinedMeasurements(_params(ImuNoise(), dump["gravity"]))
-        pim.deserialize(dump["pim"])
-        return cls(dump["start"], dump["stop"], dump["gravity"], pim)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        pim = gtsam.PreintegratedCombinedMeasurements(_params(ImuNoise(), state["gravity"]))
+        pim.deserialize(state["pim"])
+        vars(self).update(state | {"pim": pim})
 
     def predict(
         self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
@@ -106,34 +79,6 @@ class Segment:
         start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
         end = self.pim.predict(start, gtsam.imuBias.ConstantBias(b_a, b_g))
         return end.attitude().matrix(), end.velocity(), end.position()
-
-    def linearise(
-        self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
-    ) -> Propagation:
-        """`predict`, with the transition and the noise of the right-invariant error.
-
-        gtsam's tangent is local, R exp(w), p + R dp, v + R dv, in the order rotation, position,
-        velocity, accelerometer bias, gyroscope bias; the adjoint of the end state turns it into
-        the right-invariant error.
-        """
-        start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
-        bias_jacobian = np.empty((9, 6), order="F")
-        bias = gtsam.imuBias.ConstantBias(b_a, b_g)
-        end = self.pim.predict(start, bias, None, bias_jacobian)
-        R, v, p = end.attitude().matrix(), end.velocity(), end.position()
-
-        adjoint = _BIAS_SWAP.copy()
-        adjoint[0:3, 0:3] = R
-        adjoint[3:6, 6:9] = R
-        adjoint[6:9, 3:6] = R
-        adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
-        noise = adjoint @ self.pim.residualCovariance() @ adjoint.T
-
-        transition = _nav_transition(self.duration, self.gravity)
-        by_bias = adjoint[:9, :9] @ bias_jacobian
-        transition[:9, 9:12] = by_bias[:, 3:]
-        transition[:9, 12:15] = by_bias[:, :3]
-        return Propagation(R, v, p, transition, noise)
 
 
 def preintegrate(
@@ -213,20 +158,6 @@ def corrected_increments(
 
 _SHARES = np.array([1.0 / 24.0, 1.0 / 12.0])
 _EYE = np.eye(3)
-_IDENTITY = np.eye(CORE)
-_BIAS_SWAP = np.zeros((CORE, CORE))
-_BIAS_SWAP[9:12, 12:15] = np.eye(3)
-_BIAS_SWAP[12:15, 9:12] = np.eye(3)
-
-
-def _nav_transition(dt: float, gravity: float) -> FloatArray:
-    """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
-    transition = _IDENTITY.copy()
-    fall, drop = gravity * dt, 0.5 * gravity * dt * dt
-    transition[3, 1], transition[4, 0] = fall, -fall
-    transition[6, 1], transition[7, 0] = drop, -drop
-    transition[6, 3] = transition[7, 4] = transition[8, 5] = dt
-    return transition
 
 
 def _new_params(noise: ImuNoise, gravity: float) -> Any:

@@ -1,4 +1,4 @@
-"""An epoch's samples as a preintegrated segment, with the noise that holds there."""
+"""an interval's samples as a preintegrated segment, with the noise that holds there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from itertools import chain, repeat
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.intervals import Epoch
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
@@ -21,43 +21,53 @@ _STEP = 0.02
 
 
 def segment_of(
-    epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+    interval: ImuInterval,
+    R_WB: FloatArray,
+    b_g: FloatArray,
+    b_a: FloatArray,
+    config: NavigatorConfig,
 ) -> Segment:
-    """The segment from an epoch's start to its end.
+    """The segment from an interval's start to its end.
 
     Args:
-        epoch: samples, or a gap.
+        interval: samples, or a gap.
         R_WB: (3, 3) attitude at its start; only a gap needs it.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
     """
-    if epoch.gap:
-        return _unseen(epoch, R_WB, b_g, b_a, config)
-    noise = _noise(epoch, config)
-    return preintegrate(epoch.time, epoch.gyro, epoch.accel, b_g, b_a, noise, config.gravity)
+    if interval.gap:
+        return _unseen(interval, R_WB, b_g, b_a, config)
+    noise = _noise(interval, config)
+    return preintegrate(
+        interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
+    )
 
 
 def segment_of_all(
-    epochs: Sequence[Epoch], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+    intervals: Sequence[ImuInterval], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
 ) -> Segment:
-    """The segment of several epochs in a row, none of them a gap, each with its own noise.
+    """The segment of several intervals in a row, none of them a gap, each with its own noise.
 
     The noise of their mean would spread over half a second what a step's impact did in a tenth;
     position and speed at the end are then correlated as they are not.
     """
-    first, rest = epochs[0], epochs[1:]
+    first, rest = intervals[0], intervals[1:]
 
     def joined(name: str) -> FloatArray:  # each begins with the sample that ended the one before
         return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
 
-    noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in epochs)
+    noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in intervals)
     samples = joined("time"), joined("gyro"), joined("accel")
     return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
 
 
 def _unseen(
-    epoch: Epoch, R_WB: FloatArray, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+    interval: ImuInterval,
+    R_WB: FloatArray,
+    b_g: FloatArray,
+    b_a: FloatArray,
+    config: NavigatorConfig,
 ) -> Segment:
     """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
     hover = R_WB.T @ [0.0, 0.0, config.gravity] + b_a
@@ -67,25 +77,25 @@ def _unseen(
         accel_noise=config.filter.gap_accel_noise,
     )
     # In one step position and velocity would be in error together: no graph can invert that.
-    time = np.linspace(epoch.start, epoch.stop, _GAP_STEPS + 1)
+    time = np.linspace(interval.start, interval.stop, _GAP_STEPS + 1)
     gyro, accel = np.tile(b_g, (len(time), 1)), np.tile(hover, (len(time), 1))
     return preintegrate(time, gyro, accel, b_g, b_a, noise, config.gravity)
 
 
-def _noise(epoch: Epoch, config: NavigatorConfig) -> ImuNoise:
+def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     """White noise that grows with motion: scale and alignment errors act like it."""
     noise, f = config.noise, config.filter
     gyro, accel = noise.gyro_noise, noise.accel_noise
     # What a saturated sensor missed is as unknown as what happens in a gap.
-    if epoch.flags.gyro:
+    if interval.flags.gyro:
         gyro = max(gyro, f.gap_gyro_noise)
-    if epoch.flags.accel:
+    if interval.flags.accel:
         accel = max(accel, f.gap_accel_noise)
     if f.gyro_motion_noise > 0.0:
-        rate = math.sqrt(float(np.vdot(epoch.gyro, epoch.gyro)) / len(epoch.gyro))
+        rate = math.sqrt(float(np.vdot(interval.gyro, interval.gyro)) / len(interval.gyro))
         gyro = _in_steps(math.hypot(gyro, f.gyro_motion_noise * rate))
     if f.accel_motion_noise > 0.0:
-        excess = np.sqrt(np.einsum("ni,ni->n", epoch.accel, epoch.accel)) - config.gravity
+        excess = np.sqrt(np.einsum("ni,ni->n", interval.accel, interval.accel)) - config.gravity
         motion = math.sqrt(float(excess @ excess) / len(excess))
         accel = _in_steps(math.hypot(accel, f.accel_motion_noise * motion))
     return ImuNoise(gyro, accel, noise.gyro_walk, noise.accel_walk)

@@ -1,4 +1,4 @@
-"""The network along one track: its windows in order of time, its memory gone after each gap."""
+"""Stateful inference: a track's windows in the order of time, the memory gone after each gap."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from stario.sequences.sequence import FloatArray
 class Predictor(Protocol):
     """What a navigator needs of a model; `DisplacementModel` is one.
 
-    A model whose network remembers earlier windows has `along_track(updates)` besides, which gives
-    a predictor for the windows of one unbroken stretch.
+    A model whose network remembers earlier windows has `stateful_inference(updates)` besides, which
+    gives a predictor for the windows of one unbroken stretch.
     """
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -22,8 +22,8 @@ class Predictor(Protocol):
         ...
 
 
-class AlongTrack:
-    """A model's word on the windows of one track.
+class StatefulInference:
+    """What a model predicts of the windows of one track.
 
     Args:
         model: may remember.
@@ -41,7 +41,7 @@ class AlongTrack:
 
     def restart(self) -> None:
         """Forget what was before a gap."""
-        begin = getattr(self._model, "along_track", None)
+        begin = getattr(self._model, "stateful_inference", None)
         self._stretch: Any = self._model if begin is None else begin(self._updates)
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -49,18 +49,19 @@ class AlongTrack:
         answer: tuple[FloatArray, FloatArray] = self._stretch.predict(windows)
         return answer
 
-    def checkpoint(self) -> Any:
-        """What the network remembers, as a tree of arrays and numbers; None without memory."""
-        return self._stretch.checkpoint() if self.remembers else None
-
-    def rewind(self, memory: Any) -> None:
-        """Take up what a `checkpoint` of the same model gave.
+    @property
+    def memory(self) -> Any:
+        """What the network remembers, as arrays and numbers; None without memory.
 
         Raises:
-            InputError: one of the two has no memory.
+            InputError: a memory is put back into a network that has none, or the reverse.
         """
+        return self._stretch.memory if self.remembers else None
+
+    @memory.setter
+    def memory(self, memory: Any) -> None:
         self.restart()
         if (memory is not None) != self.remembers:
             raise InputError("snapshot: network", "another kind of memory", "the same network's")
         if self.remembers:
-            self._stretch.rewind(memory)
+            self._stretch.memory = memory

@@ -93,7 +93,7 @@ def _gaps(health: Health) -> list[Finding]:
         return [Finding("note", text)]
     advice = (
         "Keep the logger in the foreground and exempt it from battery saving; "
-        "a fix of position or heading behind the gap brings the direction back."
+        "a fix of position or yaw behind the gap brings the direction back."
     )
     return [Finding("warning", text, advice)]
 
@@ -143,5 +143,5 @@ def _direction(health: Health) -> list[Finding]:
     if yaw <= YAW_SIGMA:
         return []
     text = f"The direction is known to {math.degrees(yaw):.0f} degrees only (1 sigma)."
-    advice = "Rest for two seconds now and then, or give a fix of heading or two of position."
+    advice = "Rest for two seconds now and then, or give a fix of yaw or two of position."
     return [Finding("warning", text, advice)]

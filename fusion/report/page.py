@@ -110,8 +110,7 @@ def report_html(
         (t.innovations for t in tracks.values() if t.innovations), None
     )
     if innovations is not None and len(innovations.time):
-        unit = "m" if config.filter.measurement == "displacement" else "m/s"
-        panels += innovation_panels(innovations, start, config.filter.gate, unit)
+        panels += innovation_panels(innovations, start, config.filter.gate, "m")
     figures = {
         "map": json.loads(map_figure(steady if truth is None else series, known).to_json()),
         "time": json.loads(time_figure(panels).to_json()),

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.android import is_android, read_android
 from stario.sequences.readers.archive import (
     Where,
     archive_members,
@@ -24,6 +23,8 @@ from stario.sequences.readers.imunet import is_imunet, read_imunet
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv, write_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
+from stario.sequences.readers.phone import is_phone, read_phone
+from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.ridi import is_ridi, read_ridi
 from stario.sequences.readers.rnin import is_rnin, read_rnin
 from stario.sequences.readers.ronin import is_ronin, read_ronin
@@ -64,7 +65,7 @@ FORMATS: dict[str, Format] = {
     "bag": Format(is_bag, read_bag, options=("imu_topic", "truth_topic")),
     "euroc": Format(is_euroc, read_euroc),
     "oxiod": Format(is_oxiod, read_oxiod),
-    "android": Format(is_android, read_android),
+    "phone": Format(is_phone, read_phone),
     "csv": Format(is_own_csv, read_own_csv),
 }
 """Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
@@ -221,9 +222,13 @@ def _names() -> str:
 def _unknown(path: Path) -> ReadError:
     """What was seen instead of a recording, in one line."""
     fix = ""
-    if path.is_dir():
-        inside = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        names = ", ".join(inside[:5]) + (f" and {len(inside) - 5} more" if len(inside) > 5 else "")
+    if path.is_dir() and (inside := sorted(_below(path))):
+        found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
+    elif path.is_dir() and (poses := pose_files(path)):
+        found, fix = f"poses alone, {poses[0].name}", "put the IMU's files beside them"
+    elif path.is_dir():
+        there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
     elif magic(path, 2)[:1] == b"\x80":
         found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"

@@ -7,6 +7,9 @@ upright as the authors do, (x, -z, y), and the attitude is theirs as well:
 pose[0] conj(orientation[0]) orientation, turned likewise. RIDI's raw folders have the same files in
 a world with z up already: the specific force tells them apart.
 
+Its authors' later recorder writes several files of poses (of the camera, the display, the sensor);
+of them the one is taken that agrees with the gyroscope, see `poses`.
+
 A processed recording, `processed/data.csv`, is read instead where there is one.
 """
 
@@ -20,6 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
 from stario.sequences.readers.text import IntArray, first_line, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
@@ -40,14 +44,16 @@ def read_imunet(path: Path) -> ImuSequence:
     accel_ns, accel = _rows(folder / "acce.txt", 3)
     stamps, gyro, accel = on_one_clock(folder, gyro_ns, gyro, accel_ns, accel)
     time = seconds(stamps, stamps[0])
-    return ImuSequence(
+    poses = pose_files(folder)
+    sequence = ImuSequence(
         name=folder.resolve().name,
         time=time,
         gyro=gyro,
         accel=accel,
-        truth=_truth(folder, stamps[0], time, accel),
+        truth=_truth(folder, stamps[0], time, accel) if len(poses) == 1 else None,
         magnetometer=_magnetometer(folder / "magnet.txt", stamps[0]),
     )
+    return sequence if sequence.truth else with_pose(sequence, stamps[0], poses)
 
 
 def is_imunet(path: Path) -> bool:

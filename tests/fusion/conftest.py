@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import all_epochs
+from stario.fusion.imu.front_end import cut_recording
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
@@ -37,8 +37,8 @@ class Oracle:
         seed: int = 0,
     ) -> None:
         rng = np.random.default_rng(seed)
-        epochs, _ = all_epochs(sequence, config)
-        known = [e for e in epochs if e.window is not None]
+        intervals, _ = cut_recording(sequence, config)
+        known = [e for e in intervals if e.window is not None]
         stop = np.array([e.stop for e in known])
         first, last = truth.at(stop - WINDOW_SECONDS), truth.at(stop)
         R_NB = Rotation.from_matrix(np.stack([e.R_NB_window for e in known]))

@@ -24,7 +24,6 @@ FILTER = FilterConfig(
 NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
 CONFIG = NavigatorConfig(NOISE, FILTER)
 GRAPH = NavigatorConfig(NOISE, replace(FILTER, update_rate=2))
-VELOCITY = NavigatorConfig(NOISE, replace(FILTER, measurement="velocity"))
 
 
 def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:

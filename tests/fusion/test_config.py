@@ -22,7 +22,6 @@ gravity = 9.81
 [filter]
 update_rate = 5
 covariance_scale = 2      # an integer where a number is meant
-measurement = "velocity"
 [noise]
 gyro_noise = 1e-3
 """
@@ -36,7 +35,7 @@ def test_toml_sets_what_it_names_and_leaves_the_rest(tmp_path: Path) -> None:
         default,
         gravity=9.81,
         noise=replace(default.noise, gyro_noise=1e-3),
-        filter=replace(default.filter, update_rate=5, covariance_scale=2.0, measurement="velocity"),
+        filter=replace(default.filter, update_rate=5, covariance_scale=2.0),
     )
 
 
@@ -55,7 +54,7 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
 def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
     config = NavigatorConfig(
         noise=ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3),
-        filter=FilterConfig(update_rate=20, measurement="velocity", gate=0.99),
+        filter=FilterConfig(update_rate=20, gate=0.99),
         levelling_rate=0.1,
     )
     write_json(tmp_path / "config.json", asdict(config))
@@ -118,6 +117,6 @@ def test_a_missing_file_or_a_folder_is_a_known_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate", UPDATE_RATES)
 def test_updates_fall_on_states_and_overlap_is_paid_for(rate: int) -> None:
     config = FilterConfig(update_rate=rate, covariance_scale=1.0)
-    assert config.epochs_per_update * rate == config.output_rate >= 10
+    assert config.intervals_per_update * rate == config.output_rate >= 10
     assert config.window_updates == rate
     assert config.overlap_scale == pytest.approx(rate)

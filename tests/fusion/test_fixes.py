@@ -11,16 +11,18 @@ import support
 from scipy.spatial.transform import Rotation
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.jacobians import (
-    heading_jacobian,
     position_jacobian,
     velocity_jacobian,
-    yaw_twist,
+    yaw_jacobian,
 )
-from stario.fusion.fixes import Fix, cut, heading_fix, position_fix, read_fixes, velocity_fix
-from stario.fusion.imu.front_end import all_epochs
+from stario.fusion.fix_file import read_fixes
+from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
+from stario.fusion.imu.cutting import cut
+from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.lie import exp_se23, exp_so3
+from stario.fusion.yaw import yaw_twist
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
@@ -30,9 +32,6 @@ from stario.sequences.simulation.imu import ImuErrors
 NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
 CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate=1))
-VELOCITY = NavigatorConfig(
-    noise=NOISE, filter=FilterConfig(update_rate=10, measurement="velocity", covariance_scale=1.0)
-)
 EYE = np.eye(3)
 
 Make = Callable[..., Any]
@@ -59,7 +58,7 @@ def fixes_of(walk: ImuSequence) -> list[Fix]:
     p, v, yaw = zip(*(truth_at(walk, t) for t in (5.03, 12.0, 20.377)), strict=True)
     return [
         position_fix(5.03, p[0], 0.01 * EYE),
-        heading_fix(12.0, yaw[1], 0.05),
+        yaw_fix(12.0, yaw[1], 0.05),
         velocity_fix(20.377, v[2], 0.01 * EYE),
         position_fix(20.377, p[2], 0.04 * EYE),
     ]
@@ -71,7 +70,7 @@ def give(navigator: Navigator, fix: Fix) -> None:
     elif fix.kind == "velocity":
         navigator.update_velocity(fix.time, fix.value, fix.covariance)
     else:
-        navigator.update_heading(fix.time, fix.value[0], float(np.sqrt(fix.covariance[0, 0])))
+        navigator.update_yaw(fix.time, fix.value[0], float(np.sqrt(fix.covariance[0, 0])))
 
 
 def streamed(navigator: Navigator, walk: ImuSequence, fixes: list[Fix], late: float) -> NavState:
@@ -96,7 +95,7 @@ def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
 # --- Jacobians -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["position", "velocity", "heading"])
+@pytest.mark.parametrize("kind", ["position", "velocity", "yaw"])
 @pytest.mark.parametrize("seed", range(4))
 def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -110,11 +109,11 @@ def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
             return turn @ p + shift_p
         return turn @ v + shift_v if kind == "velocity" else np.array([yaw_twist(turn @ R)])
 
-    step, H = 1e-6, np.zeros((1 if kind == "heading" else 3, 9))
+    step, H = 1e-6, np.zeros((1 if kind == "yaw" else 3, 9))
     jacobian = {
         "position": lambda: position_jacobian(p),
         "velocity": lambda: velocity_jacobian(v),
-        "heading": lambda: heading_jacobian(R),
+        "yaw": lambda: yaw_jacobian(R),
     }[kind]()
     for first, block in jacobian:
         H[:, first : first + block.shape[1]] = block
@@ -137,21 +136,20 @@ def test_yaw_is_that_of_the_recordings_and_undefined_upside_down() -> None:
 # --- time ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("config", [CONFIG, VELOCITY], ids=["displacement", "velocity"])
 @pytest.mark.parametrize("late", [-3.0, 0.0, 0.3, 0.85])
 def test_a_fix_counts_at_its_own_time_however_late(
-    walk: ImuSequence, make_oracle: Make, config: NavigatorConfig, late: float
+    walk: ImuSequence, make_oracle: Make, late: float
 ) -> None:
-    model, fixes = make_oracle(walk, walk.truth, config), fixes_of(walk)
-    track = Navigator(model, config).run(walk, fixes=fixes)
-    navigator = Navigator(model, config)
+    model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
+    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    navigator = Navigator(model, CONFIG)
     state = streamed(navigator, walk, fixes, late)
     assert_same(state, track)
-    assert state.world == 2
+    assert state.map_frame == 2
     assert navigator.health.fixes["applied"] == track.health.fixes["applied"] == 4
     assert navigator.health.updates == track.health.updates
     assert navigator.health.mean_nis == pytest.approx(track.health.mean_nis)
-    assert navigator.health.rests == track.health.rests
+    assert navigator.health.zero_velocity == track.health.zero_velocity
 
 
 def test_older_fixes_are_refused_and_counted(walk: ImuSequence, model: Any) -> None:
@@ -177,14 +175,14 @@ def test_fixes_of_the_future_wait(walk: ImuSequence, model: Any) -> None:
 
 
 def test_an_epoch_cut_in_two_says_the_same(walk: ImuSequence) -> None:
-    epoch = next(e for e in all_epochs(walk, CONFIG)[0] if e.window is not None)
-    for time in (epoch.start + 0.033, float(epoch.time[4]), epoch.stop - 1e-4):
-        first, second = cut(epoch, time)
+    interval = next(e for e in cut_recording(walk, CONFIG)[0] if e.window is not None)
+    for time in (interval.start + 0.033, float(interval.time[4]), interval.stop - 1e-4):
+        first, second = cut(interval, time)
         assert first.stop == second.start == time
         assert first.window is None
-        assert second.window is epoch.window
+        assert second.window is interval.window
         for name in ("gyro", "accel"):
-            whole = np.trapezoid(getattr(epoch, name), epoch.time, axis=0)
+            whole = np.trapezoid(getattr(interval, name), interval.time, axis=0)
             halves = [np.trapezoid(getattr(e, name), e.time, axis=0) for e in (first, second)]
             np.testing.assert_allclose(sum(halves), whole, atol=1e-12)
 
@@ -239,7 +237,7 @@ def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> 
     assert 0.25 < np.mean(yaw) < 2.5  # expected 1
 
 
-@pytest.mark.parametrize("kind", ["heading", "velocity"])
+@pytest.mark.parametrize("kind", ["yaw", "velocity"])
 def test_a_heading_or_a_velocity_tells_the_yaw_too(
     walk: ImuSequence, model: Any, kind: str
 ) -> None:
@@ -248,8 +246,8 @@ def test_a_heading_or_a_velocity_tells_the_yaw_too(
     for t in (8.0, 20.0):
         p, v, yaw = truth_at(walk, t)
         fixes += [position_fix(t, turn.apply(p), 0.01 * EYE)]
-        if kind == "heading":
-            fixes += [heading_fix(t, yaw + 2.0 - 2.0 * np.pi, 0.02)]
+        if kind == "yaw":
+            fixes += [yaw_fix(t, yaw + 2.0 - 2.0 * np.pi, 0.02)]
         else:
             fixes += [velocity_fix(t, turn.apply(v), 1e-4 * EYE)]
     track = Navigator(model, CONFIG).run(walk, fixes=fixes)
@@ -282,14 +280,16 @@ def test_too_near_positions_do_not_turn_the_world(walk: ImuSequence, model: Any)
 
 
 def test_states_of_a_stream_say_which_world_they_are_in(walk: ImuSequence, model: Any) -> None:
-    navigator, worlds = Navigator(model, CONFIG), []
+    navigator, map_frames = Navigator(model, CONFIG), []
     for fix in fixes_of(walk):
         give(navigator, fix)
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         state = navigator.push(*row)
         if state is not None:
-            worlds.append((state.time, state.world))
-    changed = [t for (t, w), (_, before) in zip(worlds[1:], worlds, strict=False) if w > before]
+            map_frames.append((state.time, state.map_frame))
+    changed = [
+        t for (t, w), (_, before) in zip(map_frames[1:], map_frames, strict=False) if w > before
+    ]
     assert changed == pytest.approx([5.1, 12.0], abs=1e-6)
 
 
@@ -322,9 +322,9 @@ def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 3.0), [], 0.0)
     for time in (np.nan, np.inf):
-        navigator.update_heading(time, 0.0, 0.1)
-    navigator.update_heading(2.5, np.inf, 0.1)
-    navigator.update_heading(2.5, 0.0, np.nan)
+        navigator.update_yaw(time, 0.0, 0.1)
+    navigator.update_yaw(2.5, np.inf, 0.1)
+    navigator.update_yaw(2.5, 0.0, np.nan)
     assert navigator.health.fixes == {"value that is not finite": 4}
 
 
@@ -340,11 +340,11 @@ def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
 def test_a_heading_whose_sigma_is_none_is_refused_and_counted(
     walk: ImuSequence, model: Any, sigma: float, reason: str
 ) -> None:
-    bad = heading_fix(5.0, 0.0, sigma)
+    bad = yaw_fix(5.0, 0.0, sigma)
     assert Navigator(model, CONFIG).run(walk, fixes=[bad]).health.fixes == {reason: 1}
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 2.0), [], 0.0)
-    navigator.update_heading(1.5, 0.0, sigma)
+    navigator.update_yaw(1.5, 0.0, sigma)
     assert navigator.health.fixes == {reason: 1}
 
 
@@ -355,7 +355,7 @@ def test_a_shape_that_does_not_fit_is_an_error_by_name(model: Any) -> None:
     with pytest.raises(InputError, match="covariance"):
         navigator.update_velocity(0.0, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="yaw"):
-        navigator.update_heading(0.0, "north", 0.1)  # type: ignore[arg-type]
+        navigator.update_yaw(0.0, "north", 0.1)  # type: ignore[arg-type]
 
 
 def test_a_fix_stated_as_exact_has_a_floor(walk: ImuSequence, model: Any) -> None:
@@ -374,15 +374,15 @@ HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 def test_a_file_of_fixes(tmp_path: Path) -> None:
     path = tmp_path / "fixes.csv"
     path.write_text(
-        HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,heading,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
+        HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,yaw,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
         encoding="utf-8",
     )
-    position, heading, velocity = read_fixes(path)
-    assert (position.kind, heading.kind, velocity.kind) == ("position", "heading", "velocity")
-    assert (position.time, heading.time) == (1.5, 2.0)
+    position, yaw, velocity = read_fixes(path)
+    assert (position.kind, yaw.kind, velocity.kind) == ("position", "yaw", "velocity")
+    assert (position.time, yaw.time) == (1.5, 2.0)
     np.testing.assert_allclose(position.value, [1.0, 2.0, 3.0])
     np.testing.assert_allclose(position.covariance, np.diag([0.01, 0.01, 0.09]))
-    np.testing.assert_allclose(heading.covariance, [[0.0025]])
+    np.testing.assert_allclose(yaw.covariance, [[0.0025]])
 
 
 @pytest.mark.parametrize(

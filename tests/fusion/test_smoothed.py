@@ -89,14 +89,8 @@ def test_a_stream_gives_the_same_poses(make_walk: Make, make_oracle: Make) -> No
         if pose is not None and (not poses or pose.time > poses[-1].time):
             poses.append(pose)
     assert [pose.time for pose in poses] == pytest.approx(list(track.smoothed.time))
-    last = [pose.world == poses[-1].world for pose in poses]
+    last = [pose.map_frame == poses[-1].map_frame for pose in poses]
     ours = np.array([pose.p_W for pose in poses])[last]
     np.testing.assert_allclose(ours, track.smoothed.position_W[last], atol=1e-9)
     truth = walk.truth.at(track.smoothed.time)
     assert np.linalg.norm(truth.position_W - track.smoothed.position_W, axis=1).max() < 1.0
-
-
-def test_without_clones_there_is_none(still_model: Any, walk: ImuSequence) -> None:
-    config = NavigatorConfig(filter=FilterConfig(measurement="velocity"))
-    assert Navigator(still_model, config).run(walk).smoothed is None
-    assert Navigator(still_model, config).smoothed is None

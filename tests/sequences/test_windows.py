@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import all_epochs
+from stario.fusion.imu.front_end import cut_recording
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -179,7 +179,7 @@ def test_a_truth_that_is_mounted_askew_does_not_show_in_levelled_windows() -> No
 def test_levelled_windows_are_the_navigators_but_for_their_heading() -> None:
     walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
     (stream,) = world_streams(walk)
-    epochs, _ = all_epochs(walk, NavigatorConfig())
+    epochs, _ = cut_recording(walk, NavigatorConfig())
     true_WB = truth_of(walk).attitude_WB
     compared = 0
     for epoch in epochs:

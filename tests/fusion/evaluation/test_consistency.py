@@ -79,7 +79,7 @@ def test_runs_come_from_the_seed() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"update_rate": 1}, {"update_rate": 10, "covariance_scale": 1.0}, {"measurement": "velocity"}],
+    [{"update_rate": 1}, {"update_rate": 10, "covariance_scale": 1.0}],
 )
 def test_every_way_of_measuring_knows_how_wrong_it_is(settings: dict[str, Any]) -> None:
     config = replace(CONFIG, filter=replace(CONFIG.filter, **settings))

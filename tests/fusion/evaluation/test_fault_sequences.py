@@ -35,7 +35,7 @@ FAULTS = (
     "covariance without meaning",
     "position",
     "position far off",
-    "late heading",
+    "late yaw",
     "old velocity",
     "fix without meaning",
     "restored",
@@ -123,14 +123,14 @@ class Stream:
             n.update_position(self.now + size, [10.0 * size, 5.0, 0.0], 0.1 * eye)
         elif fault == "position far off":
             n.update_position(at, 5e6 * size * np.ones(3), 1e-4 * eye)
-        elif fault == "late heading":
-            n.update_heading(at, 4.0 * size, 0.1)
+        elif fault == "late yaw":
+            n.update_yaw(at, 4.0 * size, 0.1)
         elif fault == "old velocity":
             n.update_velocity(at - 3.0 * abs(size), [1.0, size, 0.0], 0.01 * eye)
         elif fault == "fix without meaning":
             n.update_position(at, [np.nan, size, 0.0], eye)
             n.update_velocity(at, np.zeros(3), -eye)
-            n.update_heading(np.inf, size, 0.0)
+            n.update_yaw(np.inf, size, 0.0)
         elif fault == "restored":
             data = n.snapshot()
             self.navigator = Navigator(self.model, CONFIG, backend=self.backend)

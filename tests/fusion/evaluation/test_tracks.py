@@ -72,8 +72,8 @@ def test_chained_displacements_follow_the_truth_to_centimetres(
 ) -> None:
     """What is lost is what a mean over a second does to a path: its bends get cut."""
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
-    observed = Navigator(make_oracle(walk, walk.truth, CONFIG)).observe(walk)
-    errors = horizontal_errors(network_track(observed).trajectory, walk)
+    preprocessed = Navigator(make_oracle(walk, walk.truth, CONFIG)).observe(walk)
+    errors = horizontal_errors(network_track(preprocessed).trajectory, walk)
     assert np.median(errors) < 0.15
     assert errors.max() < 0.4
 
@@ -116,8 +116,8 @@ def test_gaps_of_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None
 
 
 def test_tracks_without_a_filter_claim_no_uncertainty(walk: ImuSequence, still_model: Any) -> None:
-    observed = Navigator(still_model).observe(walk)
-    for track in (inertial_track(observed, CONFIG), network_track(observed)):
+    preprocessed = Navigator(still_model).observe(walk)
+    for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
         assert track.covariance is None
         assert track.nis is None
         assert set(track.arrays()) == {
@@ -129,8 +129,8 @@ def test_every_track_passes_through_gaps_of_the_imu(
     walk: ImuSequence, make_oracle: Make, without: Make
 ) -> None:
     holed = without(walk, (walk.time > 8.0) & (walk.time < 10.0))
-    observed = Navigator(make_oracle(holed, walk.truth, CONFIG)).observe(holed)
-    for track in (inertial_track(observed, CONFIG), network_track(observed)):
+    preprocessed = Navigator(make_oracle(holed, walk.truth, CONFIG)).observe(holed)
+    for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
         assert np.isfinite(track.trajectory.position_W).all()
         assert (np.diff(track.time) > 0).all()
         assert track.time[-1] > 19.9

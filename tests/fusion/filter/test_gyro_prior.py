@@ -11,8 +11,8 @@ import support
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimate import nav_states, smoothed_poses
-from stario.fusion.filter.estimator import FilterRecipe
-from stario.fusion.filter.gyro_prior import GyroBelief, GyroPrior
+from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.gyro_prior import GyroPosterior, GyroPrior
 from stario.fusion.fixes import position_fix
 from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence
@@ -35,21 +35,21 @@ ONLY_WIDE = configured(gyro_bias_sigma=WIDE, gyro_corrected=0.0)
 ONLY_NARROW = configured(gyro_bias_sigma=NARROW, gyro_corrected=0.0)
 
 
-def believed(recipe: FilterRecipe) -> GyroBelief | None:
-    now = recipe.estimate()
-    return recipe.gyro_prior.believe(np.array(now.time), now.b_g, now.P_gg)
+def believed(estimator: Estimator) -> GyroPosterior | None:
+    now = estimator.estimate()
+    return estimator.gyro_prior.posterior(np.array(now.time), now.b_g, now.P_gg)
 
 
-def run(config: NavigatorConfig, sequence: ImuSequence, oracle: Any) -> tuple[FilterRecipe, float]:
+def run(config: NavigatorConfig, sequence: ImuSequence, oracle: Any) -> tuple[Estimator, float]:
     """The filter behind a recording, and the log-likelihood of all that it was told."""
     seen = Navigator(oracle, config).observe(sequence)
-    assert seen.intake.start is not None
-    recipe, evidence = FilterRecipe(config, seen.intake.start), 0.0
-    for epoch, measurement in zip(seen.epochs, seen.measurements, strict=True):
-        recipe.step(epoch, measurement)
-        evidence += recipe.ekf.log_likelihood if measurement is not None else 0.0
-    assert not recipe.innovations().gated.any()
-    return recipe, evidence
+    assert seen.front_end.start is not None
+    estimator, evidence = Estimator(config, seen.front_end.start), 0.0
+    for interval, measurement in zip(seen.intervals, seen.measurements, strict=True):
+        estimator.step(interval, measurement)
+        evidence += estimator.ekf.log_likelihood if measurement is not None else 0.0
+    assert not estimator.innovations().gated.any()
+    return estimator, evidence
 
 
 @pytest.fixture(scope="module", params=[0.0, 6e-4, 2e-3], ids=["none", "small", "large"])
@@ -66,9 +66,9 @@ def test_the_odds_are_the_ratio_of_two_filters_evidences(
 ) -> None:
     _, walk, oracle = walked
     evidences = [run(config, walk, oracle)[1] for config in (ONLY_NARROW, ONLY_WIDE)]
-    belief = believed(run(MIXED, walk, oracle)[0])
-    assert belief is not None
-    odds = np.log(belief.weight / (1.0 - belief.weight))
+    posterior = believed(run(MIXED, walk, oracle)[0])
+    assert posterior is not None
+    odds = np.log(posterior.weight / (1.0 - posterior.weight))
     assert odds == pytest.approx(evidences[0] - evidences[1], abs=0.1)
 
 
@@ -77,10 +77,10 @@ def test_certain_of_the_narrow_prior_the_state_is_that_filters(
 ) -> None:
     """Whatever the bias is in truth: conditioning is what the other filter does."""
     _, walk, oracle = walked
-    narrow = run(ONLY_NARROW, walk, oracle)[0].state()
-    recipe = run(MIXED, walk, oracle)[0]
-    wide, certain = recipe.filtered(), GyroPrior(CERTAIN, recipe.gyro_prior._start)
-    state = nav_states([recipe.estimate()], certain)[0]
+    narrow = run(ONLY_NARROW, walk, oracle)[0].nav_state()
+    estimator = run(MIXED, walk, oracle)[0]
+    wide, certain = estimator.filtered(), GyroPrior(CERTAIN, estimator.gyro_prior._start)
+    state = nav_states([estimator.estimate()], certain)[0]
     for name in ("R_WB", "v_W", "p_W", "b_g"):
         apart = np.abs(getattr(wide, name) - getattr(narrow, name)).max()
         assert np.abs(getattr(state, name) - getattr(narrow, name)).max() < 0.03 * apart, name
@@ -90,11 +90,11 @@ def test_certain_of_the_narrow_prior_the_state_is_that_filters(
 
 def test_corrected_devices_are_told_from_others(walked: tuple[float, ImuSequence, Any]) -> None:
     bias, walk, oracle = walked
-    recipe = run(MIXED, walk, oracle)[0]
-    belief = believed(recipe)
-    assert belief is not None
-    assert belief.weight < 0.2 if bias > 1e-3 else belief.weight > 0.8
-    state, wide = recipe.state(), recipe.filtered()
+    estimator = run(MIXED, walk, oracle)[0]
+    posterior = believed(estimator)
+    assert posterior is not None
+    assert posterior.weight < 0.2 if bias > 1e-3 else posterior.weight > 0.8
+    state, wide = estimator.nav_state(), estimator.filtered()
     if bias <= 1e-3:  # what does not depend on the mixture is better known by it
         assert np.linalg.norm(state.b_g - bias) < np.linalg.norm(wide.b_g - bias)
         assert state.covariance[2, 2] < 0.5 * wide.covariance[2, 2]
@@ -106,8 +106,8 @@ def test_a_mixture_has_the_moments_of_its_parts() -> None:
     P, b = root @ root.T, rng.normal(size=3)  # error and bias
     S = P[3:, 3:] + 0.5 * np.eye(3)
     gain = P[:, 3:] @ np.linalg.inv(S)
-    belief = GyroBelief(np.array(0.3), np.linalg.solve(S, b), np.linalg.inv(S))
-    mean, covariance = belief.settle(P, P[:, 3:])
+    posterior = GyroPosterior(np.array(0.3), np.linalg.solve(S, b), np.linalg.inv(S))
+    mean, covariance = posterior.moments(P, P[:, 3:])
     parts = [(0.7, np.zeros(6), P), (0.3, -gain @ b, P - gain @ P[3:])]
     expected = sum(w * m for w, m, _ in parts)
     second = sum(w * (C + np.outer(m, m)) for w, m, C in parts)
@@ -121,21 +121,21 @@ def test_without_a_narrower_prior_there_is_no_mixture(
 ) -> None:
     walk = make_walk()
     config = configured(gyro_bias_sigma=WIDE, **alone)
-    recipe, _ = run(config, walk, make_oracle(walk, walk.truth, config))
-    assert believed(recipe) is None
-    assert recipe.expected_gyro_bias() is None
-    np.testing.assert_array_equal(recipe.state().p_W, recipe.filtered().p_W)
-    np.testing.assert_array_equal(recipe.state().covariance, recipe.filtered().covariance)
+    estimator, _ = run(config, walk, make_oracle(walk, walk.truth, config))
+    assert believed(estimator) is None
+    assert estimator.expected_gyro_bias() is None
+    np.testing.assert_array_equal(estimator.nav_state().p_W, estimator.filtered().p_W)
+    np.testing.assert_array_equal(estimator.nav_state().covariance, estimator.filtered().covariance)
 
 
 def test_a_clone_is_settled_as_the_state_it_is_a_copy_of(
     make_walk: Make, make_oracle: Make
 ) -> None:
     walk = make_walk()
-    recipe, _ = run(MIXED, walk, make_oracle(walk, walk.truth, MIXED))
-    state = recipe.state()  # its newest clone was taken at this time
-    clone = recipe.ekf.clone_estimate(recipe._slots[-1])
-    pose = smoothed_poses([clone], recipe.gyro_prior)[0]
+    estimator, _ = run(MIXED, walk, make_oracle(walk, walk.truth, MIXED))
+    state = estimator.nav_state()  # its newest clone was taken at this time
+    clone = estimator.ekf.state.clone_estimate(estimator._clones[-1])
+    pose = smoothed_poses([clone], estimator.gyro_prior)[0]
     assert pose.time == state.time
     np.testing.assert_allclose(pose.R_WB, state.R_WB, atol=1e-12)
     np.testing.assert_allclose(pose.p_W, state.p_W, atol=1e-12)
@@ -167,8 +167,8 @@ def far_apart(make_walk: Make, make_oracle: Make) -> tuple[ImuSequence, Any]:
     """A walk whose bias is none, on which the two priors lead metres apart."""
     walk = make_walk(3, 120.0, 100.0, ImuErrors(support.NOISE, gyro_turn_on=0.0))
     oracle = make_oracle(walk, walk.truth, MIXED, noise=0.05, sigma=0.05)
-    recipe, _ = run(MIXED, walk, oracle)
-    assert np.linalg.norm(recipe.state().p_W - recipe.filtered().p_W) > 2.0
+    estimator, _ = run(MIXED, walk, oracle)
+    assert np.linalg.norm(estimator.nav_state().p_W - estimator.filtered().p_W) > 2.0
     return walk, oracle
 
 
@@ -195,9 +195,9 @@ def test_a_long_gap_does_not_lead_back_to_the_filter(
     walk, _ = far_apart
     holed = without(walk, (walk.time > 100.0) & (walk.time < 112.0))
     oracle = make_oracle(holed, walk.truth, MIXED, noise=0.05, sigma=0.05)
-    recipe, _ = run(MIXED, holed, oracle)
-    assert recipe.time > 118.0
-    assert np.linalg.norm(recipe.state().p_W - recipe.filtered().p_W) > 2.0
+    estimator, _ = run(MIXED, holed, oracle)
+    assert estimator.time > 118.0
+    assert np.linalg.norm(estimator.nav_state().p_W - estimator.filtered().p_W) > 2.0
 
 
 @pytest.mark.parametrize(
@@ -205,6 +205,6 @@ def test_a_long_gap_does_not_lead_back_to_the_filter(
 )
 def test_extreme_priors_leave_finite_weights(wide: float, narrow: float) -> None:
     prior = GyroPrior(configured(gyro_bias_sigma=wide, gyro_corrected_sigma=narrow), 0.0)
-    belief = prior.believe(np.array(0.0), np.zeros(3), max(wide, 1e-6) ** 2 * np.eye(3))
-    assert belief is not None
-    assert belief.weight == pytest.approx(0.7, abs=1e-3)
+    posterior = prior.posterior(np.array(0.0), np.zeros(3), max(wide, 1e-6) ** 2 * np.eye(3))
+    assert posterior is not None
+    assert posterior.weight == pytest.approx(0.7, abs=1e-3)

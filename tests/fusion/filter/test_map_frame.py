@@ -11,7 +11,7 @@ from support import GRAPH as CONFIG
 from support import stream
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.fixes import Fix, heading_fix, position_fix
+from stario.fusion.fixes import Fix, position_fix, yaw_fix
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
 
@@ -85,14 +85,14 @@ def test_behind_a_gap_that_lost_the_yaw_fixes_find_it_again(
 
 
 def test_a_graph_takes_no_fix_that_the_filter_refused(make_walk: Make, make_oracle: Make) -> None:
-    """A heading of a device that hangs upside down says nothing."""
+    """A yaw of a device that hangs upside down says nothing."""
     walk = make_walk(3, 20.0, mount_rotvec=(np.pi, 0.0, 0.0))
     oracle = make_oracle(walk, walk.truth, CONFIG)
     ends = []
-    for fixes in ([], [heading_fix(10.03, 0.5, 0.01)]):
+    for fixes in ([], [yaw_fix(10.03, 0.5, 0.01)]):
         navigator = Navigator(oracle, CONFIG, backend="graph")
         for fix in fixes:
-            navigator.update_heading(fix.time, 0.5, 0.01)
+            navigator.update_yaw(fix.time, 0.5, 0.01)
         ends.append(stream(navigator, walk)[-1].p_W)
         track = navigator.run(walk, fixes=fixes)
         assert track.health.notes[0].startswith("graph of")
@@ -102,7 +102,7 @@ def test_a_graph_takes_no_fix_that_the_filter_refused(make_walk: Make, make_orac
 def test_a_heading_alone_does_not_free_the_position(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(4, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
-    fixes = [heading_fix(10.0, 1.0, 0.05)]
+    fixes = [yaw_fix(10.0, 1.0, 0.05)]
     track = Navigator(oracle, CONFIG, backend="graph").run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1}
     assert np.linalg.norm(track.trajectory.position_W[0]) < 0.01
@@ -118,4 +118,4 @@ def test_neither_gaps_nor_fixes_let_a_streams_graph_grow(
         oracle = make_oracle(recording, walk.truth, CONFIG)
         navigator = Navigator(oracle, CONFIG, backend="graph")
         given(navigator, recording, fixes)
-        assert len(navigator._recipe._builder.graph.keyframes) < 16
+        assert len(navigator._estimator._builder.graph.keyframes) < 16

@@ -12,12 +12,12 @@ from gtsam.symbol_shorthand import B, V, X
 from stario.fusion.graph.factors import (
     Displacement,
     GyroBias,
-    Heading,
     KeyframeState,
     Position,
     Prior,
     Term,
     Velocity,
+    Yaw,
 )
 from stario.fusion.lie import exp_so3
 
@@ -48,7 +48,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Displacement(0, 1, rng.normal(size=3), R_NB, EYE),
         Position(0, rng.normal(size=3), EYE, 0.4, rng.normal(size=3)),
         Velocity(0, rng.normal(size=3), EYE, rng.normal(size=3)),
-        Heading(0, exp_so3(np.array([0.0, 0.0, 0.3])) @ state.R_WB, np.eye(1)),
+        Yaw(0, exp_so3(np.array([0.0, 0.0, 0.3])) @ state.R_WB, np.eye(1)),
         GyroBias(0, rng.normal(size=3), EYE),
         Prior(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
     ]

@@ -15,12 +15,12 @@ from support import stream
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import PriorPose
-from stario.fusion.filter.jacobians import yaw_twist
-from stario.fusion.graph.fixed_lag import GraphRecipe
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
 from stario.fusion.lie import exp_so3
-from stario.fusion.navigator import Observed
+from stario.fusion.recording import PreprocessedRecording
+from stario.fusion.yaw import yaw_twist
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
 
@@ -81,19 +81,19 @@ def test_a_start_askew_leads_a_stream_no_further_astray_than_the_filter(
 
 
 def spoilt_track(
-    observed: Observed, config: NavigatorConfig, metres: float, epochs: range
+    preprocessed: PreprocessedRecording, config: NavigatorConfig, metres: float, intervals: range
 ) -> tuple[np.ndarray, int]:
-    """A stream's positions until 3 s behind epochs whose windows are off, and how many it gated."""
-    start = observed.intake.start
+    """A stream's positions until 3 s behind intervals with wrong windows, and how many it gated."""
+    start = preprocessed.front_end.start
     assert start is not None
-    recipe, positions = GraphRecipe(config, start), []
-    for k in range(epochs.stop + 3 * config.filter.output_rate):
-        measurement = observed.measurements[k]
-        if measurement is not None and k in epochs:
+    estimator, positions = FixedLagEstimator(config, start), []
+    for k in range(intervals.stop + 3 * config.filter.output_rate):
+        measurement = preprocessed.measurements[k]
+        if measurement is not None and k in intervals:
             measurement = (measurement[0] + [metres, 0.0, 0.0], measurement[1])
-        recipe.step(observed.epochs[k], measurement)
-        positions.append(recipe.state().p_W)
-    return np.array(positions), recipe.health(observed.intake.counts).gated
+        estimator.step(preprocessed.intervals[k], measurement)
+        positions.append(estimator.nav_state().p_W)
+    return np.array(positions), estimator.health(preprocessed.front_end.counts).gated
 
 
 def test_a_stream_takes_displacements_as_its_filter_judges_them(
@@ -101,9 +101,9 @@ def test_a_stream_takes_displacements_as_its_filter_judges_them(
 ) -> None:
     """Two windows that are 5 m off are left out by both."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    observed = Navigator(oracle, CONFIG).observe(walk)
-    right, none = spoilt_track(observed, CONFIG, 0.0, range(40, 50))
-    spoilt, two = spoilt_track(observed, CONFIG, 5.0, range(40, 50))
+    preprocessed = Navigator(oracle, CONFIG).observe(walk)
+    right, none = spoilt_track(preprocessed, CONFIG, 0.0, range(40, 50))
+    spoilt, two = spoilt_track(preprocessed, CONFIG, 5.0, range(40, 50))
     assert (none, two) == (0, 2)
     assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.1
 
@@ -114,10 +114,14 @@ def test_what_the_filter_weighs_otherwise_a_stream_judges_itself(
     """At 20 updates a second it takes one window in ten: a false one pulls harder."""
     config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=20))
     oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
-    observed = Navigator(oracle, config).observe(walk)
-    at = next(k for k, epoch in enumerate(observed.epochs) if epoch.stop > walk.time[0] + 9.99)
-    right, _ = spoilt_track(observed, config, 0.0, range(at, at + 1))
-    spoilt, _ = spoilt_track(observed, config, 1.2, range(at, at + 1))
+    preprocessed = Navigator(oracle, config).observe(walk)
+    at = next(
+        k
+        for k, interval in enumerate(preprocessed.intervals)
+        if interval.stop > walk.time[0] + 9.99
+    )
+    right, _ = spoilt_track(preprocessed, config, 0.0, range(at, at + 1))
+    spoilt, _ = spoilt_track(preprocessed, config, 1.2, range(at, at + 1))
     assert np.linalg.norm(spoilt - right, axis=1).max() < 0.35
 
 
@@ -134,7 +138,7 @@ def test_a_heading_far_from_what_was_thought_turns_a_stream_as_its_filter(
     ends = []
     for backend in ("graph", "ekf"):
         navigator = Navigator(oracle, CONFIG, askew, backend)
-        navigator.update_heading(10.25, yaw_twist(R_WB), 0.01)
+        navigator.update_yaw(10.25, yaw_twist(R_WB), 0.01)
         ends.append(errors(stream(navigator, walk), walk)[-1])
     assert ends[0] < 1.2 * ends[1] + 0.1
 
@@ -189,7 +193,7 @@ def test_what_is_forgotten_leaves_the_newest_as_it_was(
     """Also where windows reach from the forgotten keyframes past the first that stays."""
     navigator = lagged(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     stream(navigator, walk.slice(0.0, 6.2))
-    graph = navigator._recipe._builder.graph
+    graph = navigator._estimator._builder.graph
     graph.solve()
     before, oldest = graph.state(graph.last), graph.keyframes[0]
     graph.marginalise(oldest + 3)
@@ -236,7 +240,7 @@ def test_two_positions_turn_a_stream_that_started_without_a_pose(
     last = states[-1]
     truth = R.apply(walk.truth.at(np.array([last.time])).position_W[0]) + shift
     assert np.linalg.norm(last.p_W - truth) < 1.0
-    assert last.world == 2
+    assert last.map_frame == 2
     assert_sound(last)
 
 
@@ -250,7 +254,7 @@ def test_rest_stops_the_drift(make_oracle: Make, still_model: Any, make_walk: Ma
     navigator = lagged(still_model)
     for row in zip(time, gyro, accel, strict=True):
         navigator.push(*row)
-    assert navigator.health.rests["applied"] > 100
+    assert navigator.health.zero_velocity["applied"] > 100
     assert np.linalg.norm(navigator.state.p_W) < 0.1
     np.testing.assert_allclose(navigator.state.b_g, 2e-3, atol=2e-4)
 
@@ -307,7 +311,7 @@ def grown(walk: ImuSequence, model: Any, warm: float, seconds: float) -> int:
         before = tracemalloc.get_traced_memory()[0]
         push(warm, warm + seconds)
         gc.collect()
-        assert len(navigator._recipe._builder.graph.keyframes) < 12
+        assert len(navigator._estimator._builder.graph.keyframes) < 12
         return tracemalloc.get_traced_memory()[0] - before
     finally:
         tracemalloc.stop()

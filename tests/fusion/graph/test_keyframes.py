@@ -15,8 +15,8 @@ from support import Broken, ate
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig, config_from_dict
 from stario.fusion.evaluation.backends import score_walk, summary
-from stario.fusion.filter.estimator import PriorPose
-from stario.fusion.fixes import heading_fix, position_fix, velocity_fix
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.state import NavState
@@ -242,7 +242,7 @@ def test_heading_and_velocity_fixes_are_met(walk: ImuSequence, make_oracle: Make
     truth = walk.truth.at(np.array([9.25, 14.0]))
     yaw = float(yaw_of(truth.attitude_WB)[0])
     fixes = [
-        heading_fix(9.25, yaw, 1e-3),
+        yaw_fix(9.25, yaw, 1e-3),
         velocity_fix(14.0, truth.velocity_W[1], 1e-4 * np.eye(3)),
     ]
     track = graph(oracle, prior=prior).run(walk, fixes=fixes)

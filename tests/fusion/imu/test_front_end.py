@@ -1,4 +1,4 @@
-"""Epochs and windows: every moment once, nothing across a gap, and nothing from the filter."""
+"""Intervals and windows: every moment once, nothing across a gap, and nothing from the filter."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.imu.front_end import Intake, all_epochs
-from stario.fusion.imu.intervals import Epoch, IntakeCounts
+from stario.fusion.imu.front_end import FrontEnd, cut_recording
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SECONDS, windows_of, world_streams
@@ -22,15 +22,15 @@ def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.trapezoid(values, time, axis=0)
 
 
-def assert_seamless(epochs: list[Epoch], first: float) -> None:
-    """Each epoch begins where the one before ended, with the same samples there."""
-    assert epochs[0].start == first
-    for before, after in pairwise(epochs):
+def assert_seamless(intervals: list[ImuInterval], first: float) -> None:
+    """Each interval begins where the one before ended, with the same samples there."""
+    assert intervals[0].start == first
+    for before, after in pairwise(intervals):
         assert after.start == before.stop
         np.testing.assert_allclose(after.gyro[0], before.gyro[-1], atol=1e-12)
         np.testing.assert_allclose(after.accel[0], before.accel[-1], atol=1e-12)
-    for epoch in epochs:
-        assert (np.diff(epoch.time) > 0).all()
+    for interval in intervals:
+        assert (np.diff(interval.time) > 0).all()
 
 
 def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) -> ImuSequence:
@@ -66,20 +66,20 @@ def test_epochs_cover_every_moment_once(
     make_walk: Callable[..., ImuSequence], rate: float, jitter: float, drops: float
 ) -> None:
     walk = uneven(make_walk(2, 8.0, rate), drops, jitter)
-    epochs, intake = all_epochs(walk, CONFIG)
-    assert intake.counts == IntakeCounts(used=len(walk))
-    assert_seamless(epochs, walk.time[0])
+    intervals, front_end = cut_recording(walk, CONFIG)
+    assert front_end.counts == SampleCounts(used=len(walk))
+    assert_seamless(intervals, walk.time[0])
     period = 1.0 / CONFIG.filter.output_rate
-    np.testing.assert_allclose([e.stop - e.start for e in epochs], period, atol=1e-9)
-    end = epochs[-1].stop
+    np.testing.assert_allclose([e.stop - e.start for e in intervals], period, atol=1e-9)
+    end = intervals[-1].stop
     assert walk.time[-1] - end < period
-    # Trapezoids between the recording's samples, up to the last epoch's end.
+    # Trapezoids between the recording's samples, up to the last interval's end.
     inside = walk.time < end
     for name in ("gyro", "accel"):
         values = getattr(walk, name)
         last = [np.interp(end, walk.time, values[:, k]) for k in range(3)]
         whole = integral(np.append(walk.time[inside], end), np.vstack([values[inside], last]))
-        pieces = sum(integral(e.time, getattr(e, name)) for e in epochs)
+        pieces = sum(integral(e.time, getattr(e, name)) for e in intervals)
         np.testing.assert_allclose(pieces, whole, atol=1e-9)
 
 
@@ -87,11 +87,11 @@ def test_epochs_cover_every_moment_once(
 def test_windows_come_at_the_update_rate_one_second_after_the_start(
     walk: ImuSequence, rate: int
 ) -> None:
-    epochs, _ = all_epochs(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
-    stops = np.array([e.stop for e in epochs if e.window is not None]) - walk.time[0]
+    intervals, _ = cut_recording(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
+    stops = np.array([e.stop for e in intervals if e.window is not None]) - walk.time[0]
     assert stops[0] == pytest.approx(1.0)
     np.testing.assert_allclose(np.diff(stops), 1.0 / rate, atol=1e-9)
-    assert all(e.update for e in epochs if e.window is not None)
+    assert all(e.update for e in intervals if e.window is not None)
 
 
 @pytest.mark.parametrize(("rate", "bound"), [(100.0, 1e-3), (200.0, 1e-3), (1000.0, 5e-3)])
@@ -99,34 +99,34 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
     make_walk: Callable[..., ImuSequence], rate: float, bound: float
 ) -> None:
     walk = make_walk(3, 6.0, rate, PERFECT_IMU)
-    epochs, _ = all_epochs(walk, CONFIG)
-    # The levelled attitude stands in for the truth; corrections at epochs' ends are small steps.
-    pairs = [(e.time[k], e.attitudes[k]) for e in epochs for k in range(len(e.time) - 1)]
+    intervals, _ = cut_recording(walk, CONFIG)
+    # The levelled attitude stands in for the truth; corrections at intervals' ends are small steps.
+    pairs = [(e.time[k], e.attitudes[k]) for e in intervals for k in range(len(e.time) - 1)]
     time, R = zip(*pairs, strict=True)
     truth = Trajectory(np.array(time), np.zeros((len(time), 3)), Rotation.from_matrix(np.stack(R)))
     (stream,) = world_streams(replace(walk, truth=truth), attitude="true")
     theirs, _ = windows_of(stream, 20)
-    ours = np.stack([e.window for e in epochs if e.window is not None])
+    ours = np.stack([e.window for e in intervals if e.window is not None])
     n = min(len(ours), len(theirs))
     assert n > 40
     off = np.abs(ours[:n] - theirs[:n])
-    # At an epoch's end the attitude steps, and a faster sensor's average stops short of it.
+    # At an interval's end the attitude steps, and a faster sensor's average stops short of it.
     assert off.mean() < bound
     assert off.max() < 100.0 * bound
     assert ours.dtype == np.float32
 
 
 def test_windows_start_with_the_attitude_they_state(walk: ImuSequence) -> None:
-    epochs, _ = all_epochs(walk, CONFIG)
-    by_stop = {round(e.stop, 6): e for e in epochs}
+    intervals, _ = cut_recording(walk, CONFIG)
+    by_stop = {round(e.stop, 6): e for e in intervals}
     checked = 0
-    for epoch in epochs:
-        before = by_stop.get(round(epoch.stop - WINDOW_SECONDS, 6))
-        if epoch.window is None or before is None:
+    for interval in intervals:
+        before = by_stop.get(round(interval.stop - WINDOW_SECONDS, 6))
+        if interval.window is None or before is None:
             continue
-        np.testing.assert_array_equal(epoch.R_NB_window, before.R_NB)
+        np.testing.assert_array_equal(interval.R_NB_window, before.R_NB)
         first = before.R_NB @ before.accel[-1]
-        np.testing.assert_allclose(epoch.window[3:, 0], first, atol=1e-5)
+        np.testing.assert_allclose(interval.window[3:, 0], first, atol=1e-5)
         checked += 1
     assert checked > 100
 
@@ -141,13 +141,13 @@ def test_bad_samples_are_dropped_and_counted_and_the_rest_is_as_if_they_had_neve
     bad = replace(walk, time=time, gyro=gyro, accel=accel)
     gone = np.zeros(len(walk), dtype=bool)
     gone[[300, 500, 700, 900, 1000, 1200, 1201]] = True
-    epochs, intake = all_epochs(bad, CONFIG)
-    expected, _ = all_epochs(without(walk, gone), CONFIG)
-    assert intake.counts == IntakeCounts(
+    intervals, front_end = cut_recording(bad, CONFIG)
+    expected, _ = cut_recording(without(walk, gone), CONFIG)
+    assert front_end.counts == SampleCounts(
         used=len(walk) - 7, not_finite=4, duplicate=1, out_of_order=2
     )
-    assert len(epochs) == len(expected)
-    for ours, theirs in zip(epochs, expected, strict=True):
+    assert len(intervals) == len(expected)
+    for ours, theirs in zip(intervals, expected, strict=True):
         np.testing.assert_array_equal(ours.time, theirs.time)
         np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)
 
@@ -162,13 +162,13 @@ def test_a_gap_is_one_epoch_and_no_window_spans_it(
 ) -> None:
     start, stop = 6.02, 6.02 + length
     holed = without(walk, cut(walk, start + 1e-9, stop - 1e-9))
-    epochs, intake = all_epochs(holed, CONFIG)
-    (gap,) = [e for e in epochs if e.gap]
+    intervals, front_end = cut_recording(holed, CONFIG)
+    (gap,) = [e for e in intervals if e.gap]
     assert gap.start == pytest.approx(start)
     assert gap.stop == pytest.approx(stop)
-    assert intake.counts.gaps == [(pytest.approx(start), pytest.approx(length))]
-    assert_seamless(epochs, holed.time[0])
-    spans = [(e.stop - WINDOW_SECONDS, e.stop) for e in epochs if e.window is not None]
+    assert front_end.counts.gaps == [(pytest.approx(start), pytest.approx(length))]
+    assert_seamless(intervals, holed.time[0])
+    spans = [(e.stop - WINDOW_SECONDS, e.stop) for e in intervals if e.window is not None]
     assert not any(a < gap.stop - 1e-9 and b > gap.start + 1e-9 for a, b in spans)
     after = [b for a, b in spans if a > gap.start]
     assert min(after) == pytest.approx(stop + WINDOW_SECONDS)
@@ -178,22 +178,22 @@ def test_a_tenth_of_a_second_is_bridged(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
     holed = without(walk, cut(walk, 6.0 + 1e-9, 6.1 - 2e-2))
-    epochs, intake = all_epochs(holed, CONFIG)
-    assert intake.counts.gaps == []
-    assert not any(e.gap for e in epochs)
-    assert_seamless(epochs, walk.time[0])
+    intervals, front_end = cut_recording(holed, CONFIG)
+    assert front_end.counts.gaps == []
+    assert not any(e.gap for e in intervals)
+    assert_seamless(intervals, walk.time[0])
 
 
 def test_after_a_gap_in_the_first_second_it_begins_anew(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
     holed = without(walk, cut(walk, 0.5 + 1e-9, 0.9 - 1e-9))
-    epochs, intake = all_epochs(holed, CONFIG)
-    assert intake.counts.gaps == [(pytest.approx(0.5), pytest.approx(0.4))]
-    assert intake.start is not None
-    assert intake.start.time == pytest.approx(0.9)
-    assert_seamless(epochs, intake.start.time)
-    assert not any(e.gap for e in epochs)
+    intervals, front_end = cut_recording(holed, CONFIG)
+    assert front_end.counts.gaps == [(pytest.approx(0.5), pytest.approx(0.4))]
+    assert front_end.start is not None
+    assert front_end.start.time == pytest.approx(0.9)
+    assert_seamless(intervals, front_end.start.time)
+    assert not any(e.gap for e in intervals)
 
 
 def test_two_gaps_with_one_sample_between_them(
@@ -201,21 +201,21 @@ def test_two_gaps_with_one_sample_between_them(
 ) -> None:
     gone = cut(walk, 5.0 + 1e-9, 6.0 - 1e-9)
     gone[np.argmin(np.abs(walk.time - 5.5))] = False
-    epochs, intake = all_epochs(without(walk, gone), CONFIG)
-    assert [length for _, length in intake.counts.gaps] == pytest.approx([0.5, 0.5])
-    assert sum(e.gap for e in epochs) == 2
-    assert_seamless(epochs, walk.time[0])
+    intervals, front_end = cut_recording(without(walk, gone), CONFIG)
+    assert [length for _, length in front_end.counts.gaps] == pytest.approx([0.5, 0.5])
+    assert sum(e.gap for e in intervals) == 2
+    assert_seamless(intervals, walk.time[0])
 
 
 def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
     walk: ImuSequence,
 ) -> None:
-    intake = Intake(CONFIG)
+    front_end = FrontEnd(CONFIG)
     for k in range(250):  # half a second of samples, then 0.5 s without, once 0.8 s
         for j in range(50):
             row = (float(k) + (0.3 if k > 100 else 0.0) + 0.01 * j, *walk.gyro[j], *walk.accel[j])
-            intake.push(row)
-    counts = intake.counts
+            front_end.push(row)
+    counts = front_end.counts
     assert counts.gap_count == 249
     assert counts.longest_gap == pytest.approx(0.81)
     assert [start for start, _ in counts.gaps] == pytest.approx(np.arange(149, 249) + 0.79)
@@ -225,7 +225,8 @@ def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
 def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence) -> None:
     late = replace(walk, time=walk.time + 1.7e9)
     ours, theirs = (
-        [e.window for e in all_epochs(s, CONFIG)[0] if e.window is not None] for s in (late, walk)
+        [e.window for e in cut_recording(s, CONFIG)[0] if e.window is not None]
+        for s in (late, walk)
     )
     assert len(ours) == len(theirs)
     assert np.abs(np.stack(ours) - np.stack(theirs)).max() < 2e-3
@@ -233,28 +234,28 @@ def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence
 
 def test_what_the_filter_is_told_does_not_reach_the_windows(walk: ImuSequence) -> None:
     other = NavigatorConfig(
-        filter=FilterConfig(
-            update_rate=10, measurement="velocity", covariance_scale=9.0, gyro_bias_sigma=1.0
-        )
+        filter=FilterConfig(update_rate=10, covariance_scale=9.0, gyro_bias_sigma=1.0)
     )
-    for ours, theirs in zip(all_epochs(walk, CONFIG)[0], all_epochs(walk, other)[0], strict=True):
+    for ours, theirs in zip(
+        cut_recording(walk, CONFIG)[0], cut_recording(walk, other)[0], strict=True
+    ):
         np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)
         assert (ours.window is None) == (theirs.window is None)
 
 
 def test_it_takes_samples_one_by_one_and_holds_no_more_than_a_second(walk: ImuSequence) -> None:
-    intake = Intake(CONFIG)
+    front_end = FrontEnd(CONFIG)
     held = 0
     for row in np.column_stack([walk.time, walk.gyro, walk.accel]).tolist():
-        intake.push(tuple(row))
-        held = max(held, len(intake._samples))
+        front_end.push(tuple(row))
+        held = max(held, len(front_end._samples))
     assert held <= 1.0 * walk.rate + 2
 
 
 def test_absurd_values_are_dropped_and_counted() -> None:
-    intake = Intake(CONFIG)
+    front_end = FrontEnd(CONFIG)
     for k in range(300):
         value = 1e300 if k == 150 else 0.0
-        intake.push((k * 0.005, value, 0.0, 0.0, 0.0, 0.0, 9.81))
-    assert intake.counts.not_finite == 1
-    assert intake.counts.used == 299
+        front_end.push((k * 0.005, value, 0.0, 0.0, 0.0, 0.0, 9.81))
+    assert front_end.counts.not_finite == 1
+    assert front_end.counts.used == 299

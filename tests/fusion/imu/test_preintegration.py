@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from stario.fusion.filter.propagation import propagated
 from stario.fusion.imu.preintegration import corrected_increments, preintegrate
 from stario.fusion.lie import exp_se23, exp_so3, log_se23, log_so3, skew
 from stario.sequences.errors import InputError
@@ -144,7 +145,7 @@ def test_transition_agrees_with_finite_differences() -> None:
     for k, d in enumerate(step * np.eye(15)):
         plus, minus = across(moved(x, d)), across(moved(x, -d))
         numeric[:, k] = (difference(plus, end) - difference(minus, end)) / (2 * step)
-    np.testing.assert_allclose(segment.linearise(*x).transition, numeric, atol=1e-6)
+    np.testing.assert_allclose(propagated(segment, *x).transition, numeric, atol=1e-6)
 
 
 def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
@@ -152,7 +153,7 @@ def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
     segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
     other = moved(x, np.r_[0.3, -0.2, 2.0, 5.0, 3.0, 1.0, 50.0, 20.0, 10.0, np.zeros(6)])
     np.testing.assert_array_equal(
-        segment.linearise(*x).transition[:, :9], segment.linearise(*other).transition[:, :9]
+        propagated(segment, *x).transition[:, :9], propagated(segment, *other).transition[:, :9]
     )
 
 
@@ -162,7 +163,7 @@ def test_yaw_and_position_stay_unobservable_constants() -> None:
     unobservable = np.zeros((15, 4))
     unobservable[2, 0] = 1.0
     unobservable[6:9, 1:] = np.eye(3)
-    np.testing.assert_array_equal(segment.linearise(*x).transition @ unobservable, unobservable)
+    np.testing.assert_array_equal(propagated(segment, *x).transition @ unobservable, unobservable)
 
 
 def test_noise_is_that_of_perturbed_samples() -> None:
@@ -197,9 +198,9 @@ def test_noise_is_that_of_perturbed_samples() -> None:
                 if which >= 2:
                     column[(9 if which == 2 else 12) + axis] = 1.0
                 expected += np.outer(column, column) * sigma**2
-    noise = (
-        preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY).linearise(R, v, p, b_g, b_a).noise
-    )
+    noise = propagated(
+        preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY), R, v, p, b_g, b_a
+    ).noise
     sigma = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         noise / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-3
@@ -210,7 +211,7 @@ def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
     x = state()
     loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
     plain, scaled = (
-        preintegrate(*samples(200), x[3], x[4], noise, GRAVITY).linearise(*x).noise
+        propagated(preintegrate(*samples(200), x[3], x[4], noise, GRAVITY), *x).noise
         for noise in (NOISE, loud)
     )
     np.testing.assert_allclose(np.diag(scaled)[:9], 9.0 * np.diag(plain)[:9], rtol=0.02)
@@ -227,26 +228,26 @@ def test_a_segment_with_the_noise_of_its_parts_is_their_sequence() -> None:
     for k, density in enumerate(loud):
         part = slice(k * step, (k + 1) * step + 1)
         segment = preintegrate(t[part], gyro[part], accel[part], *x[3:], density, GRAVITY)
-        ahead = segment.linearise(*y, *x[3:])
+        ahead = propagated(segment, *y, *x[3:])
         transition = ahead.transition @ transition
         noise = ahead.transition @ noise @ ahead.transition.T + ahead.noise
         y = ahead[:3]
         parts += [density] * step
-    whole = preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY).linearise(*x)
+    whole = propagated(preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY), *x)
     np.testing.assert_allclose(whole.transition, transition, atol=1e-2)
     sigma = np.sqrt(noise.diagonal())
     np.testing.assert_allclose(
         whole.noise / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
     )
     mean = replace(NOISE, accel_noise=NOISE.accel_noise * np.sqrt(np.mean([64, 1, 1, 16])))
-    other = preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY).linearise(*x).noise
+    other = propagated(preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY), *x).noise
     assert other[6, 6] < 0.8 * noise[6, 6]
 
 
 def test_noise_does_not_depend_on_the_sensor_rate() -> None:
     x = state()
     slow, fast = (
-        preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY).linearise(*x).noise
+        propagated(preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY), *x).noise
         for rate in (100, 400)
     )
     np.testing.assert_allclose(np.diag(fast), np.diag(slow), rtol=0.02)

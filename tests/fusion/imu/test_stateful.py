@@ -7,7 +7,7 @@ import pytest
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import network_track_true_attitude
-from stario.fusion.imu.stateful import AlongTrack
+from stario.fusion.imu.stateful import StatefulInference
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
@@ -18,7 +18,7 @@ class Counting:
     def predict(self, windows):
         raise AssertionError("a network that remembers is asked along a track")
 
-    def along_track(self, updates):
+    def stateful_inference(self, updates):
         return _Chains(updates)
 
 
@@ -34,11 +34,13 @@ class _Chains:
             self.index += 1
         return mean, np.tile(np.eye(3), (len(windows), 1, 1))
 
-    def checkpoint(self):
-        return {"counts": list(self.counts), "index": self.index}
+    @property
+    def memory(self):
+        return self.index, tuple(self.counts)
 
-    def rewind(self, memory):
-        self.counts, self.index = list(memory["counts"]), memory["index"]
+    @memory.setter
+    def memory(self, memory):
+        self.index, self.counts = memory[0], list(memory[1])
 
 
 def with_gap(walk, without):
@@ -48,10 +50,12 @@ def with_gap(walk, without):
 @pytest.mark.parametrize("rate", [1, 5])
 def test_memory_lasts_from_gap_to_gap_in_series_of_their_own(walk, without, rate) -> None:
     config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
-    observed = Navigator(Counting(), config).observe(with_gap(walk, without))
+    preprocessed = Navigator(Counting(), config).observe(with_gap(walk, without))
     stretches, told = [[]], []
-    for epoch, measurement in zip(observed.epochs, observed.measurements, strict=True):
-        if epoch.gap:
+    for interval, measurement in zip(
+        preprocessed.intervals, preprocessed.measurements, strict=True
+    ):
+        if interval.gap:
             stretches.append([])
         if measurement is not None:
             stretches[-1].append(measurement[0][0])
@@ -87,8 +91,8 @@ def test_the_track_with_true_attitude_remembers_too(walk) -> None:
 
 
 def test_a_model_without_memory_is_asked_itself(still_model) -> None:
-    network = AlongTrack(still_model, 10)
+    network = StatefulInference(still_model, 10)
     assert not network.remembers
-    assert network.checkpoint() is None
+    assert network.memory is None
     with pytest.raises(InputError, match="memory"):
-        network.rewind({"counts": [1], "index": 1})
+        network.memory = (1, (1,))

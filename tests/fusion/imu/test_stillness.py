@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, PriorPose, Track
+from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.imu.front_end import all_epochs
-from stario.fusion.imu.stillness import RestDetector
+from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import exp_so3
-from stario.fusion.navigator import Backend
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
@@ -26,7 +26,7 @@ DATA = Path(
     os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"
 )
 CONFIG = NavigatorConfig()
-BLIND = replace(CONFIG, filter=replace(CONFIG.filter, rest_noise=0.0))
+BLIND = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])
 GRAVITY = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
@@ -46,9 +46,9 @@ def lying(
 
 
 def share_at_rest(sequence: ImuSequence) -> float:
-    epochs, _ = all_epochs(sequence, CONFIG)
-    detector = RestDetector(10, CONFIG.filter.rest_noise)
-    return float(np.mean([detector.at_rest(epoch) for epoch in epochs]))
+    intervals, _ = cut_recording(sequence, CONFIG)
+    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
+    return float(np.mean([detector.is_still(interval) for interval in intervals]))
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 1000.0])
@@ -59,19 +59,19 @@ def test_a_device_on_a_table_is_at_rest_after_a_second(rate: float) -> None:
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "trolley"])
 def test_who_walks_is_not_at_rest(make_walk: Make, carry: str) -> None:
     walk = make_walk(5, 20.0, 100.0, PHONE_IMU, carry=carry)
-    epochs, _ = all_epochs(walk, CONFIG)
-    detector = RestDetector(10, CONFIG.filter.rest_noise)
-    resting = np.array([e.stop for e in epochs if detector.at_rest(e)])
-    if len(resting):
-        moved = walk.truth.at(resting).position_W - walk.truth.at(resting - 1.0).position_W
+    intervals, _ = cut_recording(walk, CONFIG)
+    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
+    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    if len(still):
+        moved = walk.truth.at(still).position_W - walk.truth.at(still - 1.0).position_W
         assert np.linalg.norm(moved, axis=1).max() < 0.1  # a simulated trolley creeps smoothly
 
 
 def test_rest_needs_a_whole_second_and_a_gap_ends_it() -> None:
-    epochs, _ = all_epochs(lying(6.0), CONFIG)
-    epochs[30] = replace(epochs[30], gap=True)
-    detector = RestDetector(10, CONFIG.filter.rest_noise)
-    found = [detector.at_rest(epoch) for epoch in epochs]
+    intervals, _ = cut_recording(lying(6.0), CONFIG)
+    intervals[30] = replace(intervals[30], gap=True)
+    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
+    found = [detector.is_still(interval) for interval in intervals]
     assert not any(found[:9])
     assert all(found[9:30])
     assert not any(found[30:40])
@@ -85,21 +85,21 @@ def yaw_off(track: Track) -> float:
 
 def test_rest_measures_the_bias_and_holds_yaw_and_place(still_model: Any) -> None:
     table = lying(30.0)
-    with_rest = Navigator(still_model, CONFIG).run(table)
+    with_zero_velocity = Navigator(still_model, CONFIG).run(table)
     without = Navigator(still_model, BLIND).run(table)
-    assert with_rest.health.rests == {"applied": 291}
-    assert without.health.rests == {}
-    np.testing.assert_allclose(with_rest.b_g[-1], BIAS, atol=1e-4)
-    assert yaw_off(with_rest) < 0.2 * yaw_off(without)
-    assert np.linalg.norm(with_rest.trajectory.velocity_W[-1]) < 0.01
-    assert np.linalg.norm(with_rest.trajectory.position_W[-1]) < 0.05
-    sigma = np.sqrt(np.diag(with_rest.covariance[-1]))
-    assert (np.abs(with_rest.b_g[-1] - BIAS) < 3.0 * sigma[9:12]).all()
+    assert with_zero_velocity.health.zero_velocity == {"applied": 291}
+    assert without.health.zero_velocity == {}
+    np.testing.assert_allclose(with_zero_velocity.b_g[-1], BIAS, atol=1e-4)
+    assert yaw_off(with_zero_velocity) < 0.2 * yaw_off(without)
+    assert np.linalg.norm(with_zero_velocity.trajectory.velocity_W[-1]) < 0.01
+    assert np.linalg.norm(with_zero_velocity.trajectory.position_W[-1]) < 0.05
+    sigma = np.sqrt(np.diag(with_zero_velocity.covariance[-1]))
+    assert (np.abs(with_zero_velocity.b_g[-1] - BIAS) < 3.0 * sigma[9:12]).all()
     assert sigma[11] < 0.3 * np.sqrt(without.covariance[-1, 11, 11])
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_what_lies_still_does_not_drift_by_what_the_network_says(backend: Backend) -> None:
+def test_what_lies_still_does_not_drift_by_what_the_network_says(backend: BackendName) -> None:
     """The network learned from walking: of a table it says a centimetre a second."""
     track = Navigator(load_model(), CONFIG, backend=backend).run(lying(60.0))
     assert np.linalg.norm(track.trajectory.position_W[-1]) < 0.05
@@ -117,13 +117,13 @@ def test_an_even_glide_is_not_stopped(still_model: Any) -> None:
     """No vibration, and no network that knows: what the filter knows of its speed decides."""
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     track = Navigator(still_model, CONFIG, fast).run(lying(3.0, bias=np.zeros(3)))
-    assert track.health.rests == {"gated": 21}
+    assert track.health.zero_velocity == {"gated": 21}
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
 def test_a_slow_turn_is_not_taken_for_bias(still_model: Any) -> None:
     track = Navigator(still_model, CONFIG).run(lying(20.0, turn=0.05, bias=np.zeros(3)))
-    assert track.health.rests == {"gated": 191}
+    assert track.health.zero_velocity == {"gated": 191}
     assert np.abs(track.b_g[-1]).max() < 2e-3
 
 
@@ -143,13 +143,13 @@ def test_recordings_rest_only_where_the_truth_does(name: str, found: bool) -> No
     recording = read_recording(DATA / name)
     start = recording.time[0]
     recording = recording.slice(start, start + 40.0)
-    epochs, _ = all_epochs(recording, NavigatorConfig(filter=FilterConfig()))
-    detector = RestDetector(10, CONFIG.filter.rest_noise)
-    resting = np.array([e.stop for e in epochs if detector.at_rest(e)])
-    assert (len(resting) > 10) == found
+    intervals, _ = cut_recording(recording, NavigatorConfig(filter=FilterConfig()))
+    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
+    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    assert (len(still) > 10) == found
     if not found:
         return
-    before, now = recording.truth.at(resting - 1.0), recording.truth.at(resting)
+    before, now = recording.truth.at(still - 1.0), recording.truth.at(still)
     known = before.valid & now.valid
     assert known.any()
     assert np.linalg.norm((now.position_W - before.position_W)[known], axis=1).max() < 0.02

@@ -84,8 +84,8 @@ def test_the_graph_form_of_stario_gives_the_same_numbers(gated_unit: bool) -> No
 def test_a_network_that_remembers_does_so_in_both_engines(exported: Path) -> None:
     windows, model = some_windows(6), fresh("RNIN")
     for found, expected in zip(
-        load_model(exported).along_track(2).predict(windows),
-        model.along_track(2).predict(windows),
+        load_model(exported).stateful_inference(2).predict(windows),
+        model.stateful_inference(2).predict(windows),
         strict=True,
     ):
         assert_close(found, expected)
@@ -131,8 +131,8 @@ def test_a_model_that_remembers_depends_on_the_order_of_windows(tmp_path: Path) 
     save_model(tmp_path / "rnin.safetensors", model.training_form, model.card)
     loaded = load_model(tmp_path / "rnin.safetensors")
     windows = some_windows(6)
-    at_once = loaded.along_track(3).predict(windows)[0]
-    track = loaded.along_track(3)
+    at_once = loaded.stateful_inference(3).predict(windows)[0]
+    track = loaded.stateful_inference(3)
     one_by_one = np.concatenate([track.predict(windows[k : k + 1])[0] for k in range(6)])
     assert np.array_equal(at_once, one_by_one)
     # The first window of each series is alone, the others are not.
@@ -143,4 +143,4 @@ def test_a_model_that_remembers_depends_on_the_order_of_windows(tmp_path: Path) 
 
 def test_a_model_without_memory_is_its_own_along_a_track() -> None:
     model = fresh("I-MobileNet")
-    assert model.along_track(10) is model
+    assert model.stateful_inference(10) is model

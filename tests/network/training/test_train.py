@@ -288,7 +288,7 @@ def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -
     assert config.successive == 10
     # A step changes the weights that only a state which is not zero reaches.
     path = run(tmp_path / "row", config)
-    assert load_model(path).along_track(2) is not None
+    assert load_model(path).stateful_inference(2) is not None
     first = DisplacementNetwork(build_network_of(config)).state_dict()
     last = safetensors.torch.load_file(path)
     change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]

@@ -366,7 +366,7 @@ WRITERS: dict[str, tuple[str, float, Writer]] = {
     "rnin": ("rnin", 200.0, write_rnin),
     "tlio": ("tlio", 200.0, write_tlio),
     "tlio raw": ("tlio", 1000.0, write_tlio_raw),
-    "android": ("android", 200.0, write_android),
+    "phone": ("phone", 200.0, write_android),
     "bag ros1": ("bag", 200.0, bag_writer("ros1")),
     "bag sqlite3": ("bag", 200.0, bag_writer("sqlite3")),
     "bag mcap": ("bag", 200.0, bag_writer("mcap")),

@@ -217,14 +217,16 @@ def test_a_loggers_files_that_do_not_fit(tmp_path, walks, formats) -> None:
     lines = gyro.read_text().splitlines()
     gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0]]))
     refused(path, "Gyroscope.csv: line 51: found 3 values, expected 5")
-    gyro.write_text("\n".join([*lines[:30], "nan,nan,nan,nan,nan", *lines[31:]]))
-    refused(path, "Gyroscope.csv: row 31, values: found nan")
+    gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",nan", *lines[31:]]))
+    refused(path, "Gyroscope.csv: row 31, x, y, z: found nan")
+    gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",1e15", *lines[31:]]))
+    refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected what a sensor can give, in rad/s")
     gyro.write_text("\n".join(lines).replace(",x", ",x [rpm]", 1))
     refused(path, "Gyroscope.csv: header: found unit 'rpm', expected rad/s, deg/s")
     gyro.unlink()
     refused(path, "content: found a folder with Accelerometer.csv", ", ".join(FORMATS))
-    with pytest.raises(ReadError, match=r"gyroscope: found Accelerometer\.csv, expected a file"):
-        read_recording(path, format="android")
+    with pytest.raises(ReadError, match=r"files: found Accelerometer\.csv, .*, expected a gyrosc"):
+        read_recording(path, format="phone")
 
 
 @pytest.mark.parametrize("name", list(FORMATS))

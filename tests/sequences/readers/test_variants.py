@@ -202,17 +202,30 @@ def sessions(folder, formats, *names: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
+    ("names", "told"),
     [
-        ("walk1_acc.csv", "walk1_gyr.csv", "walk2_acc.csv", "walk2_gyr.csv"),
-        ("acc_1.csv", "acc_2.csv", "gyr_3.csv"),
+        (
+            ("walk1_acc.csv", "walk1_gyr.csv", "walk2_acc.csv", "walk2_gyr.csv"),
+            r"a folder of 2 recordings, .*; name one, such as .*/walk1_gyr\.csv",
+        ),
+        (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"a folder with acc_1\.csv, acc_2\.csv, gyr_3"),
     ],
 )
-def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names) -> None:
+def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names, told) -> None:
     sessions(tmp_path / "s", formats, *names)
-    told = ", ".join(names) + ", expected .*put each recording into a folder of its own"
     with pytest.raises(ReadError, match=told):
         read_recording(tmp_path / "s")
+
+
+def test_prefixed_files_of_two_recordings_are_two(tmp_path, formats) -> None:
+    sessions(tmp_path / "s", formats, "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv")
+    (tmp_path / "s/Two_gyr.csv").write_text(rows(np.arange(99) / 100.0, np.ones((99, 3))))
+    found = find_recordings(tmp_path)
+    assert found == [tmp_path / "s/Two_gyr.csv", tmp_path / "s/one_gyr.csv"]
+    two, one = map(read_recording, found)
+    assert (two.name, one.name) == ("two", "one")
+    assert (two.gyro == 1.0).all()
+    assert np.array_equal(one.gyro, formats.walk(100.0, 3.0).gyro)
 
 
 def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path, formats) -> None:

@@ -1,0 +1,13 @@
+"""Gates: quantiles of the chi-square distribution."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from scipy.special import gammaincinv
+
+
+@lru_cache(maxsize=4096)
+def chi2_quantile(probability: float, dof: float) -> float:
+    """The value that chi-square with so many degrees of freedom stays below with a probability."""
+    return float(2.0 * gammaincinv(0.5 * dof, probability))

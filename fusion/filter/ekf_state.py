@@ -1,0 +1,194 @@
+"""What the filter knows at one time, as a value that is never changed in place.
+
+Error state, its order and meaning: README.md, "Error state". The poses lie on SE_2(3) (clones:
+SE(3)); the covariance is that of their right-invariant error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stario.fusion.error_state import CLONE, CORE, GYRO_BIAS, plain_covariance
+from stario.fusion.filter.estimate import Estimate
+from stario.fusion.lie import FloatArray, skew
+from stario.sequences.errors import InputError
+
+_CLONE_COLUMNS = [0, 1, 2, 4]
+"""Columns R, p of a pose: a clone has no velocity."""
+
+_FAR = 1e3
+"""Farther from the origin than this [m] positions are counted from a point nearby: in the
+right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
+digits for centimetres."""
+
+
+@dataclass(frozen=True, eq=False)
+class EkfState:
+    """The current pose and biases, the cloned poses, and their covariance.
+
+    Whoever changes anything makes a new one, so that a reference to an old one is a checkpoint.
+
+    Attributes:
+        time: [s].
+        X: (1 + slots, 3, 5) columns R, v, p; row 0 is the current pose, row 1 + s the clone in slot
+            s, whose v is zero. p is counted from the origin.
+        origin_W: (3,) [m].
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        P: (n, n) covariance of the error state; zero for an empty slot.
+        clone_times: [s], None for an empty slot.
+    """
+
+    time: float
+    X: FloatArray
+    origin_W: FloatArray
+    b_g: FloatArray
+    b_a: FloatArray
+    P: FloatArray
+    clone_times: tuple[float | None, ...]
+
+    @classmethod
+    def initial(
+        cls,
+        time: float,
+        R_WB: FloatArray,
+        v_W: FloatArray,
+        p_W: FloatArray,
+        b_g: FloatArray,
+        b_a: FloatArray,
+        covariance: FloatArray,
+        slots: int,
+    ) -> EkfState:
+        """A state without clones; the covariance (15, 15) is that of `plain_covariance`."""
+        origin_W = p_W if np.linalg.norm(p_W) > _FAR else np.zeros(3)
+        X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
+        X[0, :, :3], X[0, :, 3], X[0, :, 4] = R_WB, v_W, p_W - origin_W
+        P = np.zeros((CORE + CLONE * slots,) * 2)
+        P[:CORE, :CORE] = plain_covariance(covariance, -X[0, :, 3:].T)
+        return cls(time, X, origin_W, b_g, b_a, P, (None,) * slots)
+
+    @property
+    def R_WB(self) -> FloatArray:
+        """Attitude (3, 3), body to world."""
+        return self.X[0, :, :3]
+
+    @property
+    def v_W(self) -> FloatArray:
+        """Velocity (3,) [m/s]."""
+        return self.X[0, :, 3]
+
+    @property
+    def p_W(self) -> FloatArray:
+        """Position (3,) [m]."""
+        return np.asarray(self.X[0, :, 4] + self.origin_W)
+
+    @property
+    def plain_covariance(self) -> FloatArray:
+        """Covariance (15, 15) of plain errors, each true minus estimate.
+
+        Order: rotation about W's axes [rad] (R = (I + [theta]x) R^), velocity [m/s] and position
+        [m] in W, biases [rad/s], [m/s^2].
+        """
+        return plain_covariance(self.P[:CORE, :CORE], self.X[0, :, 3:].T)
+
+    def time_of_clone(self, slot: int) -> float:
+        """When a clone was taken [s].
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
+        if time is None:
+            taken = [k for k, known in enumerate(self.clone_times) if known is not None]
+            raise InputError("slot", repr(slot), f"one that holds a clone: {taken}")
+        return time
+
+    def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
+        """R_WB (3, 3) and p_W (3,) of a clone as estimated now.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        self.time_of_clone(slot)
+        X = self.X[1 + slot]
+        return X[:, :3], np.asarray(X[:, 4] + self.origin_W)
+
+    def estimate(self, in_gap: bool = False, map_frame: int = 0) -> Estimate:
+        """The current pose and biases."""
+        P = self.P[:CORE, :CORE]
+        return self._estimate(self.time, self.X[0], P, P[:, GYRO_BIAS], in_gap, map_frame)
+
+    def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
+        """A clone as it is known now.
+
+        Raises:
+            InputError: the slot holds no clone.
+        """
+        time, first = self.time_of_clone(slot), CORE + CLONE * slot
+        rows = self.P[first : first + CLONE]
+        X, P = self.X[1 + slot][:, _CLONE_COLUMNS], rows[:, first : first + CLONE]
+        return self._estimate(time, X, P, rows[:, GYRO_BIAS], False, map_frame)
+
+    def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
+        """Every pose in another frame: p <- R p + shift, likewise attitude and velocity.
+
+        A turn about the vertical (and any shift) leaves gravity where it is; the error turns with
+        the frame exactly, by the adjoint of (R, shift).
+
+        Args:
+            R: (3, 3) rotation about the vertical.
+            shift: (3,) [m].
+        """
+        moved = R @ self.origin_W + shift
+        origin_W = moved if np.linalg.norm(moved) > _FAR else np.zeros(3)
+        shift = moved - origin_W  # what is left of it for the poses
+        X = R @ self.X
+        X[:, :, 4] += shift
+        A = np.eye(len(self.P))
+        for first, rho in self._poses():
+            A[first : first + 3, first : first + 3] = R
+            A[rho : rho + 3, rho : rho + 3] = R
+            A[rho : rho + 3, first : first + 3] = skew(shift) @ R
+        A[3:6, 3:6] = R
+        P = A @ self.P @ A.T
+        return replace(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T))
+
+    def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
+        """The covariance inflated by a turn of all poses about a vertical.
+
+        Args:
+            about_W: (3,) a point of the vertical [m].
+            sigma: of the turn [rad].
+        """
+        x, y, _ = about_W - self.origin_W
+        N = np.zeros((len(self.P), 1))
+        for first, rho in self._poses():
+            N[first + 2, 0] = 1.0
+            N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
+        return replace(self, P=self.P + sigma**2 * (N @ N.T))
+
+    def with_position_inflated(self, sigma: float) -> EkfState:
+        """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""
+        N = np.zeros((len(self.P), 3))
+        for _, rho in self._poses():
+            N[rho : rho + 3] = np.eye(3)
+        return replace(self, P=self.P + sigma**2 * (N @ N.T))
+
+    def _estimate(
+        self,
+        time: float,
+        X: FloatArray,
+        P: FloatArray,
+        P_g: FloatArray,
+        in_gap: bool,
+        map_frame: int,
+    ) -> Estimate:
+        P_gg, b_g, b_a = self.P[GYRO_BIAS, GYRO_BIAS], self.b_g, self.b_a
+        return Estimate(time, X, self.origin_W, b_g, b_a, P, P_g, P_gg, in_gap, map_frame)
+
+    def _poses(self) -> list[tuple[int, int]]:
+        """First rows of theta and rho_p of the current pose and of every clone."""
+        taken = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
+        return [(0, 6), *((first, first + 3) for first in taken)]

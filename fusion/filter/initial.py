@@ -1,0 +1,85 @@
+"""The filter's first state, and the one behind a gap too long to be bridged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.map_frame import UNKNOWN_YAW
+from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.lie import FloatArray, exp_so3
+from stario.fusion.yaw import yaw_twist
+
+STILL_TILT_SIGMA = 0.01
+"""Of the first attitude when the device was at rest [rad]."""
+
+WALKING_SPEED = 1.5
+"""How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
+
+FARTHEST = 1e4
+"""No gap is taken to have led farther than this [m]: the covariance must keep its digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class PriorPose:
+    """What is known of the first pose, at the time of the first sample.
+
+    Attributes:
+        R_WB: (3, 3) attitude.
+        v_W: (3,) velocity [m/s].
+        p_W: (3,) position [m].
+        tilt_sigma: [rad].
+        yaw_sigma: [rad].
+        velocity_sigma: per axis [m/s].
+        position_sigma: per axis [m].
+    """
+
+    R_WB: FloatArray
+    v_W: FloatArray
+    p_W: FloatArray
+    tilt_sigma: float = 0.02
+    yaw_sigma: float = 0.02
+    velocity_sigma: float = 0.1
+    position_sigma: float = 1e-3
+
+
+def initialise(
+    ekf: StateCloningEkf, start: Start, prior: PriorPose | None, config: NavigatorConfig
+) -> None:
+    """Set the first state: the prior's, else level by gravity, at rest, at the origin."""
+    f = config.filter
+    tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+    zero = np.zeros(3)
+    pose = prior or PriorPose(start.R_WB, zero, zero, tilt, f.yaw_sigma, f.velocity_sigma)
+    sigma = [pose.tilt_sigma] * 2 + [pose.yaw_sigma]
+    sigma += [pose.velocity_sigma] * 3 + [pose.position_sigma] * 3
+    sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
+    covariance = np.diag(np.square(np.maximum(sigma, SMALLEST_SIGMA)))
+    ekf.initialise(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
+
+
+def reinitialise(
+    ekf: StateCloningEkf, interval: ImuInterval, start: Start, config: NavigatorConfig
+) -> None:
+    """Behind a long gap: tilt from gravity, speed and yaw unknown, somewhere in walking reach."""
+    f, s = config.filter, ekf.state
+    P, seconds = s.plain_covariance, interval.stop - interval.start
+    covariance = np.zeros_like(P)
+    tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+    covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
+    covariance[3:6, 3:6] = max(f.velocity_sigma, SMALLEST_SIGMA) ** 2 * np.eye(3)
+    reach = min(WALKING_SPEED * seconds, FARTHEST)
+    covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
+    walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
+    turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
+    drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
+    covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
+    # What both priors of the gyroscope say of the position hangs on this.
+    covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
+    yaw = yaw_twist(s.R_WB)
+    turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
+    ekf.initialise(interval.stop, turn @ start.R_WB, np.zeros(3), s.p_W, s.b_g, s.b_a, covariance)

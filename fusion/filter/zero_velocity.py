@@ -1,0 +1,60 @@
+"""Zero-velocity and zero-rate update (ZUPT, ZARU) of a device at rest.
+
+README.md, "Zero velocity". Zero velocity is measured in the estimated axes, so that it says nothing
+of yaw. The mean rate in the middle of the still second measures the gyroscope's bias; both its
+halves are at rest, so that a beginning motion is not taken for bias. What turns too slowly to be
+told from bias shows in how the means of the second's parts differ, and their variance is the
+measurement's, for the whole second.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.imu.stillness import StillnessDetector
+from stario.fusion.lie import FloatArray
+from stario.sequences.noise import ImuNoise
+from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.windows import WINDOW_SECONDS
+
+_BY_VELOCITY = np.eye(6, 3)
+_BY_BIAS = np.eye(6, 3, k=-3)
+
+
+class ZeroVelocity(NamedTuple):
+    """What is measured at rest: the velocity is zero, the gyroscope reads its bias."""
+
+    b_g: FloatArray
+    """(3,) mean rate [rad/s]."""
+    covariance: FloatArray
+    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; measured once per interval and counted
+    once per second, hence so wide."""
+
+
+def zero_velocity(stillness: StillnessDetector, noise: ImuNoise) -> ZeroVelocity:
+    """The measurement of a still second.
+
+    The velocity is as uncertain as what white noise of the accelerometer hides over the second.
+
+    Args:
+        stillness: that found the second still.
+        noise: densities the filter assumes.
+    """
+    rates = stillness.mean_rates()
+    n = len(rates)
+    hidden = max(noise.accel_noise, PHONE_IMU.noise.accel_noise) ** 2 * WINDOW_SECONDS
+    white = PHONE_IMU.noise.gyro_noise**2 / stillness.mean_seconds()
+    spread = np.maximum(rates.var(axis=0), white)
+    return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden] * 3, *(n * spread)]))
+
+
+def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: float) -> UpdateResult:
+    """Update a filter; refused, not inflated, where an even glide only looks still."""
+    s = ekf.state
+    residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
+    blocks = [(3, _BY_VELOCITY), (9, _BY_BIAS)]
+    return ekf.update_linear(residual, blocks, measured.covariance, gate, "reject")

@@ -1,0 +1,124 @@
+"""A recording made ready for the estimators: cut into intervals, its windows inferred."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.fusion.checked import floored
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.estimator import Displacement
+from stario.fusion.imu.front_end import FrontEnd, cut_recording
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.stateful import Predictor, StatefulInference
+from stario.sequences.checks import check_units
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.windows import WINDOW_SECONDS
+
+LEAST_SIGMA = 5e-3
+"""No network knows a second's displacement better than this [m], whatever it says."""
+
+FLAGGED_SCALE = 4.0
+"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
+
+_BATCH = 512
+"""Windows of a recording that the network is given at once."""
+
+Progress = Callable[[float], None]
+"""Called with the share of the work done, 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreprocessedRecording:
+    """A recording as the estimators see it.
+
+    Attributes:
+        intervals: in order.
+        measurements: the network's displacement of the window that ends with each interval, None
+            where there is no window.
+        front_end: with its counts and the start.
+        seconds_front_end: computing time [s].
+        seconds_network: computing time [s].
+    """
+
+    intervals: list[ImuInterval]
+    measurements: list[Displacement | None]
+    front_end: FrontEnd
+    seconds_front_end: float
+    seconds_network: float
+
+
+def preprocess(
+    sequence: ImuSequence, model: Predictor, config: NavigatorConfig, progress: Progress
+) -> PreprocessedRecording:
+    """Cut a recording into intervals and let the network see its windows.
+
+    Raises:
+        InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
+    """
+    check_units(sequence)
+    began = perf_counter()
+    intervals, front_end = cut_recording(sequence, config)
+    if front_end.start is None or not any(e.window is not None for e in intervals):
+        raise InputError(
+            f"{sequence.name}: samples",
+            f"{front_end.counts.used} usable over {sequence.duration:.2f} s",
+            f"an unbroken stretch of at least {WINDOW_SECONDS:g} s",
+        )
+    seconds_front_end = perf_counter() - began
+    progress(0.1)
+    began = perf_counter()
+    network = StatefulInference(model, config.filter.window_updates)
+    measurements = _displacements(intervals, network, progress)
+    seconds_network = perf_counter() - began
+    return PreprocessedRecording(
+        intervals, measurements, front_end, seconds_front_end, seconds_network
+    )
+
+
+def displacements_of(
+    network: StatefulInference, intervals: Sequence[ImuInterval]
+) -> list[Displacement]:
+    """The network's displacements of the intervals' windows, as far as it can be trusted."""
+    windows = np.stack([_window(interval) for interval in intervals])
+    return [
+        (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
+        for interval, d_N, C in zip(intervals, *network.predict(windows), strict=True)
+    ]
+
+
+def _displacements(
+    intervals: Sequence[ImuInterval], network: StatefulInference, progress: Progress
+) -> list[Displacement | None]:
+    measurements: list[Displacement | None] = [None] * len(intervals)
+    for batch in _batches(intervals, unbroken=network.remembers):
+        if network.remembers and intervals[batch[0]].gap:
+            network.restart()
+        known = [k for k in batch if intervals[k].window is not None]
+        if known:
+            found = displacements_of(network, [intervals[k] for k in known])
+            for k, displacement in zip(known, found, strict=True):
+                measurements[k] = displacement
+        progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))
+    return measurements
+
+
+def _batches(intervals: Sequence[ImuInterval], unbroken: bool) -> Iterator[range]:
+    """Runs of intervals whose windows the network sees at once; `unbroken` ones end at a gap."""
+    begin = windows = 0
+    for k, interval in enumerate(intervals):
+        if windows == _BATCH or (unbroken and interval.gap and k > begin):
+            yield range(begin, k)
+            begin, windows = k, 0
+        windows += interval.window is not None
+    yield range(begin, len(intervals))
+
+
+def _window(interval: ImuInterval) -> NDArray[np.float32]:
+    assert interval.window is not None  # only intervals that have one are asked
+    return interval.window

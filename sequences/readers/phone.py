@@ -1,0 +1,154 @@
+"""Folders of phone loggers: one text file for each sensor, each at its own clock.
+
+Written by many apps, each in its way (Sensor Logger, phyphox, SensLogs, the Android and iOS loggers
+of several data sets), so what a file holds is told by its name and content; see `sensor_words` and
+`sensor_table`. Time without a unit is in the one that makes 10 to 1200 samples a second of it;
+values without a unit are rad/s, m/s^2 and uT.
+
+Both sensors are brought onto the gyroscope's times of their common stretch. Where the
+accelerometer's file has lost gravity and there is one of gravity, that is added. Apple's
+accelerometers report the opposite of specific force, in g: that is known by the app and system that
+the folder tells of (Sensor Logger's `Metadata.csv`), or by the phone's own attitude beside it. A
+pose that an ARCore or ARKit logger wrote beside is the truth, see `poses`.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.phone_files import PhoneFiles, phone_recordings
+from stario.sequences.readers.phone_sign import accel_sign, is_in_g
+from stario.sequences.readers.poses import pose_files, with_pose
+from stario.sequences.readers.sensor_table import Samples, SensorTable, read_samples
+from stario.sequences.readers.sensor_words import Sensor
+from stario.sequences.readers.text import seconds
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Magnetometer
+
+_log = logging.getLogger(__name__)
+
+_GRAVITY_REMOVED = 5.0
+"""A median force below this [m/s^2] has lost gravity."""
+
+
+def read_phone(path: Path) -> ImuSequence:
+    """Read a logger's folder, or by its gyroscope's file one recording of a folder with several.
+
+    Raises:
+        ReadError: a file is missing or malformed, the folder holds more than one recording, or the
+            two sensors have no stretch in common.
+    """
+    folder = path if path.is_dir() else path.parent
+    files = _chosen(path)
+    gyro = _read(files.tables["gyro"][0], "gyro")
+    accel, converted = _force(files, gyro)
+    stamps, rate, force = on_one_clock(
+        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
+    )
+    if gyro.unit not in ("", "rad/s"):
+        converted |= {"gyro"}
+    sequence = ImuSequence(
+        name=folder.resolve().name if path.is_dir() else files.key.replace(" ", "_") or path.stem,
+        time=seconds(stamps, stamps[0]),
+        gyro=rate,
+        accel=force,
+        converted=frozenset(converted),
+        magnetometer=_magnetometer(files, stamps[0]),
+    )
+    return with_pose(sequence, stamps[0], pose_files(folder, files.key))
+
+
+def is_phone(path: Path) -> bool:
+    """Whether a folder holds one recording's files, or a file is the gyroscope's of one of several.
+
+    Never raises.
+    """
+    if path.is_dir():
+        return len(phone_recordings(path)) == 1
+    if not path.is_file() or "gyr" not in path.name.lower():
+        return False
+    return any(files.gyro == path for files in phone_recordings(path.parent))
+
+
+def _chosen(path: Path) -> PhoneFiles:
+    folder = path if path.is_dir() else path.parent
+    found = phone_recordings(folder)
+    if path.is_dir() and len(found) > 1:
+        names = ", ".join(files.gyro.name for files in found)
+        fix = f"name one by its gyroscope's file: {found[0].gyro}"
+        raise ReadError(folder, "files", f"{len(found)} recordings, {names}", "one", fix)
+    chosen = [files for files in found if path.is_dir() or files.gyro == path]
+    if not chosen:
+        names = ", ".join(sorted(p.name for p in folder.glob("*"))[:6]) or "nothing"
+        expected = "a gyroscope's and an accelerometer's file of one recording"
+        raise ReadError(
+            folder, "files", names, expected, "put each recording into a folder of its own"
+        )
+    return chosen[0]
+
+
+def _read(table: SensorTable, sensor: Sensor) -> Samples:
+    """The sensor's columns: those that its header names so, or those of a file that names none."""
+    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
+    if axes is None:
+        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
+    return read_samples(table, sensor, axes)
+
+
+def _force(files: PhoneFiles, gyro: Samples) -> tuple[Samples, set[str]]:
+    """Specific force, and whether its unit or sign were converted."""
+    candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
+    whole = next((found for found in candidates if _has_gravity(found)), None)
+    gravity = None if whole else _gravity(files)
+    linear = files.first("linear")
+    if whole is None and not candidates and linear is not None:
+        candidates = [_read(linear, "linear")]
+    accel = whole or candidates[0]
+    if whole is None and gravity is not None:
+        folder = gyro_folder(files)
+        stamps, force, gravity_B = on_one_clock(
+            folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
+        )
+        accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
+        _log.info("%s: gravity added from its own file", folder)
+    converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
+    sign = accel_sign(files, accel)
+    in_g = not accel.unit and is_in_g(accel.values) and sign < 0
+    if sign < 0:
+        converted |= {"accel"}
+    factor = sign * (STANDARD_GRAVITY if in_g else 1.0)
+    return replace(accel, values=factor * accel.values), converted
+
+
+def gyro_folder(files: PhoneFiles) -> Path:
+    """The folder that a recording's files lie in."""
+    return files.gyro.parent
+
+
+def _has_gravity(accel: Samples) -> bool:
+    size = float(np.median(np.linalg.norm(accel.values, axis=1)))
+    return size >= _GRAVITY_REMOVED or is_in_g(accel.values)
+
+
+def _gravity(files: PhoneFiles) -> Samples | None:
+    table = files.first("gravity")
+    return None if table is None else _read(table, "gravity")
+
+
+def _magnetometer(files: PhoneFiles, start_ns: np.int64) -> Magnetometer | None:
+    table = files.first("mag")
+    if table is None:
+        return None
+    try:
+        samples = _read(table, "mag")
+    except ReadError as error:  # a recording does without
+        _log.warning("magnetometer left out: %s", error)
+        return None
+    time: FloatArray = seconds(samples.stamps_ns, start_ns)
+    return magnetometer(time, samples.values)

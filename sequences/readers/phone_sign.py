@@ -1,0 +1,116 @@
+"""Whether a phone's accelerometer reports specific force or, as Apple's do, its opposite.
+
+The sign does not show in the accelerometer and the gyroscope: a world upside down moves alike. It
+is known by the system that an app names, or by the phone's own attitude where that was logged:
+specific force points up. Apps differ in the order of a quaternion and in whether it takes the body
+to the world or back, so all are tried, and the one that fits best decides.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.phone_files import PhoneFiles
+from stario.sequences.readers.sensor_table import Samples, read_quaternion
+from stario.sequences.readers.text import IntArray, head_lines
+from stario.sequences.rotations import NORM_TOLERANCE
+from stario.sequences.sequence import FloatArray
+
+_log = logging.getLogger(__name__)
+
+_G_RANGE = (0.7, 1.4)
+_STEADY = 0.4
+"""Gravity keeps a tenth of the samples from falling below this share of their median."""
+
+_SURE = 0.7
+"""Mean cosine between an attitude's vertical and the force from which it decides."""
+
+_ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
+"""Where x, y, z and w stand in rows without a header."""
+
+
+def is_in_g(values: FloatArray) -> bool:
+    """Whether an accelerometer's samples (N, 3) are about one long: gravity in g."""
+    size = np.linalg.norm(values, axis=1)
+    low, median = np.percentile(size, [10, 50])
+    return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
+
+
+def accel_sign(files: PhoneFiles, accel: Samples) -> float:
+    """1.0, or -1.0 where the accelerometer has Apple's sign."""
+    folder = files.gyro.parent
+    sign = _by_attitude(files, accel)
+    if sign is None:
+        sign = _by_system(folder)
+    if sign is None and is_in_g(accel.values) and not accel.unit:
+        _log.warning(
+            "%s: an accelerometer in g: if an iPhone wrote it, pass "
+            "`--accel-unit g --accel-sign apple`", folder,
+        )  # fmt: skip
+    if sign == -1.0:
+        _log.info("%s: the accelerometer has Apple's sign, turned over", folder)
+    return sign or 1.0
+
+
+def _by_system(folder: Path) -> float | None:
+    """By Sensor Logger's `Metadata.csv`; iOS has Apple's sign unless the app standardised it."""
+    file = next((p for p in folder.glob("*") if p.name.lower() == "metadata.csv"), None)
+    if file is None:
+        return None
+    lines = [line for line in head_lines(file) if line.strip()][:2]
+    if len(lines) < 2:
+        return None
+    titles, cells = ([c.strip(" \"'").lower() for c in line.split(",")] for line in lines)
+    told = dict(zip(titles, cells, strict=False))
+    system = told.get("platform", "") or told.get("device name", "")
+    if not any(word in system for word in ("ios", "iphone", "ipad")):
+        return 1.0 if system else None
+    return 1.0 if told.get("standardisation", told.get("standardization")) == "true" else -1.0
+
+
+def _by_attitude(files: PhoneFiles, accel: Samples) -> float | None:
+    """By the phone's own attitude, where it is one to be used."""
+    table = files.first("attitude")
+    if table is None or not table.quaternion:
+        return None
+    try:
+        stamps, quaternion = read_quaternion(table)
+    except ReadError:
+        return None
+    unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
+    if unit.sum() < 2:
+        return None
+    stamps, quaternion = stamps[unit], quaternion[unit]
+    orders = _ORDERS[:1] if table.quaternion[0].title else _ORDERS
+    fits = [
+        _agreement(stamps, rotation, accel)
+        for order in orders
+        for rotation in _both_ways(Rotation.from_quat(quaternion[:, order]))
+    ]
+    best = max(fits, key=abs)
+    return float(np.sign(best)) if abs(best) > _SURE else None
+
+
+def _both_ways(attitude: Rotation) -> tuple[Rotation, Rotation]:
+    return attitude, attitude.inv()
+
+
+def _agreement(stamps_ns: IntArray, attitude_WB: Rotation, accel: Samples) -> float:
+    """Mean cosine between the vertical in B and the force over the common stretch."""
+    origin = stamps_ns.min()
+    order = np.argsort(stamps_ns, kind="stable")
+    clock = stamps_ns[order] - origin
+    inside = (accel.stamps_ns >= origin) & (accel.stamps_ns <= stamps_ns.max())
+    if inside.sum() < 2:
+        return 0.0
+    up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)[order]
+    time = accel.stamps_ns[inside] - origin
+    seen = np.stack([np.interp(time, clock, up_B[:, k]) for k in range(3)], axis=1)
+    force = accel.values[inside]
+    sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
+    return float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))

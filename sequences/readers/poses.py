@@ -1,0 +1,210 @@
+"""Poses that an augmented-reality logger wrote beside an IMU, brought into the IMU's frames.
+
+Rows are time, position xyz [m] and a quaternion, or the upper three rows of a pose matrix (ARKit).
+Files differ in what they are of (camera, display, sensor), in the quaternion's order, which some
+headers name wrongly, and in the world's vertical (y for ARCore and ARKit). The gyroscope tells:
+each file and order is held against it (`stario.sequences.truth.alignment`), the one that agrees
+is taken, its constant turn against the IMU's axes taken out and its world turned upright by the
+mean specific force. Of several that agree the one that is turned least is the sensor's own.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.sensor_table import first_row
+from stario.sequences.readers.sensor_words import is_sensor_word, words_of
+from stario.sequences.readers.text import IntArray, head_lines, read_table, seconds
+from stario.sequences.rotations import NORM_TOLERANCE, tilt_aligning
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import advancing
+from stario.sequences.truth.accel_axes import accel_axes
+from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
+from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.windows import clean_samples
+
+_log = logging.getLogger(__name__)
+
+_WORDS = {"pose", "poses", "arcore", "arkit"}
+_OTHER = {"point", "points", "cloud", "intrinsics", "image", "frames"}
+_SUFFIXES = (".txt", ".csv")
+
+_AGREES = 0.8
+"""Correlation of the turning from which a pose is that of the IMU's device."""
+
+_ALIKE = 0.02
+_OWN_AXES_RAD = np.deg2rad(8.0)
+"""A smaller turn against the IMU is the estimate's error: the pose is in the IMU's own axes."""
+
+
+@dataclass(frozen=True)
+class PoseRows:
+    """A pose file's rows in one of the ways they can be read.
+
+    Attributes:
+        file: the file.
+        stamps_ns: (N,) [ns].
+        position: (N, 3) [m].
+        attitude: N rotations, of whatever body to whatever world.
+        order: how the attitude was read.
+    """
+
+    file: Path
+    stamps_ns: IntArray
+    position: FloatArray
+    attitude: Rotation
+    order: str
+
+
+def pose_files(folder: Path, key: str = "") -> list[Path]:
+    """The files of poses of a recording, by their names; `key` is what all its names share."""
+    found = []
+    for file in sorted(folder.iterdir()):
+        words = words_of(file.stem)
+        if file.suffix.lower() not in _SUFFIXES or not _WORDS & set(words) or _OTHER & set(words):
+            continue
+        plain = [w for w in words if w not in _WORDS and not is_sensor_word(w)]
+        if not key or set(key.split()) <= set(plain):
+            found.append(file)
+    return found
+
+
+def with_pose(sequence: ImuSequence, start_ns: np.int64 | int, files: list[Path]) -> ImuSequence:
+    """The recording with the truth that the best of the pose files gives, if one agrees.
+
+    Args:
+        sequence: a recording without truth.
+        start_ns: its first sample on the poses' clock [ns].
+        files: of poses; others in the same form.
+
+    Raises:
+        ReadError: a file's rows are malformed.
+    """
+    ways = [way for file in files for way in pose_rows(file)]
+    fits = [(way, fit) for way in ways if (fit := _fitted(sequence, start_ns, way)) is not None]
+    if not fits:
+        if ways:
+            names = ", ".join(dict.fromkeys(way.file.name for way in ways))
+            _log.warning("%s: no pose of %s agrees with the gyroscope", sequence.name, names)
+        return sequence
+    best = max(fit.aligned.correlation for _, fit in fits)
+    near = [(way, fit) for way, fit in fits if fit.aligned.correlation > best - _ALIKE]
+    way, fit = min(near, key=lambda item: item[1].turn)
+    _say(sequence, fits, way, fit)
+    return _posed(sequence, way, fit)
+
+
+def pose_rows(file: Path) -> list[PoseRows]:
+    """A file's poses in each way that they can be read; none if it holds no poses.
+
+    Raises:
+        ReadError: a row is malformed.
+    """
+    lines = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
+    found = first_row(lines)
+    if found is None:
+        return []
+    first, delimiter, decimal = found
+    width = len(lines[first][1].split(delimiter))
+    if width < 8:
+        return []
+    columns = 13 if width >= 13 else 8
+    table = read_table(file, columns, lines[first][0], delimiter, None, decimal)
+    stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
+    numbers = table.values[:, 1:]
+    if columns == 13:
+        matrices = numbers.reshape(-1, 3, 4)
+        good = np.abs(np.linalg.det(matrices[:, :, :3]) - 1.0) < NORM_TOLERANCE
+        return [
+            PoseRows(
+                file, stamps[good], matrices[good, :, 3],
+                Rotation.from_matrix(matrices[good, :, :3]), "matrix",
+            )
+        ]  # fmt: skip
+    quaternion = numbers[:, 3:7]
+    good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
+    orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+    return [
+        PoseRows(
+            file, stamps[good], numbers[good, :3],
+            Rotation.from_quat(quaternion[good][:, order]), name,
+        )
+        for name, order in orders.items()
+        if good.any()
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How a pose stands to the IMU: its times on the IMU's clock, which rows, the turn [rad]."""
+
+    time: FloatArray
+    rows: IntArray
+    aligned: BodyAlignment
+    turn: float
+
+
+def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseRows) -> _Fit | None:
+    time, gyro, accel = clean_samples(sequence)
+    order = np.argsort(way.stamps_ns, kind="stable")
+    pose_time = seconds(way.stamps_ns[order], start_ns)
+    kept = advancing(pose_time)
+    rows, pose_time = order[kept], pose_time[kept]
+    attitude = way.attitude[rows]
+    valid = np.ones(len(pose_time), dtype=np.bool_)
+    try:
+        if pose_time[0] > time[-1] or pose_time[-1] < time[0]:
+            pose_time = pose_time + clock_offset(time, gyro, pose_time, attitude, valid)
+        aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
+    except InputError:
+        return None
+    if aligned.correlation < _AGREES:
+        return None
+    turn = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2].magnitude()
+    return _Fit(pose_time, rows, aligned, float(turn))
+
+
+def _say(
+    sequence: ImuSequence, fits: list[tuple[PoseRows, _Fit]], way: PoseRows, fit: _Fit
+) -> None:
+    _log.info(
+        "%s: truth is %s, quaternion %s, %.0f degrees off the IMU's axes, correlation %.3f",
+        sequence.name, way.file.name, way.order, np.degrees(fit.turn), fit.aligned.correlation,
+    )  # fmt: skip
+    for other, its in fits:
+        if other.file != way.file and its.turn > _OWN_AXES_RAD:
+            _log.warning(
+                "%s: %s is taken as the truth; %s is %.0f degrees off the IMU's axes",
+                sequence.name, way.file.name, other.file.name, np.degrees(its.turn),
+            )  # fmt: skip
+
+
+def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
+    aligned = fit.aligned
+    attitude_PB = aligned.leveling_WW.inv() * aligned.attitude_WB  # in the poses' own world
+    if fit.turn < _OWN_AXES_RAD:
+        attitude_PB = way.attitude[fit.rows]
+    time = fit.time + aligned.lag
+    truth = Trajectory(time, way.position[fit.rows], attitude_PB, valid=aligned.valid)
+    sequence = accel_axes(sequence, truth)
+    inside = (sequence.time >= time[0]) & (sequence.time <= time[-1])
+    pose = truth.at(np.unique(sequence.time[inside]))
+    force = np.stack(
+        [np.interp(pose.time, sequence.time, sequence.accel[:, k]) for k in range(3)], axis=1
+    )
+    up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
+    R_WP = tilt_aligning(up)
+    try:
+        truth = replace(
+            truth, position_W=R_WP.apply(truth.position_W), attitude_WB=R_WP * truth.attitude_WB
+        )
+    except InputError as error:
+        raise ReadError(way.file, "poses", str(error), "finite numbers") from None
+    return replace(sequence, truth=truth)

@@ -1,0 +1,138 @@
+"""What names say: which sensor a file or a column is of, along which axis, in which unit.
+
+Apps spell the same things in many ways (`TotalAcceleration.csv`, `gyr_walk1.txt`, `magneticFieldX`,
+`ACCELEROMETER X (m/s²)`, `gFx`). A name is cut into words at case changes and at what is no letter,
+and the words decide, so that order, case and what stands around them do not matter.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Literal
+
+from stario.sequences.units import TIME_UNITS, unit_named
+
+Sensor = Literal["accel", "gyro", "mag", "gravity", "linear", "attitude"]
+
+_WORD = re.compile(r"[A-Z]{2,}(?![a-z])|[A-Z]?[a-z]+|[A-Z]|\d+|[^\W\d_]+")
+_GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
+
+_BEGINNINGS: tuple[tuple[str, Sensor], ...] = (
+    ("lin", "linear"),
+    ("user", "linear"),
+    ("grav", "gravity"),
+    ("gyr", "gyro"),
+    ("angular", "gyro"),
+    ("omega", "gyro"),
+    ("mag", "mag"),
+    ("acc", "accel"),
+    ("quat", "attitude"),
+    ("orient", "attitude"),
+    ("attitude", "attitude"),
+    ("rotation", "attitude"),
+    ("game", "attitude"),
+)
+_WHOLE: dict[str, Sensor] = {
+    "a": "accel",
+    "gf": "accel",
+    "force": "accel",
+    "g": "gyro",
+    "w": "gyro",
+    "m": "mag",
+    "b": "mag",
+    "rv": "attitude",
+    "ori": "attitude",
+}
+_NOT_SAMPLES = {
+    *("bias", "drift", "offset", "calib", "calibration", "accuracy", "std", "variance"),
+    *("meta", "metadata", "down", "step", "steps", "estimated"),
+}
+_TIME = {"t", "time", "times", "timestamp", "timestamps", "seconds", "elapsed", "millis", "nanos"}
+_NO_TIME = {"date", "zone", "timezone", "txt", "gps", "location", "utc", "format"}
+_UNIT_WORDS = {
+    **dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("us", "micro", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("ms", "milli", "millis", "msec", "milliseconds"), "ms"),
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
+}
+_BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in lower case, brackets left out."""
+    return [word.lower() for word in _WORD.findall(_BRACKETS.sub(" ", name))]
+
+
+def unit_of(name: str) -> str:
+    """The unit in brackets, in the tables' spelling; empty without one."""
+    match = _BRACKETS.search(name)
+    return unit_named(match[1]) if match else ""
+
+
+def sensor_of(words: Iterable[str]) -> Sensor | None:
+    """The one sensor that words tell of; None where they tell of none, of several or no samples."""
+    words = list(words)
+    if set(words) & _NOT_SAMPLES:
+        return None
+    told = {sensor for word in words if (sensor := _sensor(word)) is not None}
+    if "linear" in told:  # linear acceleration, user acceleration
+        return "linear" if told <= {"linear", "accel"} else None
+    if told == {"attitude"} and "rate" in words:  # rotation rate
+        return "gyro"
+    return next(iter(told)) if len(told) == 1 else None
+
+
+def _sensor(word: str) -> Sensor | None:
+    if word in _WHOLE:
+        return _WHOLE[word]
+    return next((sensor for start, sensor in _BEGINNINGS if word.startswith(start)), None)
+
+
+def is_sensor_word(word: str) -> bool:
+    """Whether a word names a sensor or one of its variants, rather than a recording."""
+    variants = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
+    return _sensor(word) is not None or word.startswith(variants)
+
+
+def is_uncalibrated(words: Iterable[str]) -> bool:
+    """Whether words tell of a sensor's raw variant."""
+    return any(word.startswith(("uncal", "raw")) for word in words)
+
+
+def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
+    """A column's axis and the words besides it; None where it is no axis of samples."""
+    words = words_of(name)
+    if set(words) & _NOT_SAMPLES:
+        return None
+    alone = [word for word in words if word in ("x", "y", "z")]
+    if len(alone) == 1:
+        return alone[0], tuple(word for word in words if word != alone[0])
+    match = _GLUED.fullmatch(words[-1]) if words and not alone else None
+    if match is None or (match["stem"] and _sensor(match["stem"]) is None):
+        return None
+    return match["axis"], (*words[:-1], match["stem"])
+
+
+def quaternion_of(name: str) -> str | None:
+    """Which of x, y, z, w of a quaternion a column is; None for another."""
+    words = words_of(name)
+    last = "".join(words[-2:]) if words[-1:] and len(words[-1]) == 1 else "".join(words[-1:])
+    match = re.fullmatch(r"(?:q|quat|quaternion|rv|ori|orientation|attitude)([wxyz])", last)
+    return match[1] if match else None
+
+
+def is_time(name: str) -> bool:
+    """Whether a column is a clock."""
+    words = set(words_of(name))
+    return bool(words & _TIME) and not words & _NO_TIME
+
+
+def time_unit_of(name: str) -> str:
+    """The unit of a clock's column, in brackets or in its words; empty where it names none.
+
+    What stands in brackets is returned as it is, so that an unknown unit can be refused.
+    """
+    if (named := unit_of(name)) and (named in TIME_UNITS or named not in ("", "since")):
+        return named
+    return next((_UNIT_WORDS[word] for word in reversed(words_of(name)) if word in _UNIT_WORDS), "")
