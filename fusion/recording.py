@@ -13,7 +13,7 @@ from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator import Displacement
 from stario.fusion.imu.front_end import FrontEnd, cut_recording
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
@@ -74,7 +74,7 @@ def preprocess(
     progress(0.1)
     began = perf_counter()
     network = StatefulInference(model, config.filter.window_updates)
-    measurements = _displacements(intervals, network, progress)
+    measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
         intervals, measurements, front_end, seconds_front_end, seconds_network
@@ -82,10 +82,15 @@ def preprocess(
 
 
 def displacements_of(
-    network: StatefulInference, intervals: Sequence[ImuInterval]
+    network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
 ) -> list[Displacement]:
-    """The network's displacements of the intervals' windows, as far as it can be trusted."""
+    """The network's displacements of the intervals' windows, as far as it can be trusted.
+
+    The windows, and those that move as nothing the weights know, are counted.
+    """
     windows = np.stack([_window(interval) for interval in intervals])
+    counts.windows += len(windows)
+    counts.unfamiliar += network.unfamiliar(windows)
     return [
         (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
         for interval, d_N, C in zip(intervals, *network.predict(windows), strict=True)
@@ -93,7 +98,10 @@ def displacements_of(
 
 
 def _displacements(
-    intervals: Sequence[ImuInterval], network: StatefulInference, progress: Progress
+    intervals: Sequence[ImuInterval],
+    network: StatefulInference,
+    counts: SampleCounts,
+    progress: Progress,
 ) -> list[Displacement | None]:
     measurements: list[Displacement | None] = [None] * len(intervals)
     for batch in _batches(intervals, unbroken=network.remembers):
@@ -101,7 +109,7 @@ def _displacements(
             network.restart()
         known = [k for k in batch if intervals[k].window is not None]
         if known:
-            found = displacements_of(network, [intervals[k] for k in known])
+            found = displacements_of(network, [intervals[k] for k in known], counts)
             for k, displacement in zip(known, found, strict=True):
                 measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))

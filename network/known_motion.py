@@ -179,7 +179,7 @@ def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a centre that no window is nearest to
-        found, _ = kmeans2(known, min(_CENTRES, len(known)), minit="++", seed=seed)
+        found, _ = kmeans2(known, min(_CENTRES, len(known)), minit="points", seed=seed)
     rounded = np.round(found, 3)
     limit = max(float(np.percentile(vq(known, rounded)[1], _PERCENTILE)), 1e-3)
     return tuple(tuple(row) for row in rounded.tolist()), limit

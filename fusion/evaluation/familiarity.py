@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.imu.intervals import UNFAMILIAR_SHARE
 from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
-
-_STRANGE = 0.3
-"""Share of windows outside from which a recording is told to be: of training windows 0.05 are."""
 
 _WORDS = {
     "acceleration": ("acceleration", "m/s^2 rms"),
@@ -44,7 +42,7 @@ class Familiarity:
     @property
     def strange(self) -> bool:
         """Whether so much of the recording lies outside that the track deserves less trust."""
-        return self.outside is not None and self.outside > _STRANGE
+        return self.outside is not None and self.outside > UNFAMILIAR_SHARE
 
     def as_dict(self) -> dict[str, object]:
         """Plain values."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -48,6 +49,11 @@ class StatefulInference:
         """The stretch's next windows; as the model's `predict`."""
         answer: tuple[FloatArray, FloatArray] = self._stretch.predict(windows)
         return answer
+
+    def unfamiliar(self, windows: NDArray[np.float32]) -> int:
+        """How many windows (B, 6, 200) lie outside what the model's weights were trained on."""
+        known = getattr(getattr(self._model, "card", None), "known_motion", None)
+        return 0 if known is None else int((known.strangeness(windows) > 1.0).sum())
 
     @property
     def memory(self) -> Any:
