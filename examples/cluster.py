@@ -15,12 +15,8 @@ from pathlib import Path
 import joblib
 from distributed import Client, LocalCluster
 
-from stario.fusion import NavigatorConfig
-from stario.fusion.evaluation.many import compare_recordings
-from stario.fusion.evaluation.summary import Scores, scores_of, summary_table
-from stario.sequences import generate_walk, simulate_imu
-from stario.sequences.batch import Skipped
-from stario.sequences.readers.own_csv import write_csv
+from stario.fusion import NavigatorConfig, Scores, compare_recordings, scores_of, summary_table
+from stario.sequences import Skipped, generate_walk, simulate_imu, write_csv
 
 
 def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skipped]]:

@@ -5,8 +5,7 @@ python examples/compare_tracks.py
 
 from __future__ import annotations
 
-from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.compare import Comparison, compare
+from stario.fusion import Comparison, NavigatorConfig, compare
 from stario.network import load_model
 from stario.sequences import PHONE_IMU, WalkStyle, generate_walk, simulate_imu
 

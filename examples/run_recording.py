@@ -11,8 +11,7 @@ from pathlib import Path
 
 from stario.fusion import Navigator, Track, demonstration
 from stario.network import load_model
-from stario.sequences import read_recording
-from stario.sequences.readers.own_csv import write_csv
+from stario.sequences import read_recording, write_csv
 
 
 def fused_track(path: Path) -> Track:

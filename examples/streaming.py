@@ -25,5 +25,5 @@ def main(seconds: float = 30.0) -> list[NavState]:
 
 if __name__ == "__main__":
     for state in main()[::50]:
-        sigma = state.covariance.diagonal()[6:9] ** 0.5
+        sigma = state.position_covariance.diagonal() ** 0.5
         print(f"t {state.time:6.2f} s  p_W {state.p_W.round(2)} m  sigma {sigma.round(2)} m")

@@ -11,10 +11,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from stario.network import DisplacementModel, TrainingConfig, load_model
-from stario.network.training.train import train
-from stario.sequences import generate_walk, simulate_imu
-from stario.sequences.windows import world_streams
+from stario.network import DisplacementModel, TrainingConfig, load_model, train
+from stario.sequences import generate_walk, simulate_imu, world_streams
 
 
 def main(folder: Path, epochs: int = 2) -> DisplacementModel:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import Displacement
+from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.imu.front_end import FrontEnd, cut_recording
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.fusion.imu.stateful import Predictor, StatefulInference
@@ -88,12 +88,13 @@ def displacements_of(
 
     The windows, and those that move as nothing the weights know, are counted.
     """
-    windows = np.stack([_window(interval) for interval in intervals])
-    counts.windows += len(windows)
-    counts.unfamiliar += network.unfamiliar(windows)
+    windows_N = np.stack([_window(interval) for interval in intervals])
+    counts.windows += len(windows_N)
+    counts.unfamiliar += network.unfamiliar(windows_N)
+    heading = np.array([interval.heading for interval in intervals])
     return [
         (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
-        for interval, d_N, C in zip(intervals, *network.predict(windows), strict=True)
+        for interval, d_N, C in zip(intervals, *network.predict(windows_N, heading), strict=True)
     ]
 
 

@@ -44,7 +44,7 @@ def _classes() -> dict[str, type]:
     from stario.fusion.filter import (
         ekf_state,
         estimate,
-        estimator,
+        estimator_state,
         frame_transform,
         initial,
         innovations,
@@ -61,7 +61,12 @@ def _classes() -> dict[str, type]:
         *(intervals.SampleCounts, intervals.Start, outliers.Flags, outliers.OutlierDetector),
         *(levelling.LevelledAttitude, preintegration.Segment),
         *(fixes.Fix, fixes.Accepted, fixes.FixQueue, initial.PriorPose),
-        *(ekf_state.EkfState, estimate.Estimate, estimator.EstimatorState, estimator.Step),
+        *(
+            ekf_state.EkfState,
+            estimate.Estimate,
+            estimator_state.EstimatorState,
+            estimator_state.Step,
+        ),
         *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
         *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
         *(keyframes.KeyframeGraph, keyframes.Whitened, factors.KeyframeState),

@@ -22,11 +22,11 @@ class NavState:
         p_W: (3,) position [m], zero at the start.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
-        covariance: (15, 15) of rotation about the world's axes [rad], velocity, position, b_g, b_a;
-            each error is true minus estimate.
+        covariance: (15, 15) of rotation about W's axes [rad], velocity, position, b_g, b_a; each
+            error is true minus estimate. Its blocks have names of their own below.
         in_gap: True right after a stretch without samples.
-        world: how often fixes moved or turned the world before; states of different worlds must
-            not be compared.
+        map_frame: how many frame transforms there were before (`filter.map_frame`): states with
+            different ones must not be compared.
     """
 
     time: float
@@ -44,8 +44,38 @@ class NavState:
         """Attitude as a unit quaternion (4,), x y z w."""
         return np.asarray(Rotation.from_matrix(self.R_WB).as_quat())
 
+    @property
+    def attitude_WB(self) -> Rotation:
+        """Attitude, body to world."""
+        return Rotation.from_matrix(self.R_WB)
+
+    @property
+    def attitude_covariance(self) -> FloatArray:
+        """(3, 3) of the rotation about W's axes [rad^2]."""
+        return self.covariance[0:3, 0:3]
+
+    @property
+    def velocity_covariance(self) -> FloatArray:
+        """(3, 3) [m^2/s^2]."""
+        return self.covariance[3:6, 3:6]
+
+    @property
+    def position_covariance(self) -> FloatArray:
+        """(3, 3) [m^2]."""
+        return self.covariance[6:9, 6:9]
+
+    @property
+    def gyro_bias_covariance(self) -> FloatArray:
+        """(3, 3) [rad^2/s^2]."""
+        return self.covariance[9:12, 9:12]
+
+    @property
+    def accel_bias_covariance(self) -> FloatArray:
+        """(3, 3) [m^2/s^4]."""
+        return self.covariance[12:15, 12:15]
+
     def shifted(self, by: FloatArray) -> NavState:
-        """The state in a world whose origin lies at -`by` (3,) [m]."""
+        """The state in a frame whose origin lies at -`by` (3,) [m]."""
         return replace(self, p_W=self.p_W + by)
 
 
@@ -57,8 +87,8 @@ class SmoothedPose:
         time: of the pose [s].
         R_WB: (3, 3) attitude, body to world.
         p_W: (3,) position [m].
-        covariance: (6, 6) of rotation about the world's axes [rad] and position [m].
-        world: as in `NavState`.
+        covariance: (6, 6) of rotation about W's axes [rad] and position [m].
+        map_frame: as in `NavState`.
     """
 
     time: float
@@ -103,7 +133,7 @@ class Health:
         mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
         fixes: absolute fixes applied (of these gated), and left out by reason.
-        zero_velocity: measurements of rest (one per state at rest) applied, and left out by reason.
+        zero_velocity: updates at rest (one per state there) applied, and left out by reason.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.
@@ -139,7 +169,7 @@ class Health:
         if self.fixes:
             text.append(f"fixes {_counted(self.fixes)}")
         if self.zero_velocity:
-            text.append(f"at rest {_counted(self.zero_velocity)}")
+            text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}", *self.notes]
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from stario.network.model import load_model as load_model
     from stario.network.training.augment import Augmentation as Augmentation
     from stario.network.training.config import TrainingConfig as TrainingConfig
+    from stario.network.training.train import train as train
 
 _MODULES = {
     "Augmentation": "training.augment",
@@ -19,14 +20,8 @@ _MODULES = {
     "DisplacementModel": "model",
     "TrainingConfig": "training.config",
     "load_model": "model",
+    "train": "training.train",
 }
 
-__all__ = [
-    "Augmentation",
-    "Calibration",
-    "Card",
-    "DisplacementModel",
-    "TrainingConfig",
-    "load_model",
-]
+__all__ = [*_MODULES]
 __getattr__ = lazy_attributes("stario.network", _MODULES)

@@ -21,7 +21,10 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 
 FORMAT = 1
-FRAME = "gravity-aligned, z up, yaw arbitrary"
+FRAME = "gravity-aligned, z up, the device's heading zero"
+FRAMES = (FRAME, "gravity-aligned, z up, yaw arbitrary")
+"""Of a network that was shown windows at any yaw, the device's heading is one of them."""
+
 MAX_SIGMA = 5.0
 """Nobody walks further in a second: a larger sigma [m] says nothing more."""
 
@@ -171,9 +174,10 @@ def _check(card: Card, path: Path) -> None:
         "outputs": 6,
         "rate": WINDOW_RATE,
         "samples": WINDOW_SAMPLES,
-        "frame": FRAME,
         "channels": CHANNELS,
     }
     for name, value in expected.items():
         if getattr(card, name) != value:
             raise WeightsError(path, name, repr(getattr(card, name)), repr(value))
+    if card.frame not in FRAMES:
+        raise WeightsError(path, "frame", repr(card.frame), repr(FRAME))

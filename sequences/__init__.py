@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from stario.sequences.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from stario.sequences.batch import Skipped as Skipped
     from stario.sequences.checks import check_units as check_units
     from stario.sequences.conventions import with_conventions as with_conventions
     from stario.sequences.errors import ConfigError as ConfigError
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from stario.sequences.noise import ImuNoise as ImuNoise
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
+    from stario.sequences.readers.own_csv import write_csv as write_csv
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import ImuSequence as ImuSequence
     from stario.sequences.sequence import Magnetometer as Magnetometer
@@ -31,23 +33,29 @@ if TYPE_CHECKING:
     from stario.sequences.simulation.imu import PHONE_IMU as PHONE_IMU
     from stario.sequences.simulation.imu import ImuErrors as ImuErrors
     from stario.sequences.simulation.imu import simulate_imu as simulate_imu
+    from stario.sequences.simulation.magnetometer import INDOOR_FIELD as INDOOR_FIELD
+    from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
     from stario.sequences.simulation.walks import WalkStyle as WalkStyle
     from stario.sequences.simulation.walks import generate_walk as generate_walk
     from stario.sequences.units import with_units as with_units
+    from stario.sequences.windows import world_streams as world_streams
 
 _MODULES = {
     "ConfigError": "errors",
     "GOOD_IMU": "simulation.imu",
+    "INDOOR_FIELD": "simulation.magnetometer",
     "ImuErrors": "simulation.imu",
     "ImuNoise": "noise",
     "ImuSequence": "sequence",
     "InputError": "errors",
+    "MagneticField": "simulation.magnetometer",
     "Magnetometer": "sequence",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
     "PositionTrack": "sequence",
     "ReadError": "errors",
     "STANDARD_GRAVITY": "sequence",
+    "Skipped": "batch",
     "StarioError": "errors",
     "Trajectory": "sequence",
     "WalkStyle": "simulation.walks",
@@ -64,11 +72,14 @@ _MODULES = {
     "simulate_imu": "simulation.imu",
     "with_conventions": "conventions",
     "with_units": "units",
+    "world_streams": "windows",
+    "write_csv": "readers.own_csv",
     "write_tum": "files",
 }
 
 __all__ = [
     "GOOD_IMU",
+    "INDOOR_FIELD",
     "PERFECT_IMU",
     "PHONE_IMU",
     "STANDARD_GRAVITY",
@@ -77,7 +88,11 @@ __all__ = [
     "ImuNoise",
     "ImuSequence",
     "InputError",
+    "MagneticField",
+    "Magnetometer",
+    "PositionTrack",
     "ReadError",
+    "Skipped",
     "StarioError",
     "Trajectory",
     "WalkStyle",
@@ -94,6 +109,8 @@ __all__ = [
     "simulate_imu",
     "with_conventions",
     "with_units",
+    "world_streams",
+    "write_csv",
     "write_tum",
 ]
 __getattr__ = lazy_attributes("stario.sequences", _MODULES)

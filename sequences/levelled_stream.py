@@ -18,6 +18,8 @@ from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
     clean_samples,
+    facing,
+    headings_at,
     resample,
     unbroken,
 )
@@ -36,11 +38,13 @@ class LevelledStream:
     Attributes:
         start: time of the first sample [s].
         imu_N: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] in N.
+        facing_N: (N, 2) float32, which way the device faces (`stario.sequences.windows.facing`).
         R_NB: (K, 3, 3) attitude at the ticks, one every `TICK_SECONDS` from `start`.
     """
 
     start: float
     imu_N: NDArray[np.float32]
+    facing_N: NDArray[np.float32]
     R_NB: FloatArray
 
     def __len__(self) -> int:
@@ -56,9 +60,18 @@ class LevelledStream:
         """Windows of a second that begin at a tick and are whole."""
         return max(0, (len(self) - WINDOW_SAMPLES) // TICK_SAMPLES + 1)
 
+    @property
+    def headings(self) -> FloatArray:
+        """Heading (M,) [rad] of the device in N in each window."""
+        return headings_at(self.facing_N, self._starts)
+
+    @property
+    def _starts(self) -> NDArray[np.int64]:
+        return TICK_SAMPLES * np.arange(self.window_count)
+
     def windows(self) -> NDArray[np.float32]:
         """Windows (M, 6, 200) in N that begin at the first M ticks."""
-        rows = TICK_SAMPLES * np.arange(self.window_count)[:, None] + np.arange(WINDOW_SAMPLES)
+        rows = self._starts[:, None] + np.arange(WINDOW_SAMPLES)
         return np.ascontiguousarray(self.imu_N[rows].transpose(0, 2, 1))
 
 
@@ -81,8 +94,10 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
         vectors = np.stack([gyro[part], accel[part]], axis=1)
         imu = (vectors @ R_NB.transpose(0, 2, 1)).reshape(-1, 6)
+        values = np.concatenate([imu, facing(R_NB)], axis=1)
         grid = np.arange(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
         at_tick = np.searchsorted(time[part], grid[::TICK_SAMPLES] - 1e-9)
-        imu_N = resample(time[part], imu, grid).astype(np.float32)
-        streams.append(LevelledStream(float(time[begin]), imu_N, R_NB[at_tick]))
+        even = resample(time[part], values, grid).astype(np.float32)
+        imu_N, facing_N = (np.ascontiguousarray(part) for part in np.split(even, [6], axis=1))
+        streams.append(LevelledStream(float(time[begin]), imu_N, facing_N, R_NB[at_tick]))
     return streams

@@ -178,9 +178,11 @@ def _written(file: Path, streams: list[WorldStream]) -> bool:
         return False
     imu_W = np.concatenate([s.imu_W for s in streams])
     position_W = np.concatenate([s.position_W for s in streams])
+    facing_W = np.concatenate([s.facing_W for s in streams])
     streams_of = json.dumps([(stream.name, len(stream)) for stream in streams])
     content = safetensors.numpy.save(
-        {"imu_W": imu_W, "position_W": position_W}, metadata={"streams": streams_of}
+        {"imu_W": imu_W, "position_W": position_W, "facing_W": facing_W},
+        metadata={"streams": streams_of},
     )
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -208,9 +210,9 @@ def _opened(file: Path) -> list[WorldStream] | None:
             length = int.from_bytes(source.read(8), "little")
             header = json.loads(source.read(min(length, size)))
         names, lengths = zip(*json.loads(header["__metadata__"]["streams"]), strict=True)
-        if size != 8 + length + sum(lengths) * 9 * 4:
+        if size != 8 + length + sum(lengths) * 11 * 4:
             raise ValueError(f"{size} bytes")
-        imu_W, position_W = (
+        imu_W, position_W, facing_W = (
             np.asarray(
                 np.memmap(
                     file,
@@ -220,7 +222,7 @@ def _opened(file: Path) -> list[WorldStream] | None:
                     shape=tuple(header[name]["shape"]),
                 )
             )
-            for name in ("imu_W", "position_W")
+            for name in ("imu_W", "position_W", "facing_W")
         )
     except FileNotFoundError:
         return None
@@ -229,6 +231,6 @@ def _opened(file: Path) -> list[WorldStream] | None:
         return None
     ends = np.cumsum([0, *lengths]).tolist()
     return [
-        WorldStream(name, imu_W[start:stop], position_W[start:stop])
+        WorldStream(name, imu_W[start:stop], position_W[start:stop], facing_W[start:stop])
         for name, (start, stop) in zip(names, pairwise(ends), strict=True)
     ]

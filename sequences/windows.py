@@ -4,12 +4,17 @@ A window that starts at t_i holds the 200 samples at t_i + k / 200 s, gyroscope 
 each rotated from the body into a gravity-aligned frame; its target is the displacement from t_i to
 t_j = t_i + 1 s in that frame (TLIO, Liu et al. 2020, section IV). For training the attitude is
 levelled by the IMU as in use, with the heading of the truth; or true, the papers' protocol.
+
+The networks see a window in frame H, in which the device's heading is zero: the same motion of the
+same device then looks the same whichever way it points. The heading is that of the twist about the
+vertical, averaged over the window (`mean_heading`); it has no singularity but for a device that
+lies upside down all the while, where any heading is as good as another.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -51,14 +56,63 @@ class WorldStream:
         name: the recording's.
         imu_W: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] rotated into W.
         position_W: (N, 3) float32 [m], relative to the stretch's start.
+        facing_W: (N, 2) float32, which way the device faces, as `facing` gives it.
     """
 
     name: str
     imu_W: NDArray[np.float32]
     position_W: NDArray[np.float32]
+    facing_W: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.imu_W)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelledImu:
+    """An IMU at 200 Hz in a gravity-aligned frame.
+
+    Attributes:
+        time: (M,) [s]; even but for long gaps, of which whole seconds are left out: a clock that
+            jumps by decades must not cost memory.
+        imu: (M, 6) float32, gyroscope [rad/s] and specific force [m/s^2].
+        facing: (M, 2) float32, which way the device faces, as `facing` gives it.
+        usable: (M,) where neither the IMU nor, if it was asked for, the truth has a gap.
+    """
+
+    time: FloatArray
+    imu: NDArray[np.float32]
+    facing: NDArray[np.float32]
+    usable: BoolArray
+
+
+def facing(R_NB: FloatArray) -> FloatArray:
+    """Which way a device faces (..., 2), from attitudes (..., 3, 3): not normalised.
+
+    Its angle is the attitude's twist about the vertical. Its length is 1 for a level device and
+    falls to 0 for one upside down, whose heading is not defined.
+    """
+    return 0.5 * np.stack(
+        [R_NB[..., 0, 0] + R_NB[..., 1, 1], R_NB[..., 1, 0] - R_NB[..., 0, 1]], axis=-1
+    )
+
+
+HEADING_STEP = 20
+"""Samples between the attitudes that a window's heading is the mean of."""
+
+
+def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
+    """Heading (B,) [rad] of windows from which way the device faces at ten instants (B, 10, 2)."""
+    total = np.asarray(facing_N, dtype=np.float64).sum(axis=-2)
+    return np.asarray(np.arctan2(total[..., 1], total[..., 0]))
+
+
+def turned_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np.float32]:
+    """Windows (B, 6, 200) turned about the vertical by `yaw` (B,) [rad]."""
+    R = about_z(yaw).as_matrix().astype(np.float32)
+    vectors = windows.reshape(len(windows), 2, 3, WINDOW_SAMPLES)
+    turned: NDArray[np.float32] = (R[:, None] @ vectors).reshape(windows.shape)
+    return turned
 
 
 def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
@@ -78,18 +132,20 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     return np.where((widths > 0.25 * step)[:, None], means, _interpolate(grid, time, values))
 
 
+_SHORTEST_SECONDS = 2.0 * WINDOW_SECONDS
+
+
 def world_streams(
     sequence: ImuSequence,
-    min_seconds: float = 2.0 * WINDOW_SECONDS,
     attitude: Attitude = "levelled",
 ) -> list[WorldStream]:
     """Cut a recording with truth into unbroken 200 Hz stretches in the world frame.
 
-    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`).
+    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); those
+    shorter than two windows are left out.
 
     Args:
         sequence: the recording.
-        min_seconds: shorter stretches are left out [s].
         attitude: "levelled" by the IMU with the true heading, or "true". A device that was mounted
             askew, or a truth that is, shows in the mean specific force under the true attitude:
             a network learns from it which way the device faces, and misses that in use.
@@ -99,29 +155,24 @@ def world_streams(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
-    grid, imu_W, usable = imu_in_world(sequence, sequence.truth, attitude)
+    world = imu_in_world(sequence, sequence.truth, attitude)
     known = sequence.truth.valid
-    position_W = _interpolate(grid, sequence.truth.time[known], sequence.truth.position_W[known])
+    truth = sequence.truth
+    position_W = _interpolate(world.time, truth.time[known], truth.position_W[known])
     return [
         WorldStream(
             name=sequence.name,
-            imu_W=imu_W[start:stop],
+            imu_W=world.imu[start:stop],
             position_W=(position_W[start:stop] - position_W[start]).astype(np.float32),
+            facing_W=world.facing[start:stop],
         )
-        for start, stop in runs(usable)
-        if (stop - start) / WINDOW_RATE >= min_seconds
+        for start, stop in runs(world.usable)
+        if (stop - start) / WINDOW_RATE >= _SHORTEST_SECONDS
     ]
 
 
-def imu_in_world(
-    sequence: ImuSequence, truth: Trajectory, attitude: Attitude
-) -> tuple[FloatArray, NDArray[np.float32], BoolArray]:
+def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -> LevelledImu:
     """The IMU at 200 Hz turned into the world, by an attitude as for `world_streams`.
-
-    Returns:
-        Grid times (M,) [s], gyroscope and specific force in W (M, 6) float32, and (M,) where
-        neither IMU nor truth has a gap. The grid is even but for long gaps of the IMU, of which
-        whole seconds are left out: a clock that jumps by decades must not cost memory.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -130,13 +181,21 @@ def imu_in_world(
     attitude_WB = truth.at(time).attitude_WB
     if attitude == "levelled":
         attitude_WB = _levelled(time, gyro, accel, attitude_WB, truth.covers(time))
+    world = _even(time, gyro, accel, attitude_WB)
+    return replace(world, usable=world.usable & truth.covers(world.time))
+
+
+def _even(
+    time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
+) -> LevelledImu:
+    """Samples turned by their attitudes and brought to an even 200 Hz."""
     left_out = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
     even_time = time - left_out
     even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
     grid = even + left_out[np.searchsorted(even_time, even, side="right") - 1]
-    imu_W = np.concatenate([attitude_WB.apply(gyro), attitude_WB.apply(accel)], axis=1)
-    usable = truth.covers(grid) & ~_spans_gap(even_time, even)
-    return grid, resample(even_time, imu_W, even).astype(np.float32), usable
+    columns = [attitude_WB.apply(gyro), attitude_WB.apply(accel), facing(attitude_WB.as_matrix())]
+    values = resample(even_time, np.concatenate(columns, axis=1), even).astype(np.float32)
+    return LevelledImu(grid, values[:, :6], values[:, 6:], ~_spans_gap(even_time, even))
 
 
 def _levelled(
@@ -146,12 +205,8 @@ def _levelled(
 
     Within a window the heading is the gyroscope's, as in use: the turn is averaged over a second.
     """
-    R_NB = np.empty((len(time), 3, 3))
     parts = unbroken(time)
-    for start, stop in parts:
-        part = slice(start, stop)
-        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
-    levelled_NB = Rotation.from_matrix(R_NB)
+    levelled_NB = Rotation.from_matrix(_levelled_NB(time, gyro, accel))
     turn = yaw_of(true_WB * levelled_NB.inv())
     second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
     changes = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
@@ -160,6 +215,15 @@ def _levelled(
         part = slice(start, stop)
         turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
     return about_z(turn) * levelled_NB
+
+
+def _levelled_NB(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+    """Attitudes (n, 3, 3) levelled by the IMU, each unbroken stretch for itself."""
+    R_NB = np.empty((len(time), 3, 3))
+    for start, stop in unbroken(time):
+        part = slice(start, stop)
+        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
+    return R_NB
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -217,10 +281,23 @@ def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
 def windows_at(
     stream: WorldStream, starts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Windows (M, 6, 200) that begin at samples `starts` (M,), and displacements (M, 3) [m]."""
+    """Windows (M, 6, 200) that begin at samples `starts` (M,), and displacements (M, 3) [m], in W.
+
+    Frame H is that turned by minus `headings_at`.
+    """
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
     windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
     return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
+
+
+def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> FloatArray:
+    """The device's heading (M,) [rad] in the windows that begin at samples `starts` (M,).
+
+    Args:
+        facing: (N, 2) of the stream, as the function of that name gives it.
+        starts: (M,).
+    """
+    return mean_heading(facing[starts[:, None] + np.arange(0, WINDOW_SAMPLES, HEADING_STEP)])
 
 
 def runs(flags: BoolArray) -> list[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""`stario backends`: filter against graph."""
+"""`stario check backends`: filter against graph."""
 
 from __future__ import annotations
 

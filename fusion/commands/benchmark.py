@@ -1,4 +1,4 @@
-"""`stario benchmark`: speed on this machine."""
+"""`stario check benchmark`: speed on this machine."""
 
 from __future__ import annotations
 

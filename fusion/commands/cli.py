@@ -20,6 +20,7 @@ from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.faults import faults
 from stario.fusion.commands.inspect import inspect
+from stario.fusion.commands.live import live
 from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
@@ -33,22 +34,13 @@ app = typer.Typer(
     help="Inertial navigation: fused trajectories from IMU recordings.",
 )
 
-for command in (
-    run,
-    compare,
-    evaluate,
-    simulate,
-    convert,
-    inspect,
-    train,
-    models,
-    export,
-    benchmark,
-    backends,
-    faults,
-    consistency,
-):
+for command in (run, live, compare, evaluate, inspect, convert, train, simulate, export):
     app.command()(command)
+
+check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
+for command in (models, backends, faults, consistency, benchmark):
+    check.command()(command)
+app.add_typer(check, name="check")
 
 
 def main() -> None:

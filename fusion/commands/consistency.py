@@ -1,4 +1,4 @@
-"""`stario consistency`: does the filter know how wrong it is?"""
+"""`stario check consistency`: does the filter know how wrong it is?"""
 
 from __future__ import annotations
 

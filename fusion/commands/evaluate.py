@@ -61,8 +61,8 @@ def evaluate(
         str | None,
         typer.Option(
             "--models",
-            help="Networks side by side: names of `stario models`, default, or weights files, "
-            "with commas between; several weights of one network are averaged.",
+            help="Networks side by side: names of `stario check models`, default, or weights "
+            "files, with commas between; several weights of one network are averaged.",
         ),
     ] = None,
     runs: Annotated[

@@ -15,7 +15,7 @@ def export(
         str,
         typer.Option(
             "--model",
-            help="Network: a name of `stario models`, default, or a weights file with its card.",
+            help="Network: a name of `stario check models`, default, or weights with their card.",
         ),
     ] = "default",
     runs: Annotated[

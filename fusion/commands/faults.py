@@ -1,4 +1,4 @@
-"""`stario faults`: what faults in a recording cost."""
+"""`stario check faults`: what faults in a recording cost."""
 
 from __future__ import annotations
 

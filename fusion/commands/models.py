@@ -1,4 +1,4 @@
-"""`stario models`: what each network costs."""
+"""`stario check models`: what each network costs."""
 
 from __future__ import annotations
 

@@ -32,7 +32,8 @@ def train(
     reading: Reading,
     paths: PathsArgument = None,
     model: Annotated[
-        str | None, typer.Option("--model", help="Network to train, as `stario models` names it.")
+        str | None,
+        typer.Option("--model", help="Network to train, as `stario check models` names it."),
     ] = None,
     out: Annotated[
         Path | None,

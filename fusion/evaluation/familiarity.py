@@ -11,7 +11,7 @@ from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SECONDS
+from stario.sequences.windows import WINDOW_SECONDS, turned_windows
 
 _WORDS = {
     "acceleration": ("acceleration", "m/s^2 rms"),
@@ -79,8 +79,9 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     if not streams or not any(stream.window_count for stream in streams):
         return Familiarity(None, {}, {})
     windows = np.concatenate([stream.windows()[::2] for stream in streams])
-    displacement = model.predict(windows)[0]
-    speeds = np.linalg.norm(displacement[:, :2], axis=1) / WINDOW_SECONDS
+    headings = np.concatenate([stream.headings[::2] for stream in streams])
+    displacement_H = model.predict(turned_windows(windows, -headings))[0]
+    speeds = np.linalg.norm(displacement_H[:, :2], axis=1) / WINDOW_SECONDS
     found = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
     rates = np.concatenate([step_rates(stream.imu_N) for stream in streams])
     if len(rates):

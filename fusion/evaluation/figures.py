@@ -98,7 +98,7 @@ def _pde_boxes(table: NetworkTable) -> Figure:
         axes.set_title(words, loc="left", fontsize=10)
         axes.set_ylim(bottom=0.0)
         _dress(axes)
-    panels[0].set_ylabel("PDE [% of the way]")
+    panels[0].set_ylabel("PDE [% of the path]")
     return fig
 
 
@@ -120,8 +120,8 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
 
 
 def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
-    way = sample.truth.position_W[sample.truth.valid]
-    axes.plot(way[:, 0], way[:, 1], color="black", lw=2.0, label="truth")
+    path = sample.truth.position_W[sample.truth.valid]
+    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label="truth")
     names = list(sample.tracks)
     if _AGAINST in names:
         ours = [name for name in names if name.startswith("StarIO")]
@@ -130,7 +130,7 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
         track, colour = sample.tracks[name].position_W, colours[name]
         axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=name)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
-    axes.plot(*way[0, :2], "o", mfc="white", mec=_INK, ms=8)
+    axes.plot(*path[0, :2], "o", mfc="white", mec=_INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")

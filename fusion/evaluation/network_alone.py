@@ -61,9 +61,10 @@ def answers(model: Predictor, prepared: Prepared) -> list[Answers]:
 
 
 def _along(network: StatefulInference, stream: LevelledStream) -> Answers:
-    windows = stream.windows()
+    windows, heading = stream.windows(), stream.headings
     parts = [
-        network.predict(windows[first : first + _BATCH]) for first in range(0, len(windows), _BATCH)
+        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
+        for first in range(0, len(windows), _BATCH)
     ]
     displacement, covariance = zip(*parts, strict=True)
     return Answers(np.concatenate(displacement), np.concatenate(covariance))

@@ -46,6 +46,7 @@ FASTEST = 6.0
 
 _ARRAYS = (
     "imu_N",
+    "facing_N",
     "R_NB",
     "position_W",
     "breaks",
@@ -258,6 +259,7 @@ def _load(file: Path, path: Path) -> Prepared | None:
 def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:
     return {
         "imu_N": piece.stream.imu_N,
+        "facing_N": piece.stream.facing_N,
         "R_NB": piece.stream.R_NB,
         "position_W": _split(piece.position_W),
         "breaks": piece.breaks.astype(np.int64),
@@ -269,7 +271,8 @@ def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:
 
 
 def _piece(arrays: dict[str, np.ndarray]) -> PreparedPiece:
-    stream = LevelledStream(float(arrays["start"][0]), arrays["imu_N"], arrays["R_NB"])
+    imu_N, facing_N, R_NB = (arrays[name] for name in ("imu_N", "facing_N", "R_NB"))
+    stream = LevelledStream(float(arrays["start"][0]), imu_N, facing_N, R_NB)
     position_W, waypoint_W = (_joined(arrays[name]) for name in ("position_W", "waypoint_W"))
     return PreparedPiece(
         stream, position_W, arrays["breaks"], arrays["yaw_WN"], arrays["waypoint_time"], waypoint_W

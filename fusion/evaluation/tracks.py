@@ -9,6 +9,7 @@ from __future__ import annotations
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
@@ -24,6 +25,7 @@ from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
     clean_samples,
+    headings_at,
     imu_in_world,
     runs,
 )
@@ -98,9 +100,9 @@ def network_track_true_attitude(
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
     began = perf_counter()
     truth = _carried_through_gaps(sequence, sequence.truth)
-    time, windows = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
+    time, windows, heading = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
-    displacement = _along(model, time, windows, config.filter.window_updates)
+    displacement = _along(model, time, windows, heading, config.filter.window_updates)
     done = perf_counter()
     middle = time + 0.5 * WINDOW_SECONDS
     ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
@@ -116,16 +118,18 @@ def network_track_true_attitude(
 def _along(
     model: Predictor,
     time: FloatArray,
-    windows: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
+    windows: NDArray[np.float32],
+    heading: FloatArray,
     updates: int,
 ) -> FloatArray:
     """Displacements (M, 3) of windows that start at `time` (M,), a memory ending at each gap."""
     network = StatefulInference(model, updates)
     if not network.remembers:
-        return network.predict(windows)[0]
+        return network.predict(windows, heading)[0]
     displacements = []
-    for part in np.split(windows, np.flatnonzero(np.diff(time) * updates > 1.5) + 1):
-        displacements.append(network.predict(part)[0])
+    gaps = np.flatnonzero(np.diff(time) * updates > 1.5) + 1
+    for part, headings in zip(np.split(windows, gaps), np.split(heading, gaps), strict=True):
+        displacements.append(network.predict(part, headings)[0])
         network.restart()
     return np.concatenate(displacements)
 
@@ -149,17 +153,18 @@ def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajector
 
 def _true_windows(
     sequence: ImuSequence, truth: Trajectory, period: float
-) -> tuple[FloatArray, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
-    """Start times (M,) and windows (M, 6, 200), where neither IMU nor truth has a gap."""
-    grid, imu_W, usable = imu_in_world(sequence, truth, "true")
-    bad_before = np.concatenate([[0], np.cumsum(~usable)])
+) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
+    """Start times (M,), windows (M, 6, 200) and headings (M,) where nothing has a gap."""
+    world = imu_in_world(sequence, truth, "true")
+    bad_before = np.concatenate([[0], np.cumsum(~world.usable)])
     stride = round(period * WINDOW_RATE)
-    starts = np.arange(0, len(grid) - WINDOW_SAMPLES + 1, stride)
+    starts = np.arange(0, len(world.time) - WINDOW_SAMPLES + 1, stride)
     starts = starts[bad_before[starts + WINDOW_SAMPLES] == bad_before[starts]]
     if len(starts) == 0:
         raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    return grid[starts], imu_W[rows].transpose(0, 2, 1)
+    windows = world.imu[rows].transpose(0, 2, 1)
+    return world.time[starts], windows, headings_at(world.facing, starts)
 
 
 def _chained(

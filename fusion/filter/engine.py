@@ -3,7 +3,7 @@
 filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
 `benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never changed in
-place: whoever holds an earlier one may go back to it.
+place: whoever holds an earlier one may go back to it. README.md, "Gates".
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self._log_likelihood = self._likelihood = self._mahalanobis = None
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
-        """(I - K H) P (I - K H)^T + K R K^T: dearer, but no difference of large numbers."""
+        """(I - K H) P (I - K H)^T + K R K^T: slower, but without differences of large numbers."""
         A = np.eye(self.dim_x)
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H

@@ -1,8 +1,8 @@
 """Jacobians of the filter's measurements by its right-invariant error.
 
 Error state: theta, rho_v, rho_p, d_bg, d_ba of the current state, then theta, rho_p of each clone
-(see `preintegration` for their meaning). A Jacobian is a list of blocks; what is in no block is
-zero. All are derived in FUSION's notation: v = v^ + rho_v - [v^]x theta, likewise for position.
+(`error_state`). A Jacobian is a list of blocks; what is in no block is zero. Derivations:
+README.md, "Displacement measurement" and "Fixes".
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def position_jacobian(p_W: FloatArray) -> list[Block]:
 
 
 def velocity_jacobian(v_W: FloatArray) -> list[Block]:
-    """Jacobian of a velocity in the true world: theta -[v]x, rho_v I."""
+    """Jacobian of a velocity in the true W: theta -[v]x, rho_v I."""
     H = _LAST_EYE.copy()
     H[:, :3] = -skew(v_W)
     return [(0, H)]

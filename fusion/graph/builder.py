@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator import Displacement as Measured
+from stario.fusion.filter.estimator_state import Displacement as Measured
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
@@ -147,11 +147,6 @@ class GraphBuilder:
             return False
         graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
         return True
-
-    def expect_gyro_bias(self, covariance: FloatArray) -> None:
-        """Take in, wherever the graph begins, that the bias is zero to a covariance (3, 3)."""
-        for k in self.starts:
-            self.graph.add(GyroBias(k, np.zeros(3), covariance), gated=False)
 
     def forget(self, time: float) -> None:
         """Marginalise the keyframes before the last one up to a time [s].

@@ -3,7 +3,8 @@
 Every term gives its residual (measured minus predicted) and the Jacobians of what it predicts; the
 graph whitens them, weighs down what may be an outlier and hands gtsam a `JacobianFactor` in C++,
 anew in every round of the optimisation. gtsam's own factors would do for position and velocity
-alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt.
+alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt
+(README.md, "Graph factors").
 
 Tangent of a keyframe, as gtsam's: pose R exp(w), p + R dp in the order w, dp; velocity additive;
 biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
@@ -149,7 +150,7 @@ class Prior:
 class Displacement:
     """The network's displacement from keyframe i to keyframe j.
 
-    The network saw the window in a levelled frame N, whose yaw against the world is that of
+    The network saw the window in a levelled frame N, whose yaw against W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
     pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also learn
     tilt from it, which on some recordings doubles the error.

@@ -34,6 +34,8 @@ from stario.sequences.windows import (
     MAX_IMU_GAP,
     WINDOW_RATE,
     WINDOW_SECONDS,
+    facing,
+    mean_heading,
     resample,
 )
 
@@ -238,8 +240,13 @@ class FrontEnd:
             return interval
         window = np.concatenate(self._window, axis=1)
         window_flagged = any(self._flagged)
+        heading = float(mean_heading(facing(np.stack(self._starts))))
         return replace(
-            interval, window=window, R_NB_window=self._starts[0], window_flagged=window_flagged
+            interval,
+            window=window,
+            R_NB_window=self._starts[0],
+            heading=heading,
+            window_flagged=window_flagged,
         )
 
     def _block(self, interval: ImuInterval) -> NDArray[np.float32]:

@@ -33,12 +33,13 @@ class ImuInterval:
         gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
         anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
         flags: whether samples of either sensor are saturated or were spikes.
-        suspect: whether samples of the window's are.
+        window_flagged: whether samples of the window's are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
         update: whether windows begin and end at this interval's end.
         window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
+        heading: of the device in N, averaged over the window [rad].
     """
 
     time: FloatArray
@@ -50,6 +51,7 @@ class ImuInterval:
     update: bool = False
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
+    heading: float = 0.0
     anew: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False

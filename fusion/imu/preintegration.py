@@ -6,9 +6,9 @@ samples are therefore first turned into the equivalent constants (`corrected_inc
 gtsam accumulates the rotation as one rotation vector, to first order per step: segments of a tenth
 of a second lose nothing (4e-6 rad per second in lively motion at 200 Hz), whole seconds do (1e-3).
 
-Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
-2017; P. Savage, "Strapdown inertial navigation
-integration algorithm design", 1998 (coning, sculling).
+README.md, "Preintegration". Sources: C. Forster et al., "On-manifold preintegration for real-time
+visual-inertial odometry", 2017; P. Savage, "Strapdown inertial navigation integration algorithm
+design", 1998 (coning, sculling).
 """
 
 from __future__ import annotations

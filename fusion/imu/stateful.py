@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stario.sequences.errors import InputError
+from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import turned_windows
 
 
 class Predictor(Protocol):
@@ -19,7 +21,10 @@ class Predictor(Protocol):
     """
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2]."""
+        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2].
+
+        Windows and answers are in frame H: z up, the device's heading zero.
+        """
         ...
 
 
@@ -45,10 +50,23 @@ class StatefulInference:
         begin = getattr(self._model, "stateful_inference", None)
         self._stretch: Any = self._model if begin is None else begin(self._updates)
 
-    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The stretch's next windows; as the model's `predict`."""
-        answer: tuple[FloatArray, FloatArray] = self._stretch.predict(windows)
-        return answer
+    def predict(
+        self, windows_N: NDArray[np.float32], heading: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The stretch's next windows, shown to the model in the device's heading frame H.
+
+        Args:
+            windows_N: (B, 6, 200) in a gravity-aligned frame N.
+            heading: (B,) the device's heading in N [rad].
+
+        Returns:
+            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
+        """
+        mean_H, covariance_H = self._stretch.predict(turned_windows(windows_N, -heading))
+        R_NH = about_z(heading).as_matrix()
+        with np.errstate(invalid="ignore"):  # the estimator refuses what is not finite
+            mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
+            return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
         """How many windows (B, 6, 200) lie outside what the model's weights were trained on."""

@@ -47,7 +47,13 @@ def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
     frame = _frame(tracks, truth)
     for axis, limits, title in (("xaxis", frame[0], "x [m]"), ("yaxis", frame[1], "y [m]")):
         figure.update_layout(
-            {axis: {"title": {"text": title, "standoff": 6}, "range": limits, **_axis()}}
+            {
+                axis: {
+                    "title": {"text": title, "standoff": 6, "font": {"size": 13}},
+                    "range": limits,
+                    **_axis(),
+                }
+            }
         )
     figure.update_layout(yaxis={"scaleanchor": "x", "scaleratio": 1})
     return figure
@@ -69,7 +75,10 @@ def time_figure(panels: Sequence[Panel]) -> go.Figure:
             figure.add_trace(trace, row=row, col=1)
         figure.update_yaxes(row=row, col=1, **_axis(), **panel.layout)
         figure.update_xaxes(row=row, col=1, showticklabels=True, **_axis())
-    figure.update_xaxes(title={"text": "time since the first sample [s]", "standoff": 6}, row=count)
+    figure.update_xaxes(
+        title={"text": "time since the first sample [s]", "standoff": 6, "font": {"size": 13}},
+        row=count,
+    )
     # Titles begin at the panels' left edge: on a phone there is no room around a centred one.
     figure.update_annotations(x=0.0, xanchor="left", font={"size": 13, "color": INK})
     figure.update_layout(

@@ -70,12 +70,11 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
         file.write(graph.SerializeToString())
 
 
-def load_onnx(path: Path, threads: int | None = None) -> tuple[OnnxEngine, Card]:
-    """The engine and the card of an exported file.
+def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
+    """The engine and the card of an exported file, on as many threads as PyTorch uses.
 
     Args:
         path: written by `export_onnx`.
-        threads: of ONNX Runtime; as many as PyTorch uses unless given.
 
     Raises:
         InputError: the extra `onnx` is not installed.
@@ -85,7 +84,7 @@ def load_onnx(path: Path, threads: int | None = None) -> tuple[OnnxEngine, Card]
     if not path.is_file():
         raise WeightsError(path, "file", "nothing there", "an exported model")
     options = runtime.SessionOptions()
-    options.intra_op_num_threads = threads or torch.get_num_threads()
+    options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
     try:
         session = runtime.InferenceSession(

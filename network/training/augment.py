@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stario.network.training.lever_arm import draw_swing, swung
+from stario.network.training.lever_arm import Swing, draw_swing, swung
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
+from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, WorldStream
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Augmentation:
         swung: share of windows in which the device is swung besides.
         swing_rate: largest angular rate of a swing [rad/s].
         lever: largest distance of the device from the point it is swung about [m].
+        yaw: deviation of the error of the device's heading [rad].
+        any_yaw: share of windows that are shown at any yaw instead.
         tilt: largest error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
@@ -45,6 +47,8 @@ class Augmentation:
     swung: float = 0.35
     swing_rate: float = 2.5
     lever: float = 0.35
+    yaw: float = 0.3
+    any_yaw: float = 0.3
     tilt: float = 0.05
     gyro_bias: float = 0.03
     accel_bias: float = 0.15
@@ -106,7 +110,6 @@ class WindowSampler:
                 raise InputError(stream.name, found, f"at least {reach}, the fastest replay's")
         self._streams = streams
         self._reach = reach
-        self._first = torch.tensor([0, *(len(s) for s in streams[:-1])]).cumsum(0)
         self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
         share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
         self._cumulative = (share / share.sum()).cumsum(0)
@@ -118,61 +121,58 @@ class WindowSampler:
         More than one in a row come as (size, K, 6, 200) and (size, K, 3).
         """
         uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
-        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._first) - 1)
+        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._streams) - 1)
         # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
         speed = self._speeds(size)
-        # Samples count through all streams, as the draws of a seed always have.
-        start = self._first[stream].double() + offset
         steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
-        at = start[:, None] + steps * speed[:, None].double()
-        imu_W, position_W = self._pieces(stream.tolist(), offset.long().tolist())
-        imu = _lerp(imu_W, start, at[:, :-1])
-        ends = _lerp(position_W, start, at[:, ::WINDOW_SAMPLES])
-        imu, displacement = self._vary(_replayed(imu, speed), ends.diff(dim=1))
+        at = offset.double()[:, None] + steps * speed[:, None].double()
+        imu_W, position_W, facing_W = self._pieces(stream.tolist(), offset.long().tolist())
+        imu = _replayed(_lerp(imu_W, offset, at[:, :-1]), speed)
+        ends = _lerp(position_W, offset, at[:, ::WINDOW_SAMPLES])
+        facing = _lerp(facing_W, offset, at[:, :-1:HEADING_STEP])
+        imu, displacement = self._vary(imu, ends.diff(dim=1), facing)
         if self._successive == 1:
             return imu.transpose(1, 2).contiguous(), displacement.squeeze(1)
         windows = imu.view(size, self._successive, WINDOW_SAMPLES, 6)
         return windows.transpose(2, 3).contiguous(), displacement
 
-    def _pieces(self, streams: list[int], offsets: list[int]) -> tuple[Tensor, Tensor]:
-        """Stretches (B, reach, 6) and (B, reach, 3): all that is read from a memory-mapped file."""
-        imu = np.empty((len(streams), self._reach, 6), dtype=np.float32)
-        position = np.empty((len(streams), self._reach, 3), dtype=np.float32)
-        for row, (stream, offset) in enumerate(zip(streams, offsets, strict=True)):
-            imu[row] = self._streams[stream].imu_W[offset : offset + self._reach]
-            position[row] = self._streams[stream].position_W[offset : offset + self._reach]
-        return torch.from_numpy(imu), torch.from_numpy(position)
+    def _pieces(self, streams: list[int], offsets: list[int]) -> list[Tensor]:
+        """IMU, position, facing (B, reach, K): all that is read from a memory-mapped file."""
+        arrays = [np.empty((len(streams), self._reach, k), dtype=np.float32) for k in (6, 3, 2)]
+        for row, (index, offset) in enumerate(zip(streams, offsets, strict=True)):
+            stream, part = self._streams[index], slice(offset, offset + self._reach)
+            for array, values in zip(
+                arrays, (stream.imu_W, stream.position_W, stream.facing_W), strict=True
+            ):
+                array[row] = values[part]
+        return [torch.from_numpy(array) for array in arrays]
 
     def _speeds(self, size: int) -> Tensor:
         low, high = self.augmentation.speeds
         speed = low + (high - low) * self._uniform(size)
         return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
 
-    def _vary(self, imu: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-        """Mirror, turn, tilt, bias and noise of imu (B, 200 K, 6), displacements (B, K, 3)."""
-        a = self.augmentation
-        size = len(imu)
-        mirror = torch.where(self._uniform(size) < 0.5, -1.0, 1.0)
-        imu, displacement = _mirrored(imu, displacement, mirror)
+    def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
+        """Swing imu (B, 200 K, 6) in W, then show each second in its frame H, mirrored and so on.
+
+        Args:
+            imu: gyroscope and specific force.
+            displacement: (B, K, 3).
+            facing: (B, 10 K, 2) which way the device faces in W.
+        """
+        a, size, seconds = self.augmentation, len(imu), self._successive
         swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
         imu, displacement = swung(imu, displacement, swings)
-        R_yaw = _about_z(self._symmetric(size) * torch.pi)
-        R_tilt = _small_tilt(self._symmetric(size, 2) * a.tilt / 2**0.5)
-        turned = imu.view(size, -1, 2, 3) @ (R_tilt @ R_yaw).mT.unsqueeze(1)
-        imu = turned.reshape(size, -1, 6)
-        limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
-        deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
-        imu = imu + (self._symmetric(size, 6) * limits).unsqueeze(1)
-        white = torch.randn(imu.shape, generator=self.generator)
-        imu = imu + white * (self._uniform(size)[:, None, None] ** 2 * deviations)
-        return imu, displacement @ R_yaw.mT
+        heading = heading_of(facing.view(size, seconds, -1, 2), swings)
+        imu = imu.reshape(size * seconds, WINDOW_SAMPLES, 6)
+        seen = show(imu, heading.flatten(), a, self.generator, seconds)
+        displacement = displacement.reshape(-1, 1, 3) @ seen.R_HW.mT
+        displacement = displacement * seen.mirror[:, None, 3:]
+        return seen.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)
-
-    def _symmetric(self, *shape: int) -> Tensor:
-        return 2.0 * self._uniform(*shape) - 1.0
 
 
 def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
@@ -183,11 +183,79 @@ def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
     return torch.cat([imu[..., :3] * s, accel], dim=2)
 
 
-def _mirrored(imu: Tensor, displacement: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
-    """Image in the vertical x-z plane where sign is -1: rates are axial vectors, the rest polar."""
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Windows as the network is shown them.
+
+    Attributes:
+        imu: (B, 200, 6).
+        R_HW: (B, 3, 3) takes W to the frame that they are shown in, before the mirror.
+        mirror: (B, 6) signs of the mirror image for axial vectors, then for polar ones.
+    """
+
+    imu: Tensor
+    R_HW: Tensor
+    mirror: Tensor
+
+
+def show(
+    imu: Tensor,
+    heading: Tensor,
+    augmentation: Augmentation,
+    generator: torch.Generator,
+    together: int = 1,
+) -> Shown:
+    """Windows (B, 200, 6) in W in the device's frame H, as an imperfect device may give them.
+
+    Turned by minus the heading (B,) and an error; mirrored left to right, which in H is the same
+    person with the device in the other hand; tilted, biased and noisy.
+
+    Args:
+        imu: in W.
+        heading: of the device in W, averaged over the window [rad].
+        augmentation: how far windows are varied.
+        generator: of all draws.
+        together: windows in a row that share mirror, tilt and biases.
+    """
+    a, groups = augmentation, len(imu) // together
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    def symmetric(*shape: int) -> Tensor:
+        return 2.0 * uniform(*shape) - 1.0
+
+    def of_each(values: Tensor) -> Tensor:
+        return values.repeat_interleave(together, dim=0)
+
+    # Drawn for every window: an error in common would be taken out of a stretch of weak truth.
+    error = a.yaw * torch.randn(len(imu), generator=generator)
+    anywhere = uniform(len(imu)) < a.any_yaw
+    R_HW = _about_z(torch.where(anywhere, symmetric(len(imu)) * torch.pi, error) - heading)
+    sign = torch.where(uniform(groups) < 0.5, -1.0, 1.0)
     one = torch.ones_like(sign)
-    factors = torch.stack([sign, one, sign, one, sign, one], dim=1)
-    return imu * factors.unsqueeze(1), displacement * factors[:, None, 3:]
+    mirror = of_each(torch.stack([one, sign, sign, sign, one, one], dim=1))
+    R_tilt = of_each(_small_tilt(symmetric(groups, 2) * a.tilt / 2**0.5))
+    turned = (imu.view(len(imu), -1, 2, 3) @ R_HW.mT.unsqueeze(1)).reshape(imu.shape)
+    tilted = (turned * mirror.unsqueeze(1)).view(len(imu), -1, 2, 3) @ R_tilt.mT.unsqueeze(1)
+    limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
+    deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
+    imu = tilted.reshape(imu.shape) + of_each(symmetric(groups, 6) * limits).unsqueeze(1)
+    white = torch.randn(imu.shape, generator=generator)
+    imu = imu + white * of_each(uniform(groups)[:, None, None] ** 2 * deviations)
+    return Shown(imu, R_HW, mirror)
+
+
+def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:
+    """Heading (B, K) [rad] of windows from which way the device faces (B, K, 10, 2), swung."""
+    size, seconds, instants, _ = facing.shape
+    angle = torch.atan2(facing[..., 1], facing[..., 0])
+    if swings is not None:
+        time = torch.arange(seconds * instants) * (HEADING_STEP / WINDOW_RATE)
+        turn = swings.angle.at(time)[0] * swings.axis[:, 2:]
+        angle = angle + turn.view(size, seconds, instants)
+    length = facing.norm(dim=-1)
+    return torch.atan2((length * angle.sin()).sum(-1), (length * angle.cos()).sum(-1))
 
 
 def _about_z(yaw: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ and resumed follows the same schedule.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import torch
@@ -30,6 +31,18 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
 
 SIGMA_WEIGHT = 0.05
 """Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
+
+_COUNTS = (
+    "epochs",
+    "epoch_windows",
+    "batch",
+    "patience",
+    "successive",
+    "waypoint_stretches",
+    "waypoint_seconds",
+    "track_stretches",
+    "track_seconds",
+)
 
 _RANGES = (
     ("rate", 1e-8, 1.0),
@@ -65,6 +78,15 @@ class TrainingConfig:
         successive: windows in a row, one second apart, that a step draws from one place; more than
             one only for a network that remembers earlier windows.
         seed: of initial weights, draws and dropout.
+        waypoint_stretches: stretches between waypoints that a step learns from, where recordings
+            have them (`stario.network.training.weak_truth`).
+        waypoint_seconds: windows in each of them.
+        track_stretches: the same of stretches along a track of positions without attitude.
+        track_seconds: windows in each; short, as heads and phones drift apart in yaw.
+        shares: of the windows that each source makes up, by a part of its recordings' path;
+            those that none names are drawn by their length and liveliness.
+        compiled: compile the network for training (torch.compile; needs a C++ compiler on CPUs,
+            which saves a third of the time).
         augmentation: how windows are varied.
 
     Raises:
@@ -88,10 +110,16 @@ class TrainingConfig:
     attitude: Attitude = "levelled"
     successive: int = 1
     seed: int = 0
+    waypoint_stretches: int = 6
+    waypoint_seconds: int = 20
+    track_stretches: int = 8
+    track_seconds: int = 12
+    shares: Mapping[str, float] = field(default_factory=dict)
+    compiled: bool = False
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "epoch_windows", "batch", "patience", "successive"):
+        for name in _COUNTS:
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= 1):
                 raise ConfigError(name, repr(value), "a count of at least 1")

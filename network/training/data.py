@@ -74,18 +74,13 @@ def _liveliness(stream: WorldStream) -> float:
 
 
 def split_off(
-    recordings: Sequence[Sequence[WorldStream]], share: float = 0.2
+    recordings: Sequence[Sequence[WorldStream]],
 ) -> tuple[list[WorldStream], list[WorldStream]]:
-    """Streams of each recording without its last part, and that part; scraps below 2 s are lost.
-
-    Args:
-        recordings: the streams of each.
-        share: of a recording's samples in its last part.
-    """
+    """Streams of each recording without its last fifth, and that; scraps below 2 s are lost."""
     first: list[WorldStream] = []
     last: list[WorldStream] = []
     for streams in recordings:
-        left = round((1.0 - share) * sum(len(stream) for stream in streams))
+        left = round(0.8 * sum(len(stream) for stream in streams))
         for stream in streams:
             first.append(_cut(stream, 0, left))
             last.append(_cut(stream, max(left, 0), len(stream)))
@@ -95,7 +90,9 @@ def split_off(
 
 def _cut(stream: WorldStream, start: int, stop: int) -> WorldStream:
     part = slice(start, max(stop, start))
-    return WorldStream(stream.name, stream.imu_W[part], stream.position_W[part])
+    return WorldStream(
+        stream.name, stream.imu_W[part], stream.position_W[part], stream.facing_W[part]
+    )
 
 
 def simulated_streams(

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers, workers
 from stario.network.training.validation import ValidationSet
+from stario.network.training.weak_truth import LegSampler, LegStream, leg_loss, leg_samplers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WorldStream
@@ -56,6 +58,7 @@ def train(
     trained_on: Sequence[str] = (),
     start_from: DisplacementModel | None = None,
     keep_calibration: bool = False,
+    legs: Sequence[LegStream] = (),
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
@@ -71,6 +74,7 @@ def train(
         start_from: a model whose weights are the first ones.
         keep_calibration: keep that model's calibration, for a last stage that learns from the
             validation recordings as well: their errors then say nothing any more.
+        legs: stretches of weak truth, positions or waypoints, to learn from besides.
 
     Returns:
         Path of the model's weights.
@@ -85,8 +89,8 @@ def train(
         raise InputError("streams", "none", "stretches of at least 2 s with truth")
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
-        material = _material([streams, validation], weights, start_from)
-        run = _Run(config, sampler, material, folder, these)
+        material = _material([streams, validation, legs], weights, start_from)
+        run = _Run(config, sampler, leg_samplers(config, legs, sampler), material, folder, these)
         if start_from is not None:
             run.start_from(start_from)
         run.resume()
@@ -109,12 +113,13 @@ class _Run:
         self,
         config: TrainingConfig,
         sampler: WindowSampler,
+        legs: list[tuple[LegSampler, int]],
         material: str,
         folder: Path,
         workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.sampler, self.folder = config, sampler, folder
+        self.config, self.sampler, self.legs, self.folder = config, sampler, legs, folder
         self.workers, self.device, self._material = workers, workers.device, material
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint = folder / "checkpoint.safetensors"
@@ -126,9 +131,10 @@ class _Run:
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.rate, weight_decay=config.weight_decay
         )
-        self._shared = workers.wrapped(
-            self.network, idle=architecture(config.architecture).heads > 1
-        )
+        idle = architecture(config.architecture).heads > 1
+        shared = workers.wrapped(self.network, idle=idle)
+        self._shared: Any = torch.compile(shared) if config.compiled else shared
+        self._mixed = config.precision == "bfloat16"
         if not workers.leads:
             torch.manual_seed(config.seed + workers.rank)  # dropout of its own
         self.step = 0
@@ -166,12 +172,23 @@ class _Run:
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
         if not self.network.remembers:
             windows = windows.flatten(0, -3)
-        mixed = self.config.precision == "bfloat16"
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
-            mean, log_sigma = (part.flatten(0, -2) for part in self._shared(windows))
-        squared = (mean - target.flatten(0, -2)) ** 2
+        # All sources in one batch, so that its normalisation sees them all.
+        legs = [sampler.batch(size).to(self.device) for sampler, size in self.legs]
+        whole = torch.cat([windows, *(part.windows.flatten(0, 1) for part in legs)])
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
+            mean, log_sigma = self._shared(whole)
+        parts = [len(windows), *(part.windows[:, :, 0, 0].numel() for part in legs)]
+        means, log_sigmas = mean.split(parts), log_sigma.split(parts)
+        squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
         likelihood = self.step >= self.config.likelihood_from * self.config.steps
-        loss = loss_with_sigma(squared, log_sigma) if likelihood else squared.sum(1).mean()
+        loss = (
+            loss_with_sigma(squared, log_sigmas[0].flatten(0, -2))
+            if likelihood
+            else squared.sum(1).mean()
+        )
+        for part, told, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
+            shape = part.windows.shape[:2]
+            loss = loss + leg_loss(told.view(*shape, 3), sigma.view(*shape, 3), part)[0]
         self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -321,7 +338,7 @@ def _sampler(
 
 
 def _material(
-    streams: Sequence[Sequence[WorldStream]],
+    streams: Sequence[Sequence[WorldStream | LegStream]],
     weights: Sequence[float],
     start_from: DisplacementModel | None,
 ) -> str:

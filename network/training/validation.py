@@ -10,7 +10,15 @@ from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
 from stario.sequences.errors import InputError
-from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, window_starts, windows_at
+from stario.sequences.rotations import about_z
+from stario.sequences.windows import (
+    WINDOW_SAMPLES,
+    WorldStream,
+    headings_at,
+    turned_windows,
+    window_starts,
+    windows_at,
+)
 
 VALIDATION_STRIDE = 20
 """Samples from the start of a window to the next one's."""
@@ -44,6 +52,9 @@ class ValidationSet:
             starts = window_starts(stream, VALIDATION_STRIDE)
             for first in range(0, len(starts), answer.batch):
                 windows, target = windows_at(stream, starts[first : first + answer.batch])
+                heading = headings_at(stream.facing_W, starts[first : first + answer.batch])
+                windows = turned_windows(windows, -heading)
+                target = about_z(-heading).apply(target).astype(np.float32)
                 mean, log_sigma = answer(torch.from_numpy(windows).to(self.device))
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())

@@ -46,7 +46,8 @@ def show(browser, tmp_path: Path):
         context = browser.new_context(
             viewport={"width": width, "height": height}, has_touch=width < 600, offline=offline
         )
-        context.set_default_timeout(120_000)  # a shared core draws a page slowly
+        context.set_default_timeout(20_000)
+        context.set_default_navigation_timeout(120_000)  # a shared core reads plotly slowly
         opened.append(context)
         shown = Shown(context.new_page())
         shown.page.on(
@@ -56,7 +57,7 @@ def show(browser, tmp_path: Path):
         shown.page.on("pageerror", lambda error: shown.complaints.append(str(error)))
         shown.page.on("requestfailed", lambda r: shown.complaints.append(f"failed: {r.url}"))
         shown.page.goto(url)
-        shown.page.wait_for_selector("body[data-ready=yes]")
+        shown.page.wait_for_selector("body[data-ready=yes]", timeout=120_000)
         return shown
 
     yield show

@@ -16,15 +16,15 @@ from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.windows import WINDOW_SECONDS
+from stario.sequences.windows import WINDOW_SECONDS, turned_windows
 
 
 class Oracle:
     """Tells the true displacement of every window of one recording, with white noise if asked.
 
     It knows a window by its content, so that it answers alike in streams and in batches. Like a
-    network it answers in the window's frame: off from the truth's by the yaw of the attitude that
-    the window was prepared with.
+    network it answers in the frame that it is shown, which heads as the device does by the attitude
+    that the window was prepared with.
     """
 
     def __init__(
@@ -45,7 +45,10 @@ class Oracle:
         turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
         displacement = turn.apply(last.position_W - first.position_W)
         displacement += noise * rng.standard_normal(displacement.shape)
-        keys = [e.window.tobytes() for e in known]
+        heading = np.array([e.heading for e in known])
+        displacement = about_z(-heading).apply(displacement)
+        seen = turned_windows(np.stack([e.window for e in known]), -heading)
+        keys = [window.tobytes() for window in seen]
         self._known = dict(zip(keys, displacement, strict=True))
         self._covariance = sigma**2 * np.eye(3)
         self.calls = 0

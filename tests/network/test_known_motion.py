@@ -33,7 +33,8 @@ def walked(seed: int, rate: float = 1.8, size: float = 1.0, seconds: float = 40.
     imu[:, 3] += 0.4 * size * np.sin(np.pi * rate * time + 1.0)
     imu[:, 2] += 0.5 * np.sin(0.4 * time)
     position = np.stack([1.2 * time, 0.0 * time, 0.0 * time], axis=1)
-    return WorldStream("walk", imu.astype(np.float32), position.astype(np.float32))
+    facing = np.tile(np.array([1.0, 0.0], np.float32), (len(time), 1))
+    return WorldStream("walk", imu.astype(np.float32), position.astype(np.float32), facing)
 
 
 def windows(stream: WorldStream) -> np.ndarray:

@@ -14,8 +14,11 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     Attitude,
     clean_samples,
+    facing,
     imu_in_world,
+    mean_heading,
     resample,
+    turned_windows,
     windows_of,
     world_streams,
 )
@@ -229,9 +232,9 @@ def test_a_first_time_of_zero_before_seconds_since_1970_costs_no_memory(
     truth = truth_of(walk)
     late = replace(walk, time=start + walk.time, truth=replace(truth, time=start + truth.time))
     late.time[0] = 0.0
-    grid, imu_W, usable = imu_in_world(late, truth_of(late), attitude)
-    assert len(grid) == len(imu_W) == len(usable) < len(walk) + 500
-    assert (np.diff(grid) > 0.0).all()
+    world = imu_in_world(late, truth_of(late), attitude)
+    assert len(world.time) == len(world.imu) == len(world.usable) < len(walk) + 500
+    assert (np.diff(world.time) > 0.0).all()
     (stream,), (whole,) = world_streams(late, attitude=attitude), world_streams(walk)
     assert len(stream) == pytest.approx(len(whole), abs=5)
 
@@ -240,7 +243,8 @@ def test_behind_a_long_gap_the_grid_goes_on_evenly(walk: ImuSequence) -> None:
     """Index arithmetic meets the same times as on the whole grid: whole seconds are left out."""
     kept = (walk.time < 4.0) | (walk.time > 12.345)
     holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    grid, _, usable = imu_in_world(holed, truth_of(walk), "true")
+    world = imu_in_world(holed, truth_of(walk), "true")
+    grid, usable = world.time, world.usable
     index = (grid - grid[0]) * 200.0
     assert np.abs(index - np.round(index)).max() < 1e-6
     left_out = np.round(index) - np.arange(len(grid))
@@ -256,3 +260,26 @@ def test_what_gives_no_windows_is_refused(walk: ImuSequence) -> None:
         world_streams(replace(walk, time=1e3 * walk.time))
     with pytest.raises(InputError, match="0 usable"):
         clean_samples(replace(walk, gyro=np.nan * walk.gyro))
+
+
+def test_heading_is_the_turn_about_the_vertical_at_any_tilt_but_upside_down() -> None:
+    """A phone that stands upright or lies on its side has a heading too."""
+    for tilt in ([0.0, 0.0, 0.0], [1.57, 0.0, 0.0], [0.0, 1.57, 0.0], [-2.5, 0.5, 0.0]):
+        R_tilt = Rotation.from_rotvec(tilt)
+        for yaw in (-3.0, 0.2, 1.7):
+            R = (Rotation.from_rotvec([0.0, 0.0, yaw]) * R_tilt).as_matrix()
+            heading = float(mean_heading(np.tile(facing(R), (10, 1))))
+            assert heading == pytest.approx(yaw, abs=1e-9)
+    upside_down = facing(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix())
+    np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
+
+
+def test_turning_a_window_turns_its_vectors() -> None:
+    rng = np.random.default_rng(0)
+    windows = rng.normal(size=(3, 6, 200)).astype(np.float32)
+    yaw = np.array([0.3, -1.0, 2.0])
+    turned = turned_windows(windows, yaw)
+    for window, result, angle in zip(windows, turned, yaw, strict=True):
+        R = Rotation.from_rotvec([0.0, 0.0, angle])
+        np.testing.assert_allclose(result[:3].T, R.apply(window[:3].T), atol=1e-6)
+        np.testing.assert_allclose(result[3:].T, R.apply(window[3:].T), atol=1e-6)

@@ -201,7 +201,7 @@ def test_an_unknown_back_end_is_one_line(stario, recording: Path) -> None:
 
 
 def test_backends_compares_filter_and_graph(stario) -> None:
-    done = stario("backends", "--walks", "1", "--seconds", "10", "--json")
+    done = stario("check", "backends", "--walks", "1", "--seconds", "10", "--json")
     assert done.code == 0
     content = json.loads(done.out)
     assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
@@ -210,7 +210,7 @@ def test_backends_compares_filter_and_graph(stario) -> None:
 
 def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Path) -> None:
     write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
-    done = stario("backends", "blind.csv", recording, "--json")
+    done = stario("check", "backends", "blind.csv", recording, "--json")
     assert done.code == 1
     assert "skipped: blind.csv" in done.err
     assert [score["name"] for score in json.loads(done.out)["scores"]] == ["walk"]

@@ -51,6 +51,8 @@ class Stub:
         known = piece.position_W
         steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
+        steps = np.pad(steps, (0, piece.stream.window_count - len(steps)), "edge")
+        steps = np.exp(-1j * piece.stream.headings) * steps  # as it is shown them
         self.displacement_N = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
         self.given = 0
 

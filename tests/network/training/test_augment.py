@@ -4,19 +4,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stario.network.training.augment import Augmentation, WindowSampler
+from stario.network.training.augment import Augmentation, WindowSampler, heading_of
+from stario.network.training.lever_arm import draw_swing
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, windows_of, world_streams
 
 NOTHING = Augmentation(
-    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
-    gyro_noise=0.0, accel_noise=0.0,
+    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,
+    accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
 )  # fmt: skip
-"""No range at all; yaw and mirror image are drawn always, for both are exact."""
+"""No range at all, at any yaw; the mirror image is drawn always."""
 
 TO_MIRROR_IMAGE = np.diag([1.0, -1.0, 1.0])
 
@@ -150,7 +152,12 @@ def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
     imu_W[:, 5] = STANDARD_GRAVITY
     position_W = np.zeros((length, 3), np.float32)
     position_W[:, 2] = climb * np.arange(length) / 200.0
-    return WorldStream(name, imu_W, position_W)
+    return WorldStream(name, imu_W, position_W, facing(length))
+
+
+def facing(length: int) -> NDArray[np.float32]:
+    """Of a level device that heads along x."""
+    return np.tile(np.float32([1.0, 0.0]), (length, 1))
 
 
 def only(**ranges: object) -> Augmentation:
@@ -222,13 +229,13 @@ def test_a_stream_shorter_than_the_fastest_window_is_refused() -> None:
 
 def mapped(stream: WorldStream, folder: Path) -> WorldStream:
     """The same stream in files that are not read until they are used."""
-    for name in ("imu_W", "position_W"):
+    for name in ("imu_W", "position_W", "facing_W"):
         np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
-    imu_W, position_W = (
+    imu_W, position_W, facing_W = (
         np.load(folder / f"{stream.name}-{name}.npy", mmap_mode="r")
-        for name in ("imu_W", "position_W")
+        for name in ("imu_W", "position_W", "facing_W")
     )
-    return WorldStream(stream.name, imu_W, position_W)
+    return WorldStream(stream.name, imu_W, position_W, facing_W)
 
 
 def test_memory_mapped_streams_give_the_same_windows(tmp_path: Path) -> None:
@@ -246,11 +253,13 @@ def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
     if not statm.exists():
         pytest.skip("this system does not say how much memory is resident")
     rows = 10 * 3600 * 200  # 260 MB; a file of zeros that takes no room on the disk
-    imu_W, position_W = (
-        np.memmap(tmp_path / str(width), np.float32, "w+", shape=(rows, width)) for width in (6, 3)
+    imu_W, position_W, facing_W = (
+        np.memmap(tmp_path / str(width), np.float32, "w+", shape=(rows, width))
+        for width in (6, 3, 2)
     )
     before = int(statm.read_text().split()[1])
-    sampler = WindowSampler([WorldStream("long", imu_W, position_W)], [1.0], Augmentation(), seed=0)
+    long = WorldStream("long", imu_W, position_W, facing_W)
+    sampler = WindowSampler([long], [1.0], Augmentation(), seed=0)
     windows, _ = sampler.batch(64)
     assert torch.isfinite(windows).all()
     assert int(statm.read_text().split()[1]) - before < 25_000  # pages of 4 kB
@@ -287,6 +296,30 @@ def test_a_swing_goes_on_from_one_window_to_the_next() -> None:
     windows, displacement = WindowSampler(
         [resting("rest", 2400)], [1.0], swinging, 0, successive=3
     ).batch(8)
-    seam = (windows[:, 1:, :, 0] - windows[:, :-1, :, -1]).abs().max()
+    # Each window has a heading of its own, which touches neither the vertical nor lengths.
+    told = torch.stack([*(windows[:, :, k] for k in (2, 5)), windows[:, :, :2].norm(dim=2)])
+    seam = (told[:, :, 1:, 0] - told[:, :, :-1, -1]).abs().max()
     assert float(displacement.norm(dim=-1).max()) > 0.05
     assert float(seam) < 0.2  # a sample's change, not a jump to another swing
+
+
+def test_a_window_looks_the_same_whichever_way_the_device_points() -> None:
+    """Shown in the device's heading frame, a path and its turned copy give the same batch."""
+    plain = only(any_yaw=0.0, yaw=0.0)
+    turned = stream_of(path(yaw=2.0))
+    first, second = (WindowSampler([s], [1.0], plain, seed=4).batch(16) for s in (STREAM, turned))
+    for a, b in zip(first, second, strict=True):
+        torch.testing.assert_close(a, b, atol=5e-3, rtol=1e-3)
+
+
+def test_swinging_a_device_turns_its_heading_along() -> None:
+    """At rest and swung about the vertical the rate is all there is to see; H turns with it."""
+    generator = torch.Generator().manual_seed(0)
+    swings = draw_swing(64, 1.0, 2.0, 0.0, generator)
+    level = torch.zeros(64, 1, 10, 2)
+    level[..., 0] = 1.0
+    turn = (swings.angle.at(torch.arange(10) / 10.0)[0] * swings.axis[:, 2:]).mean(dim=1)
+    small = turn.abs() < 0.3
+    torch.testing.assert_close(
+        heading_of(level, swings)[small, 0], turn[small], atol=0.05, rtol=0.0
+    )

@@ -12,7 +12,8 @@ from stario.sequences.windows import WorldStream
 
 def stream(name: str, samples: int) -> WorldStream:
     count = np.arange(samples, dtype=np.float32)[:, None]
-    return WorldStream(name, count + np.zeros(6, np.float32), count + np.zeros(3, np.float32))
+    six, three, two = (count + np.zeros(k, np.float32) for k in (6, 3, 2))
+    return WorldStream(name, six, three, two)
 
 
 def test_the_last_fifth_of_each_recording_is_held_out() -> None:
@@ -66,4 +67,4 @@ def test_lively_recordings_are_drawn_more_often() -> None:
 def moving(name: str, acceleration: float) -> WorldStream:
     imu_W = np.zeros((2000, 6), np.float32)
     imu_W[:, 3], imu_W[:, 5] = acceleration, STANDARD_GRAVITY
-    return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32))
+    return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32), np.ones((2000, 2), np.float32))

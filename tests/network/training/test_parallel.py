@@ -29,7 +29,8 @@ def swaying(name, phase, seconds):
     way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
     imu_W = np.zeros((len(t), 6), np.float32)
     imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, 9.80665]
-    return WorldStream(name, imu_W, way.astype(np.float32))
+    facing_W = np.tile(np.float32([1.0, 0.0]), (len(t), 1))
+    return WorldStream(name, imu_W, way.astype(np.float32), facing_W)
 
 if sys.argv[2] == "plain":  # no batch norm: what two processes compute is the same number
     torch.manual_seed(0)

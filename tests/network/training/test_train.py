@@ -37,7 +37,7 @@ TINY = TrainingConfig(
     average=0.9,
     device="cpu",
     augmentation=Augmentation(
-        speeds=(1.0, 1.0), swung=0.0, tilt=0.02, gyro_bias=0.01, accel_bias=0.05
+        speeds=(1.0, 1.0), swung=0.0, any_yaw=1.0, tilt=0.02, gyro_bias=0.01, accel_bias=0.05
     ),
 )
 
@@ -48,7 +48,8 @@ def swaying(name: str, phase: float, seconds: float = 20.0) -> WorldStream:
     way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
     imu_W = np.zeros((len(t), 6), np.float32)
     imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, STANDARD_GRAVITY]
-    return WorldStream(name, imu_W, way.astype(np.float32))
+    facing_W = np.tile(np.float32([1.0, 0.0]), (len(t), 1))
+    return WorldStream(name, imu_W, way.astype(np.float32), facing_W)
 
 
 STREAMS = [swaying("a", 0.3), swaying("b", 1.2)]

@@ -1,0 +1,96 @@
+"""Replay a recording against the live server, as a phone with Sensor Logger would send it.
+
+By itself it starts a server, replays half a minute at five times the true speed, and says where the
+track ended. To watch, start the server first, open its page, and replay at true speed:
+
+    stario live
+    python examples/replay_live.py --url http://127.0.0.1:8000/data [RECORDING]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+from stario.fusion import Navigator, demonstration
+from stario.fusion.live.run import LiveServer
+from stario.network import load_model
+from stario.sequences import ImuSequence, read_recording
+
+PERIOD = 0.2
+"""Time between two pushes [s]; the app's settings offer the like."""
+
+
+def replay(
+    recording: ImuSequence, url: str, speed: float, seconds: float, device: str = "replay"
+) -> int:
+    """Push a recording in batches; returns the samples that the server took."""
+    first_ns, began, taken = time.time_ns(), time.monotonic(), 0
+    stop = min(recording.duration, seconds)
+    for number in range(int(stop / PERIOD) + 1):
+        begin, end = number * PERIOD, min(stop, (number + 1) * PERIOD)
+        elapsed = recording.time - recording.time[0]
+        rows = (elapsed >= begin) & (elapsed < end)
+        payload = [
+            {
+                "name": name,
+                "time": first_ns + round(t * 1e9),
+                "values": dict(zip("xyz", value, strict=True)),
+            }
+            for name, values in (("gyroscope", "gyro"), ("totalacceleration", "accel"))
+            for t, value in zip(
+                elapsed[rows].tolist(), getattr(recording, values)[rows].tolist(), strict=True
+            )
+        ]
+        time.sleep(max(0.0, end / speed - (time.monotonic() - began)))
+        message = {"messageId": number, "sessionId": str(first_ns), "deviceId": device}
+        body = json.dumps(message | {"payload": payload}).encode()
+        request = urllib.request.Request(url, body, {"content-type": "application/json"})
+        with urllib.request.urlopen(request) as answer:
+            taken += json.load(answer)["samples"]
+    return taken
+
+
+def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], Path]:
+    """Replay the bundled demonstration against a server of its own.
+
+    Returns:
+        Samples taken, the end's x, y, z [m] as drawn, and the recording that was written.
+    """
+    model = load_model("default")
+    folder = Path(tempfile.mkdtemp(prefix="stario-live-"))
+    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    listening = threading.Event()
+    thread = threading.Thread(target=server.run, args=(listening.set,))
+    thread.start()
+    listening.wait()
+    try:
+        url = f"http://127.0.0.1:{server.port}/data"
+        taken = replay(demonstration(), url, speed, seconds)
+        session = server.hub.sessions["replay"]
+        return taken, session.drawn.points[-1][1:4], session.path
+    finally:
+        server.stop()
+        thread.join()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Replay a recording against the live server.")
+    parser.add_argument("recording", nargs="?", type=Path, help="default: the demonstration")
+    parser.add_argument("--url", help="of a running server; default: one of its own")
+    parser.add_argument("--speed", type=float, default=1.0, help="times the true one")
+    parser.add_argument("--device", default="replay", help="name of the phone")
+    options = parser.parse_args()
+    if options.url is None:
+        taken, end, path = main()
+        print(f"{taken} samples, end at {end} m; recording: {path}")
+    else:
+        recording = demonstration()
+        if options.recording is not None:
+            recording = read_recording(options.recording)
+        print(replay(recording, options.url, options.speed, float("inf"), options.device))

@@ -1,0 +1,50 @@
+"""`stario live`: tracks that grow while devices send."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stario.fusion.commands.common import Estimating, grouped
+
+
+@grouped
+def live(
+    estimating: Estimating,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page and the pushes.")] = 8000,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; 0.0.0.0 lets phones in, with a token.")
+    ] = "127.0.0.1",
+    lines_port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="For lines of JSON over TCP and UDP; port + 1 if not given."
+        ),
+    ] = None,
+    phyphox: Annotated[
+        list[str] | None, typer.Option(help="Address of a phone with phyphox; may be repeated.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the recordings.")] = Path(
+        "runs/live"
+    ),
+) -> None:
+    """Watch tracks grow: takes Sensor Logger, phyphox and lines of JSON; serves one page."""
+    from stario.sequences.readers.checked import optional_package
+
+    for package in ("starlette", "uvicorn", "plotly"):
+        optional_package(package, "live")
+    from stario.fusion.live.run import LiveServer
+    from stario.fusion.navigator import Navigator
+
+    model, settings = estimating.network(), estimating.settings()
+    server = LiveServer(
+        lambda: Navigator(model, settings),
+        out,
+        host,
+        port,
+        port + 1 if lines_port is None and port else lines_port or 0,
+        phyphox or [],
+    )
+    server.run(started=lambda: typer.echo("\n".join(server.addresses()), err=True))

@@ -1,0 +1,71 @@
+"""What goes into an estimator's step and comes out of it, and all that it knows in between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.innovations import UpdateCounts
+from stario.fusion.filter.map_frame import MapFrameState
+from stario.fusion.filter.zero_velocity import ZeroVelocity
+from stario.fusion.fixes import Accepted, Fix
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.preintegration import Segment
+from stario.fusion.lie import FloatArray
+
+Displacement = tuple[FloatArray, FloatArray]
+"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
+
+
+class IntervalMeasurements(NamedTuple):
+    """An IMU interval and what became of what was measured in it."""
+
+    interval: ImuInterval
+    offered: Displacement | None
+    """What the network said of the window that ends here; None where there is none, or at rest."""
+    displacement: Displacement | None
+    """The same with its covariance as inflated, None where it was left out."""
+    zero_velocity: ZeroVelocity | None
+    """None where the device moved, or the measurement was refused."""
+    fixes: list[Accepted]
+    """Those taken in, in order."""
+    segment: Segment | None
+    """The samples, None where fixes cut them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A step that a late fix may ask to be taken again, and the state before it."""
+
+    before: EstimatorState
+    interval: ImuInterval
+    displacement: Displacement | None
+    fixes: Sequence[Fix]
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorState:
+    """Everything that an estimator knows between two intervals; nothing is changed in place.
+
+    Attributes:
+        ekf: pose, biases, clones and their covariance.
+        clones: slots of the clones, oldest first.
+        map_frame: where the fixes' frame lies.
+        stillness: the last second's sums (`StillnessDetector`).
+        counts: what became of the updates.
+        in_gap: whether the last interval had no samples.
+        oldest: the newest pose that left the window, corrected by all of it.
+        history: the steps of the last second of a stream.
+    """
+
+    ekf: EkfState
+    clones: tuple[int, ...]
+    map_frame: MapFrameState
+    stillness: tuple[FloatArray | None, ...]
+    counts: UpdateCounts
+    in_gap: bool
+    oldest: Estimate | None
+    history: tuple[Step, ...] = ()

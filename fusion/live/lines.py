@@ -1,0 +1,165 @@
+"""Lines of JSON over TCP and UDP, for any device that is no phone with an app.
+
+Each line is one sample, see `payload`; a UDP packet holds one or several. Over TCP what cannot be
+used is answered by a line `{"error": ...}`; over UDP it is counted. Where the server has a token, a
+TCP connection begins with the line `{"token": "..."}`, and a UDP packet's first line is that one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Sequence
+
+from stario.fusion.live.hub import Hub
+from stario.fusion.live.payload import Batch, json_from, parse_line
+from stario.fusion.live.server import same
+from stario.sequences.errors import InputError
+
+LONGEST_LINE = 64 * 1024
+"""Bytes."""
+
+MOST_CONNECTIONS = 32
+MOST_WAITING = 2000
+"""UDP packets that wait to be worked off; beyond, they are dropped and counted."""
+
+_log = logging.getLogger(__name__)
+
+
+class LineServer:
+    """Listens for lines over TCP and UDP on one port.
+
+    Args:
+        hub: that takes the samples.
+        token: empty where none is wanted.
+    """
+
+    def __init__(self, hub: Hub, token: str = "") -> None:
+        self._hub, self._token = hub, token
+        self._connections = 0
+        self._packets: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue(MOST_WAITING)
+        self._bound = asyncio.Event()
+        self.port = 0
+
+    async def serve(self, host: str, port: int) -> None:
+        """Listen until cancelled.
+
+        Raises:
+            OSError: the port is taken.
+        """
+        loop = asyncio.get_running_loop()
+        server = await asyncio.start_server(self._connected, host, port)
+        number = server.sockets[0].getsockname()[1]
+        transport, _ = await loop.create_datagram_endpoint(
+            lambda: _Packets(self._packets, self._hub), local_addr=(host, number)
+        )
+        self.port = number
+        self._bound.set()
+        try:
+            await self._work_off_packets()
+        finally:
+            transport.close()
+            server.close()
+
+    async def listening(self, serving: asyncio.Task[None]) -> None:
+        """Wait until the task of `serve` listens.
+
+        Raises:
+            OSError: it cannot.
+        """
+        bound = asyncio.create_task(self._bound.wait())
+        await asyncio.wait((bound, serving), return_when=asyncio.FIRST_COMPLETED)
+        bound.cancel()
+        if serving.done():
+            serving.result()
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._connections >= MOST_CONNECTIONS:
+            writer.close()
+            return
+        self._connections += 1
+        sender = f"tcp {writer.get_extra_info('peername')[0]}"
+        try:
+            await self._read(reader, writer, sender)
+        except (ConnectionError, asyncio.IncompleteReadError) as error:
+            _log.info("%s: %s", sender, error)
+        finally:
+            self._connections -= 1
+            writer.close()
+
+    async def _read(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, sender: str
+    ) -> None:
+        rest, trusted = b"", not self._token
+        while data := await reader.read(LONGEST_LINE):
+            *lines, rest = (rest + data).split(b"\n")
+            if lines and not trusted:
+                trusted = self._is_token(lines.pop(0))
+                if not trusted:
+                    await self._answer(writer, ["token: none or another one"])
+                    return
+            errors = await self._take(lines, sender)
+            if len(rest) > LONGEST_LINE:
+                errors.append(f"line: found a longer one, expected at most {LONGEST_LINE} bytes")
+                rest = b""
+            await self._answer(writer, errors)
+        if trusted and rest.strip():
+            await self._take([rest], sender)
+
+    async def _answer(self, writer: asyncio.StreamWriter, errors: Sequence[str]) -> None:
+        for error in errors:
+            self._hub.refuse("tcp")
+            writer.write(json.dumps({"error": error}).encode() + b"\n")
+        await writer.drain()
+
+    async def _work_off_packets(self) -> None:
+        while True:
+            data, sender = await self._packets.get()
+            lines = data.split(b"\n")
+            if self._token and not self._is_token(lines.pop(0)):
+                self._hub.refuse("udp")
+                continue
+            for _ in await self._take(lines, sender):
+                self._hub.refuse("udp")
+
+    async def _take(self, lines: Sequence[bytes], sender: str) -> list[str]:
+        """Take lines in, those of a device at once; returns what is wrong with the others."""
+        errors: list[str] = []
+        batches: list[Batch] = []
+        for line in filter(bytes.strip, lines):
+            try:
+                batch = parse_line(line, sender)
+            except InputError as error:
+                errors.append(str(error))
+                continue
+            last = batches[-1] if batches else None
+            if last and (last.device, last.recording) == (batch.device, batch.recording):
+                last.readings.extend(batch.readings)
+            else:
+                batches.append(batch)
+        for batch in batches:
+            try:
+                await self._hub.take(batch)
+            except (InputError, OSError) as error:
+                errors.append(str(error))
+        return errors
+
+    def _is_token(self, line: bytes) -> bool:
+        try:
+            message = json_from(line)
+        except InputError:
+            return False
+        shown = message.get("token") if isinstance(message, dict) else None
+        return isinstance(shown, str) and same(shown, self._token)
+
+
+class _Packets(asyncio.DatagramProtocol):
+    def __init__(self, queue: asyncio.Queue[tuple[bytes, str]], hub: Hub) -> None:
+        self._queue, self._hub = queue, hub
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        try:
+            self._queue.put_nowait((data, f"udp {addr[0]}"))
+        except asyncio.QueueFull:
+            self._hub.refuse("udp")

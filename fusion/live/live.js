@@ -1,0 +1,249 @@
+"use strict";
+// Draws what /events tells: a track per device on the map, sigma, speed and yaw over time.
+(() => {
+  const element = (id) => document.getElementById(id);
+  const [map, time, connection] = [element("map"), element("time"), element("connection")];
+  const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#7F5539"];
+  const DASHES = ["solid", "dash", "dot", "dashdot"];
+  const SYMBOLS = ["circle", "square", "diamond", "triangle-up"];
+  const BESIDE = ["top center", "bottom center", "middle right", "middle left"];
+  const MOST_DRAWN = 1200;
+  const MOST_KEPT = 24000;
+  const devices = new Map();
+  window.stario = { devices, delays: [] };
+
+  // One server, one frame: points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw].
+  const sigmaOf = (p) => Math.sqrt((p[6] + p[8]) / 2 + Math.hypot((p[6] - p[8]) / 2, p[7]));
+  const thinned = (points) => {
+    const step = Math.ceil(points.length / MOST_DRAWN);
+    return step < 2 ? points : points.filter((_, k) => k % step === 0 || k === points.length - 1);
+  };
+  const ellipse = (p, origin) => {
+    const [mean, off] = [(p[6] + p[8]) / 2, Math.hypot((p[6] - p[8]) / 2, p[7])];
+    const [a, b] = [3 * Math.sqrt(mean + off), 3 * Math.sqrt(Math.max(0, mean - off))];
+    const turn = 0.5 * Math.atan2(2 * p[7], p[6] - p[8]);
+    const corners = Array.from({ length: 40 }, (_, k) => {
+      const [u, v] = [a * Math.cos((k * Math.PI) / 20), b * Math.sin((k * Math.PI) / 20)];
+      return `${p[1] - origin[0] + u * Math.cos(turn) - v * Math.sin(turn)},${p[2] - origin[1] + u * Math.sin(turn) + v * Math.cos(turn)}`;
+    });
+    return `M${corners.join("L")}Z`;
+  };
+
+  const axis = (title) => ({ title: { text: title, standoff: 4, font: { size: 13 } }, gridcolor: "#E3E6EA", zeroline: false,
+    linecolor: "#767676", showline: true, ticks: "outside", ticklen: 4, tickcolor: "#767676" });
+  const font = { family: "system-ui, sans-serif", size: 13, color: "#222222" };
+  const base = { font, paper_bgcolor: "white", plot_bgcolor: "white", showlegend: false };
+  const mapLayout = { ...base, margin: { l: 54, r: 10, t: 6, b: 42 }, dragmode: "pan", hovermode: "closest", uirevision: 1,
+    xaxis: { ...axis("x [m]"), range: [-6, 6] }, yaxis: { ...axis("y [m]"), range: [-6, 6], scaleanchor: "x" } };
+  const rows = [["Sigma of position [m]", sigmaOf], ["Speed [m/s]", (p) => p[4]], ["Yaw [deg]", (p) => p[5]]];
+  const timeLayout = { ...base, height: 460, margin: { l: 54, r: 10, t: 22, b: 42 }, hovermode: "x", dragmode: false, uirevision: 1,
+    grid: { rows: 3, columns: 1, pattern: "independent", ygap: 0.38 },
+    annotations: rows.map(([text], k) => ({ text, x: 0, xanchor: "left", xref: "paper", yref: `y${k ? k + 1 : ""} domain`,
+      y: 1.02, yanchor: "bottom", showarrow: false, font })) };
+  rows.forEach((_, k) => {
+    timeLayout[`xaxis${k ? k + 1 : ""}`] = { ...axis(k === 2 ? "time of each track [s]" : ""), ...(k ? { matches: "x" } : {}) };
+    timeLayout[`yaxis${k ? k + 1 : ""}`] = { ...axis(""), ...(k === 2 ? { range: [-185, 185], dtick: 90 } : { rangemode: "tozero" }) };
+  });
+  const config = { responsive: true, displaylogo: false, displayModeBar: false, scrollZoom: true };
+
+  let following = true;
+  const fitted = () => {
+    const known = [...devices.values()].flatMap((d) => {
+      const points = thinned(d.points).map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]);
+      const last = points[points.length - 1];
+      if (!last) return [];
+      const reach = Math.min(50, 3 * sigmaOf(d.points[d.points.length - 1]));
+      return [...points, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
+    });
+    const [xs, ys] = [0, 1].map((k) => known.map((p) => p[k]));
+    const size = map.getBoundingClientRect();
+    const [wide, high] = [size.width - 64, size.height - 48];
+    const [x0, x1, y0, y1] = [Math.min(-1, ...xs), Math.max(1, ...xs), Math.min(-1, ...ys), Math.max(1, ...ys)];
+    const metres = 1.2 * Math.max((x1 - x0) / wide, (y1 - y0) / high, 6 / wide);
+    const [cx, cy] = [(x0 + x1) / 2, (y0 + y1) / 2];
+    return { x: [cx - 0.5 * metres * wide, cx + 0.5 * metres * wide], y: [cy - 0.5 * metres * high, cy + 0.5 * metres * high] };
+  };
+
+  const draw = async () => {
+    const [mapTraces, timeTraces, shapes] = [[], [], []];
+    for (const d of devices.values()) {
+      const points = thinned(d.points);
+      const line = { color: d.colour, dash: d.dash, width: 2 };
+      const place = (p) => [p[1] - d.origin[0], p[2] - d.origin[1]];
+      const words = (p) => `<b>${d.label}</b> at ${p[0].toFixed(1)} s<br>sigma ${sigmaOf(p).toFixed(2)} m<br>speed ${p[4].toFixed(2)} m/s`;
+      mapTraces.push({ x: points.map((p) => place(p)[0]), y: points.map((p) => place(p)[1]), mode: "lines", line,
+        text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
+      const last = points[points.length - 1];
+      mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [d.label],
+        textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
+      if (last) shapes.push({ type: "path", path: ellipse(last, d.origin), line: { color: d.colour, width: 1 }, fillcolor: d.colour + "22" });
+      rows.forEach(([, value], k) => {
+        let before = null;
+        const ys = points.map((p) => {
+          const y = value(p);
+          const jumps = k === 2 && before !== null && Math.abs(y - before) > 180;  // yaw passes 180 degrees
+          before = y;
+          return jumps ? null : y;
+        });
+        timeTraces.push({ x: points.map((p) => p[0]), y: ys, mode: "lines", line, xaxis: `x${k ? k + 1 : ""}`,
+          yaxis: `y${k ? k + 1 : ""}`, hovertemplate: `${d.label} %{y:.2f}<extra></extra>` });
+      });
+    }
+    if (following && mapTraces.length) {
+      const { x, y } = fitted();
+      mapLayout.xaxis.range = x;
+      mapLayout.yaxis.range = y;
+      mapLayout.uirevision += 1;
+    }
+    mapLayout.shapes = shapes;
+    await Promise.all([Plotly.react(map, mapTraces, mapLayout, config), Plotly.react(time, timeTraces, timeLayout, config)]);
+  };
+
+  // A slow device draws less often: half of its time at most goes into drawing.
+  let [drawing, wanted] = [false, false];
+  const redraw = async () => {
+    wanted = true;
+    if (drawing) return;
+    drawing = true;
+    while (wanted) {
+      wanted = false;
+      const began = performance.now();
+      const received = Math.max(0, ...[...devices.values()].map((d) => d.received));
+      await draw();
+      const now = Date.now() / 1000;
+      window.stario.delays.push([performance.now() - began, now - received]);
+      if (window.stario.delays.length > 2000) window.stario.delays.shift();
+      document.body.dataset.drawn = String(Number(document.body.dataset.drawn || 0) + 1);
+      await new Promise((done) => setTimeout(done, Math.max(150, performance.now() - began)));
+    }
+    drawing = false;
+  };
+
+  const post = async (id, command, content = {}) => {
+    const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
+      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
+    const error = answer.ok ? "" : (await answer.json()).error;
+    const device = devices.get(id);
+    device.card.querySelector(".error").textContent = error;
+    device.card.querySelector(".error").hidden = !error;
+  };
+
+  let tapping = null;
+  const tap = (id) => {
+    tapping = id;
+    element("tap").hidden = id === null;
+    if (id !== null) {
+      element("tap-text").textContent = `Tap the map where ${devices.get(id).label} is now`;
+      if (window.innerWidth <= 900) element("tap").scrollIntoView({ behavior: "smooth" });
+    }
+  };
+  element("tap-cancel").addEventListener("click", () => tap(null));
+  element("fit").addEventListener("click", () => { following = true; redraw(); });
+  const watchMap = () => {
+    let pressed = null;
+    map.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
+    map.addEventListener("pointerup", (event) => {
+      const moved = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 6;
+      if (tapping === null || moved || !pressed) return;
+      const layout = map._fullLayout;
+      const box = map.getBoundingClientRect();
+      const x = layout.xaxis.p2d(event.clientX - box.left - layout.xaxis._offset);
+      const y = layout.yaxis.p2d(event.clientY - box.top - layout.yaxis._offset);
+      post(tapping, "fix", { x, y, sigma: Number(element("sigma").value) });
+      tap(null);
+    }, true);
+    map.on("plotly_relayout", (change) => {
+      if ("xaxis.range[0]" in change || "yaxis.range[0]" in change) following = false;
+    });
+  };
+
+  const button = (text, title, act) => {
+    const made = document.createElement("button");
+    Object.assign(made, { type: "button", textContent: text, title });
+    made.addEventListener("click", act);
+    return made;
+  };
+  const newDevice = (id) => {
+    const n = devices.size;
+    const card = document.createElement("article");
+    card.className = "device";
+    card.dataset.device = id;
+    card.innerHTML = '<h2><svg width="30" height="10" aria-hidden="true"></svg><span class="name"></span><span class="state"></span></h2>' +
+      '<div class="figures"></div><ul class="words"></ul><div class="tools"></div><p class="error" hidden></p><p class="file"></p>';
+    const device = { id, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
+      dash: DASHES[Math.floor(n / COLOURS.length + n) % DASHES.length], symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
+      points: [], origin: [0, 0, 0], received: 0, running: true, card };
+    const strokes = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
+    card.querySelector("svg").innerHTML = `<line x1="0" y1="5" x2="30" y2="5" stroke="${device.colour}" stroke-width="3" stroke-dasharray="${strokes[device.dash]}"/>`;
+    card.querySelector(".name").textContent = id;
+    device.toggle = button("Stop", "Ends this track, or begins a new one", () => post(id, device.running ? "stop" : "start"));
+    device.zero = button("Zero here", "Draws the place where it is now as x = y = 0", () => post(id, "zero"));
+    device.fix = button("Place on map", "Tells the filter where it is now, by a tap on the map", () => tap(id));
+    card.querySelector(".tools").append(device.toggle, device.zero, device.fix);
+    element("devices").append(card);
+    devices.set(id, device);
+    return device;
+  };
+
+  const show = (device, now) => {
+    const p = device.points[device.points.length - 1];
+    const age = now - device.received;
+    const state = device.card.querySelector(".state");
+    const silent = device.running && age > 3;
+    state.textContent = !device.running ? "stopped" : silent ? `silent for ${age.toFixed(0)} s` : `live, ${device.rate.toFixed(0)} Hz`;
+    state.classList.toggle("bad", silent);
+    const figures = p ? [
+      [`${Math.hypot(p[1] - device.origin[0], p[2] - device.origin[1]).toFixed(1)} m`, "from the origin"],
+      [`${sigmaOf(p).toFixed(2)} m`, "sigma of position"],
+      [`${p[4].toFixed(2)} m/s`, "speed"],
+      [`${p[5].toFixed(0)} ± ${p[9].toFixed(0)}°`, "yaw, 1 sigma"],
+      [`${(p[3] - device.origin[2]).toFixed(1)} m`, "height"],
+      [`${Math.floor(p[0] / 60)}:${String(Math.floor(p[0] % 60)).padStart(2, "0")}`, "min:s"]] : [];
+    device.card.querySelector(".figures").replaceChildren(...figures.map(([value, what]) => {
+      const box = document.createElement("div");
+      box.append(Object.assign(document.createElement("b"), { textContent: value }),
+        Object.assign(document.createElement("span"), { textContent: what }));
+      return box;
+    }));
+    const words = [...(device.problem ? [{ level: "warning", text: device.problem, advice: "" }] : []), ...device.health];
+    const key = JSON.stringify(words);
+    if (key !== device.words) {
+      device.words = key;
+      device.card.querySelector(".words").replaceChildren(...words.map((word) => {
+        const item = Object.assign(document.createElement("li"), { className: word.level, textContent: word.text });
+        if (word.advice) item.append(Object.assign(document.createElement("em"), { textContent: word.advice }));
+        return item;
+      }));
+    }
+    device.toggle.textContent = device.running ? "Stop" : "Start a new track";
+    device.zero.disabled = device.fix.disabled = !p || !device.running;
+    const dropped = Object.entries(device.dropped).map(([reason, n]) => `${n} ${reason}`).join(", ");
+    device.card.querySelector(".file").textContent = device.file ?
+      `${device.file}: ${device.samples} samples${dropped ? `, dropped: ${dropped}` : ""}${device.fixes ? `, ${device.fixes} fixes` : ""}` : "";
+  };
+
+  const take = (message) => {
+    for (const news of message.devices) {
+      const device = devices.get(news.id) || newDevice(news.id);
+      const { id, fresh, points, ...status } = news;
+      Object.assign(device, status);
+      device.points = fresh ? points : device.points.concat(points);
+      if (device.points.length > MOST_KEPT) device.points = device.points.filter((_, k) => k % 2 === 0);
+      show(device, message.time);
+    }
+    element("empty").hidden = devices.size > 0;
+    const refused = Object.values(message.refused).reduce((sum, n) => sum + n, 0);
+    connection.textContent = `${devices.size} device${devices.size === 1 ? "" : "s"}${refused ? `, ${refused} messages refused` : ""}`;
+    connection.className = "";
+    redraw();
+  };
+
+  element("push-url").textContent = new URL("data", location.href).href + location.search;
+  if (window.innerWidth <= 900) mapLayout.dragmode = "pan";
+  draw().then(() => {
+    watchMap();
+    const events = new EventSource("events" + location.search);
+    events.onmessage = (event) => { take(JSON.parse(event.data)); document.body.dataset.ready = "yes"; };
+    events.onerror = () => { connection.textContent = "no connection to the server, trying again"; connection.className = "bad"; };
+  });
+})();

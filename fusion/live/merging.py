@@ -1,0 +1,164 @@
+"""Sensors with clocks of their own, merged into samples at the gyroscope's times.
+
+A phone's sensors tick apart from each other and arrive in batches. Each gyroscope sample waits for
+the accelerometer's next one and takes the specific force interpolated in between; gravity and
+linear acceleration, where they come apart, are joined first in the same way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from stario.fusion.live.payload import (
+    ACCEL_RAW,
+    GRAVITY,
+    GYRO,
+    GYRO_RAW,
+    LINEAR,
+    TOTAL,
+    Reading,
+    Vector,
+)
+from stario.sequences.sequence import MAX_IMU_GAP
+
+Sample = tuple[int, Vector, Vector]
+"""Time [ns], angular rate [rad/s], specific force [m/s^2]."""
+
+CHOOSING = 5 * 10**8
+"""Time [ns] in which every sensor of a device shows up, before it is chosen among them."""
+
+LONGEST_WAIT = 5 * 10**9
+"""So long [ns] a gyroscope sample waits for the accelerometer."""
+
+_MAX_GAP = round(MAX_IMU_GAP * 1e9)
+_GYROS = (GYRO, GYRO_RAW)
+_ACCELS = ((TOTAL,), (LINEAR, GRAVITY), (ACCEL_RAW,))
+
+
+class Join:
+    """Values of a second stream at the times of a first.
+
+    Attributes:
+        late: values of either that came behind newer ones of theirs, and were dropped.
+        alone: values of the first that none of the second is near, and were dropped.
+    """
+
+    def __init__(self) -> None:
+        self._first: deque[tuple[int, Vector]] = deque()
+        self._second: deque[tuple[int, Vector]] = deque()
+        self._newest = [-1, -1]
+        self.late = self.alone = 0
+
+    def add(self, stream: int, time_ns: int, value: Vector) -> None:
+        """A value of the first (0) or second (1) stream; each must move on in time."""
+        if time_ns <= self._newest[stream]:
+            self.late += 1
+            return
+        self._newest[stream] = time_ns
+        (self._first, self._second)[stream].append((time_ns, value))
+
+    def ready(self) -> list[Sample]:
+        """What can be told by now, in the order of time."""
+        done: list[Sample] = []
+        while self._first and self._second:
+            time, value = self._first[0]
+            while len(self._second) > 1 and self._second[1][0] <= time:
+                self._second.popleft()
+            if self._second[0][0] < time and len(self._second) == 1:
+                break  # its next one is still to come
+            self._first.popleft()
+            other = self._at(time)
+            if other is None:
+                self.alone += 1
+            else:
+                done.append((time, value, other))
+        while self._first and self._newest[0] - self._first[0][0] > LONGEST_WAIT:
+            self._first.popleft()
+            self.alone += 1
+        return done
+
+    def _at(self, time: int) -> Vector | None:
+        """The second stream's value at a time, None outside it or in a gap."""
+        before, value = self._second[0]
+        if before == time:
+            return value
+        if before > time:
+            return None
+        after, other = self._second[1]
+        if after - before > _MAX_GAP:
+            return None
+        weight = (time - before) / (after - before)
+        x, y, z = (a + weight * (b - a) for a, b in zip(value, other, strict=True))
+        return x, y, z
+
+
+class Merger:
+    """Turns a device's readings into samples, once it is known which sensors it has."""
+
+    def __init__(self) -> None:
+        self._waiting: list[Reading] = []
+        self._gyro = ""
+        self._accel: tuple[str, ...] = ()
+        self._join, self._gravity = Join(), Join()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Readings dropped so far, by reason; those with a count."""
+        counts = {
+            "late": self._join.late + self._gravity.late,
+            "without acceleration": self._join.alone,
+        }
+        return {reason: count for reason, count in counts.items() if count}
+
+    @property
+    def missing(self) -> str:
+        """What a device does not send though a track needs it; empty where nothing is missing."""
+        if self._gyro or not self._waiting:
+            return ""
+        seen = {reading.sensor for reading in self._waiting}
+        if not seen & set(_GYROS):
+            return "gyroscope"
+        if not any(set(names) <= seen for names in _ACCELS):
+            return "total acceleration, or accelerometer with gravity"
+        return ""
+
+    def add(self, readings: Iterable[Reading]) -> list[Sample]:
+        """Readings as they come; returns the samples that they complete."""
+        if not self._gyro:
+            self._waiting += readings
+            if not self._choose():
+                return []
+            readings, self._waiting = self._waiting, []
+        # Sensors come one after the other in a batch: each is sorted, so that none is late.
+        for reading in sorted(readings, key=lambda reading: reading.time_ns):
+            self._take(reading)
+        if len(self._accel) == 2:
+            for time, linear, gravity in self._gravity.ready():
+                x, y, z = (a + b for a, b in zip(linear, gravity, strict=True))
+                self._join.add(1, time, (x, y, z))
+        return self._join.ready()
+
+    def _take(self, reading: Reading) -> None:
+        sensor, time, value = reading.sensor, reading.time_ns, reading.value
+        if sensor == self._gyro:
+            self._join.add(0, time, value)
+        elif len(self._accel) == 2 and sensor in self._accel:
+            self._gravity.add(self._accel.index(sensor), time, value)
+        elif sensor in self._accel:
+            self._join.add(1, time, value)
+
+    def _choose(self) -> bool:
+        """The best of the sensors seen, once enough of the stream is there to have seen all."""
+        times = [reading.time_ns for reading in self._waiting]
+        if not times or max(times) - min(times) < CHOOSING:
+            return False
+        seen = {reading.sensor for reading in self._waiting}
+        gyro = next((name for name in _GYROS if name in seen), "")
+        accel = next((names for names in _ACCELS if set(names) <= seen), ())
+        if not gyro or not accel:
+            newest = max(times)  # what waits must not grow
+            self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
+            return False
+        self._gyro, self._accel = gyro, accel
+        return True

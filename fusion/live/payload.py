@@ -1,0 +1,231 @@
+"""What devices send, taken apart: Sensor Logger's pushes, and lines of JSON from anything else.
+
+A push of the app Sensor Logger is a JSON object with a batch of samples of all its sensors:
+
+    {"messageId": 7, "sessionId": "...", "deviceId": "...", "payload": [
+        {"name": "gyroscope", "time": 1698501144401773000, "values": {"x": 0.1, "y": 0, "z": 0}}]}
+
+`time` is in nanoseconds, rates in rad/s, accelerations in m/s^2. "accelerometer" is without gravity
+and "gravity" a sensor of its own; "totalacceleration" (Android) holds both. Sensors that no track
+is made of are skipped.
+
+A line of any other device is one sample; gyro [rad/s] and accel [m/s^2] come together or alone:
+
+    {"device": "rig", "t": 12.345, "gyro": [0.1, 0, 0], "accel": [0, 0, 9.81]}
+
+`t_ns` (a whole number) may stand for `t`. A batch is taken as a whole or refused as a whole.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from stario.sequences.errors import InputError
+
+Vector = tuple[float, float, float]
+
+MOST_ENTRIES = 50_000
+"""Samples in one push; the fastest phone needs a minute for them."""
+
+LONGEST_SPAN = 600 * 10**9
+"""Time [ns] between a push's first and last sample: longer, and a stamp is wrong."""
+
+_LARGEST = 1e4
+"""No sensor reads more in rad/s or m/s^2."""
+
+_LATEST = 2**63
+_LONGEST_NAME = 80
+
+GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
+TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
+ACCEL_RAW = "accelerometeruncalibrated"
+SENSORS = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW})
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One sample of one sensor.
+
+    Attributes:
+        sensor: one of `SENSORS`.
+        time_ns: on the device's clock [ns].
+        value: [rad/s] or [m/s^2].
+    """
+
+    sensor: str
+    time_ns: int
+    value: Vector
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What came at once from one device.
+
+    Attributes:
+        device: which one.
+        recording: its own name for the recording, empty where it has none.
+        readings: in the order they came.
+    """
+
+    device: str
+    recording: str
+    readings: list[Reading]
+
+
+def parse_push(body: bytes) -> Batch:
+    """A push of Sensor Logger.
+
+    Raises:
+        InputError: the body is no such JSON; it names the field.
+    """
+    message = _object("body", json_from(body))
+    payload = message.get("payload")
+    if not isinstance(payload, list):
+        raise InputError("payload", _kind(payload), "a list of samples")
+    if len(payload) > MOST_ENTRIES:
+        found = f"{len(payload)} samples"
+        raise InputError("payload", found, f"at most {MOST_ENTRIES}", "choose a shorter period")
+    device = _name("deviceId", message.get("deviceId"))
+    recording = _name("sessionId", message.get("sessionId", ""), needed=False)
+    readings = [
+        reading
+        for k, entry in enumerate(payload)
+        if (reading := _pushed(f"payload[{k}]", _object(f"payload[{k}]", entry))) is not None
+    ]
+    return Batch(device, recording, _together("payload", readings))
+
+
+def parse_line(line: bytes, sender: str) -> Batch:
+    """A line of a device's own.
+
+    Args:
+        line: JSON.
+        sender: the device's name where the line has none.
+
+    Raises:
+        InputError: the line is no such JSON; it names the field.
+    """
+    message = _object("line", json_from(line))
+    if "payload" in message:
+        return parse_push(line)
+    if "t_ns" in message:
+        time_ns = _nanoseconds("t_ns", message["t_ns"])
+    else:
+        time_ns = _nanoseconds("t", 1e9 * _number("t", message.get("t")))
+    readings = [
+        Reading(sensor, time_ns, _three(key, message[key]))
+        for key, sensor in (("gyro", GYRO), ("accel", TOTAL))
+        if key in message
+    ]
+    if not readings:
+        raise InputError("line", "neither gyro nor accel", "at least one of them")
+    device = _name("device", message.get("device", sender))
+    return Batch(device, _name("recording", message.get("recording", ""), needed=False), readings)
+
+
+def json_from(text: bytes) -> Any:
+    """JSON, whatever the bytes are.
+
+    Raises:
+        InputError: they are none.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise InputError("JSON", "too many levels", "an object") from None
+    except ValueError as error:  # no UTF-8, no JSON, or a number of thousands of digits
+        raise InputError("JSON", str(error)[:120], "valid JSON in UTF-8") from None
+
+
+def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
+    """One sample of a push, None of a sensor that no track is made of."""
+    name = entry.get("name")
+    if not isinstance(name, str):
+        raise InputError(f"{where}.name", _kind(name), "the name of a sensor")
+    sensor = name.lower()
+    if sensor not in SENSORS:
+        return None
+    values = entry.get("values", entry)
+    return Reading(
+        sensor,
+        _nanoseconds(f"{where}.time", entry.get("time")),
+        _axes(f"{where}.values", _object(f"{where}.values", values)),
+    )
+
+
+def _together(where: str, readings: list[Reading]) -> list[Reading]:
+    times = [reading.time_ns for reading in readings]
+    if times and max(times) - min(times) > LONGEST_SPAN:
+        found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
+        raise InputError(where, found, f"at most {LONGEST_SPAN / 1e9:g} s in one push")
+    return readings
+
+
+def _object(where: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(where, _kind(value), "an object")
+    return value
+
+
+def _name(where: str, value: Any, needed: bool = True) -> str:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = str(value)
+    if not isinstance(value, str) or (needed and not value.strip()):
+        raise InputError(where, _kind(value), "a name")
+    return value.strip()[:_LONGEST_NAME]
+
+
+def _nanoseconds(where: str, value: Any) -> int:
+    """A whole number, also as text of digits, as the app's JSON exports have it."""
+    if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20:
+        value = int(value)
+    if isinstance(value, float) and math.isfinite(value):
+        value = round(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _LATEST:
+        raise InputError(where, _kind(value), "a time in nanoseconds, not negative")
+    return value
+
+
+def _axes(where: str, values: Mapping[str, Any]) -> Vector:
+    x, y, z = (_reading(f"{where}.{axis}", values.get(axis)) for axis in "xyz")
+    return x, y, z
+
+
+def _three(where: str, values: Any) -> Vector:
+    if not isinstance(values, list) or len(values) != 3:
+        raise InputError(where, _kind(values), "a list of three numbers")
+    x, y, z = (_reading(f"{where}[{k}]", value) for k, value in enumerate(values))
+    return x, y, z
+
+
+def _reading(where: str, value: Any) -> float:
+    number = _number(where, value)
+    if abs(number) > _LARGEST:
+        raise InputError(where, f"{number:.3g}", f"at most {_LARGEST:g} rad/s or m/s^2")
+    return number
+
+
+def _number(where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(where, _kind(value), "a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(where, "no finite number", "a number")
+    return number
+
+
+def _kind(value: Any) -> str:
+    """What something is, in few words whatever its size."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, (dict, list)):
+        return "a list" if isinstance(value, list) else "an object"
+    text = repr(value) if isinstance(value, (str, float, bool)) else f"{str(value)[:20]}"
+    return text if len(text) <= 40 else f"{text[:40]}..."

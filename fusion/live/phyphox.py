@@ -1,0 +1,163 @@
+"""A phone with phyphox: its remote interface is asked for what is new, some times a second.
+
+The app (menu: "Allow remote access") answers `/config` with the experiment's sensors and the names
+of their buffers, and `/get?acc_time=12.3&accX=12.3|acc_time` with what is newer than 12.3 s. The
+experiment must record the gyroscope and the acceleration with g: "Add experiment, simple" has both.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import urllib.request
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import quote, urlsplit
+
+from stario.fusion.live.hub import Hub
+from stario.fusion.live.payload import GRAVITY, GYRO, LINEAR, TOTAL, Batch, Reading, json_from
+from stario.sequences.errors import InputError
+
+PERIOD = 0.2
+"""Between two questions [s]."""
+
+_SENSORS = {
+    "gyroscope": GYRO,
+    "accelerometer": TOTAL,
+    "linear_acceleration": LINEAR,
+    "gravity": GRAVITY,
+}
+_TIMEOUT = 3.0
+_PATIENCE = 2.0
+_LARGEST_ANSWER = 16 * 1024 * 1024
+_LARGEST_VALUE = 1e4
+
+_log = logging.getLogger(__name__)
+
+
+class Phyphox:
+    """A client of one phone.
+
+    Args:
+        address: such as 192.168.0.7:8080.
+
+    Raises:
+        InputError: it is no address of HTTP.
+    """
+
+    def __init__(self, address: str) -> None:
+        url = urlsplit(address if "//" in address else f"//{address}", scheme="http")
+        if url.scheme != "http" or not url.hostname:
+            raise InputError("phyphox", repr(address), "an address such as 192.168.0.7:8080")
+        self.device = f"phyphox {url.netloc}"
+        self._root = f"http://{url.netloc}"
+        self._buffers: dict[str, tuple[str, str, str, str]] = {}
+        self._newest: dict[str, float] = {}
+        self._session = ""
+
+    def fetch(self) -> Batch:
+        """What is new on the phone.
+
+        Raises:
+            InputError: its answer is not phyphox's, or the experiment lacks a sensor.
+            OSError: it does not answer.
+        """
+        if not self._buffers:
+            self._buffers = buffers_of(self._ask("/config"))
+        answer = self._ask(f"/get?{'&'.join(self._questions())}")
+        status, buffers = answer.get("status"), answer.get("buffer")
+        if not isinstance(status, dict) or not isinstance(buffers, dict):
+            raise InputError("phyphox", "no status or no buffers", "an answer of phyphox's /get")
+        session = str(status.get("session", ""))
+        if session != self._session:  # another experiment: its buffers and times are others
+            started, self._session = bool(self._session), session
+            if started:
+                self._buffers, self._newest = {}, {}
+                return Batch(self.device, session, [])
+        readings = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
+        return Batch(self.device, session, readings)
+
+    def _questions(self) -> list[str]:
+        questions = []
+        for sensor, names in self._buffers.items():
+            t, *axes = map(quote, names)
+            if sensor in self._newest:
+                since = repr(self._newest[sensor])
+                questions += [f"{t}={since}", *(f"{axis}={since}%7C{t}" for axis in axes)]
+            else:
+                questions += [f"{name}=full" for name in (t, *axes)]
+        return questions
+
+    def _readings(self, sensor: str, buffers: Mapping[str, Any]) -> list[Reading]:
+        columns = [_column(buffers, name) for name in self._buffers[sensor]]
+        readings = []
+        for t, *value in zip(*columns, strict=False):  # one may be ahead by a sample
+            if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _LARGEST_VALUE:
+                continue
+            self._newest[sensor] = t
+            x, y, z = value
+            readings.append(Reading(sensor, round(1e9 * t), (x, y, z)))
+        return readings
+
+    def _ask(self, path: str) -> dict[str, Any]:
+        with urllib.request.urlopen(self._root + path, timeout=_TIMEOUT) as answer:
+            body = answer.read(_LARGEST_ANSWER)
+        message = json_from(body)
+        if not isinstance(message, dict):
+            raise InputError("phyphox", "another answer", "a JSON object")
+        return message
+
+
+def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]]:
+    """Names of the buffers of time, x, y and z by sensor, of phyphox's `/config`.
+
+    Raises:
+        InputError: the experiment lacks the gyroscope or the acceleration with g.
+    """
+    found = {}
+    inputs = config.get("inputs")
+    for source in inputs if isinstance(inputs, list) else []:
+        sensor = _SENSORS.get(str(source.get("source"))) if isinstance(source, dict) else None
+        if sensor is None:
+            continue
+        outputs = {k: v for output in source.get("outputs", []) for k, v in output.items()}
+        if all(isinstance(outputs.get(key), str) for key in "txyz"):
+            t, x, y, z = (outputs[key] for key in "txyz")
+            found[sensor] = (t, x, y, z)
+    if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
+        have = ", ".join(found) or "neither"
+        raise InputError(
+            "phyphox",
+            have,
+            "gyroscope and acceleration with g in one experiment",
+            "add a simple experiment with both",
+        )
+    return found
+
+
+async def follow(hub: Hub, phone: Phyphox) -> None:
+    """Ask a phone for as long as the server runs; what goes wrong is told once, and tried again."""
+    told = ""
+    while True:
+        try:
+            batch = await asyncio.to_thread(phone.fetch)
+            await hub.take(batch)
+            told = ""
+        except (OSError, InputError, ValueError) as error:
+            if str(error) != told:
+                _log.warning("%s: %s", phone.device, error)
+                told = str(error)
+            await asyncio.sleep(_PATIENCE)
+        await asyncio.sleep(PERIOD)
+
+
+def _column(buffers: Mapping[str, Any], name: str) -> list[float]:
+    """The numbers of a buffer, up to the first that is none."""
+    buffer = buffers.get(name)
+    values = buffer.get("buffer") if isinstance(buffer, dict) else None
+    numbers: list[float] = []
+    for value in values if isinstance(values, list) else []:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+            break
+        numbers.append(float(value))
+    return numbers

@@ -1,0 +1,251 @@
+"""The live server: pushes in, one page out.
+
+    GET  /                       the page
+    GET  /events                 its news, as server-sent events
+    POST /data                   a push of Sensor Logger, or lines of JSON (application/x-ndjson)
+    POST /devices/{id}/{command} start, stop, zero, or fix with {"x": m, "y": m, "sigma": m}
+
+`/data?accel_unit=g` (or -g, -m/s2) says what a device's accelerometer reports; the minus is Apple's
+sign. Whatever cannot be used gets a 4xx with the reason, and changes nothing.
+
+A server that others can reach wants its token with everything, in the address (`?token=...`), as
+`Authorization: Bearer ...`, or in the cookie that the page sets. One on loopback wants none, but
+answers only to loopback's own names, or any web page that a browser visits could reach it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import hmac
+import importlib.resources
+import json
+import logging
+from collections.abc import AsyncIterator
+from functools import cache
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from stario.fusion.live.hub import Hub, Viewer
+from stario.fusion.live.payload import json_from, parse_line, parse_push
+from stario.sequences.errors import InputError, StarioError
+from stario.sequences.units import ACCEL_UNITS, unit_named
+
+MOST_BYTES = 4 * 1024 * 1024
+"""Of a push."""
+
+LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
+
+COMMANDS = ("start", "stop", "zero", "fix")
+
+_MOST_OFTEN = 0.05
+_AT_LEAST = 1.0
+_COOKIE = "stario_token"
+_FURTHEST, _SIGMAS = 1e6, (0.01, 1e3)
+_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
+
+_log = logging.getLogger(__name__)
+
+
+def live_app(hub: Hub, token: str = "") -> Starlette:
+    """The web application.
+
+    Args:
+        hub: its devices.
+        token: that everything must bring; empty for a server on loopback alone.
+    """
+    guard = (
+        Middleware(TokenMiddleware, token=token)
+        if token
+        else Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK)
+    )
+    app = Starlette(
+        routes=[
+            Route("/", _asset("live.html")),
+            Route("/live.css", _asset("live.css")),
+            Route("/live.js", _asset("live.js")),
+            Route("/plotly.js", _plotly),
+            Route("/events", _events),
+            Route("/data", _data, methods=["POST"]),
+            Route("/devices/{device}/{command}", _command, methods=["POST"]),
+        ],
+        middleware=[guard],
+        exception_handlers={StarioError: _unusable, OSError: _no_room},
+    )
+    app.state.hub = hub
+    return app
+
+
+class TokenMiddleware:
+    """Lets nothing through that does not bring the token.
+
+    Args:
+        app: behind it.
+        token: not empty.
+    """
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app, self._token = app, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or pass it on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        named = request.query_params.get("token", "")
+        bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
+        shown = (named, bearer, request.cookies.get(_COOKIE, ""))
+        if not any(same(one, self._token) for one in shown):
+            reason = (
+                "token: none or another one; add ?token=..., as the server printed at its start"
+            )
+            await JSONResponse({"error": reason}, 401)(scope, receive, send)
+            return
+
+        async def with_cookie(message: Any) -> None:
+            if message["type"] == "http.response.start" and same(named, self._token):
+                cookie = f"{_COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                message["headers"] = [*message["headers"], (b"set-cookie", cookie.encode())]
+            await send(message)
+
+        await self._app(scope, receive, with_cookie)
+
+
+def same(shown: str, token: str) -> bool:
+    """Whether a token is the right one, in a time that does not tell how nearly."""
+    return hmac.compare_digest(shown.encode(), token.encode())
+
+
+def accel_factor(unit: str) -> float:
+    """What turns an accelerometer's unit into specific force in m/s^2.
+
+    Raises:
+        InputError: there is no such unit.
+    """
+    name = unit_named(unit)
+    if name not in ACCEL_UNITS:
+        raise InputError("accel_unit", repr(unit[:20]), ", ".join(ACCEL_UNITS))
+    return ACCEL_UNITS[name]
+
+
+async def _data(request: Request) -> Response:
+    hub: Hub = request.app.state.hub
+    try:
+        _check_origin(request)
+        factor = accel_factor(request.query_params.get("accel_unit", "m/s^2"))
+        body = await _body(request)
+        if request.headers.get("content-type", "").startswith("application/x-ndjson"):
+            sender = f"http {request.client.host if request.client else ''}"
+            lines = [line for line in body.splitlines() if line.strip()]
+            batches = [parse_line(line, sender) for line in lines]  # all of them, or none
+        else:
+            batches = [parse_push(body)]
+    except InputError:
+        hub.refuse("http")
+        raise
+    count = 0
+    for batch in batches:
+        count += await hub.take(batch, factor)
+    return JSONResponse({"samples": count})
+
+
+def _check_origin(request: Request) -> None:
+    """Browsers say whose page sends something: pages of others must not steer this server."""
+    origin = request.headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
+        raise InputError("origin", "a page of another server", "this server's page, or an app")
+
+
+async def _body(request: Request) -> bytes:
+    """The whole body; a larger one is refused before it is there."""
+    parts, size = [], 0
+    try:
+        async for part in request.stream():
+            size += len(part)
+            if size > MOST_BYTES:
+                raise InputError("body", "a larger one", f"at most {MOST_BYTES} bytes")
+            parts.append(part)
+    except ClientDisconnect:
+        raise InputError("body", "a part of it", "a whole one") from None
+    return b"".join(parts)
+
+
+async def _command(request: Request) -> Response:
+    hub: Hub = request.app.state.hub
+    _check_origin(request)
+    device, command = request.path_params["device"], request.path_params["command"]
+    if command not in COMMANDS:
+        raise InputError("command", repr(command[:40]), ", ".join(COMMANDS))
+    values = {} if command != "fix" else _fix_values(json_from(await _body(request)))
+    await hub.command(device, command, **values)
+    return JSONResponse({"done": command})
+
+
+def _fix_values(message: Any) -> dict[str, float]:
+    values = {}
+    for name in ("x", "y", "sigma"):
+        value = message.get(name) if isinstance(message, dict) else None
+        if not isinstance(value, (int, float)) or not abs(value) <= _FURTHEST:
+            raise InputError(name, "none, or no number", f"a number up to {_FURTHEST:g} m")
+        values[name] = float(value)
+    low, high = _SIGMAS
+    if not low <= values["sigma"] <= high:
+        raise InputError("sigma", f"{values['sigma']:g}", f"{low:g} to {high:g} m")
+    return values
+
+
+async def _events(request: Request) -> Response:
+    hub: Hub = request.app.state.hub
+
+    async def messages() -> AsyncIterator[str]:
+        viewer = Viewer(hub)
+        while True:
+            waiting = asyncio.create_task(hub.news(_AT_LEAST))
+            yield f"data: {json.dumps(viewer.message(), separators=(',', ':'))}\n\n"
+            await waiting
+            await asyncio.sleep(_MOST_OFTEN)
+
+    headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
+    return StreamingResponse(messages(), media_type="text/event-stream", headers=headers)
+
+
+def _asset(name: str) -> Any:
+    content = importlib.resources.files("stario.fusion.live").joinpath(name).read_bytes()
+    media = _TYPES[name.rpartition(".")[2]]
+    policy = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"
+    headers = {"cache-control": "no-cache", "content-security-policy": policy}
+
+    async def answer(request: Request) -> Response:
+        return Response(content, media_type=media, headers=headers)
+
+    return answer
+
+
+async def _plotly(request: Request) -> Response:
+    headers = {"content-encoding": "gzip", "cache-control": "max-age=86400"}
+    content = await asyncio.to_thread(_plotly_packed)
+    return Response(content, media_type="text/javascript", headers=headers)
+
+
+@cache
+def _plotly_packed() -> bytes:
+    from plotly.offline import get_plotlyjs
+
+    return gzip.compress(get_plotlyjs().encode(), 6)
+
+
+async def _unusable(request: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 400)
+
+
+async def _no_room(request: Request, error: Exception) -> Response:
+    _log.error("a recording cannot be written: %s", error)
+    return JSONResponse({"error": f"the recording cannot be written: {error}"}, 507)

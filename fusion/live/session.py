@@ -1,0 +1,274 @@
+"""One device: its samples on the way into a recording, a navigator and the points of its track."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.fixes import position_fix
+from stario.fusion.live.merging import Merger
+from stario.fusion.live.payload import Batch
+from stario.fusion.live.storage import LiveFile
+from stario.fusion.navigator import Navigator
+from stario.fusion.report.health import findings
+from stario.fusion.state import NavState
+from stario.sequences.errors import InputError
+from stario.sequences.rotations import yaw_of
+from stario.sequences.sequence import FloatArray
+
+Point = list[float]
+"""t [s], x, y, z [m], speed [m/s], yaw [deg], the horizontal covariance's xx, xy, yy [m^2], and
+the standard deviation of yaw [deg]."""
+
+MOST_POINTS = 20_000
+"""Kept of a track; beyond, every second one is forgotten, since memory must not grow."""
+
+BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
+"""A jump of the device's clock beyond these [ns] begins a new track."""
+
+_HEALTH_SECONDS = 1.0
+
+
+@dataclass
+class Drawn:
+    """A track as it is drawn.
+
+    Attributes:
+        points: thinned where there are many.
+        revision: goes up whenever earlier points changed.
+        origin: (3,) what is drawn as zero [m].
+        map_frame: of the states in `points`.
+    """
+
+    points: list[Point] = field(default_factory=list)
+    revision: int = 0
+    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
+    map_frame: int = 0
+
+    def add(self, state: NavState) -> None:
+        """The newest state; one in a new map frame takes the earlier points along."""
+        self.points.append(point_of(state))
+        if len(self.points) > MOST_POINTS:
+            self.points = self.points[::2]
+            self.revision += 1
+
+    def move(self, before: NavState, after: NavState) -> None:
+        """The map frame moved and turned: `before` became `after`, and so do earlier points."""
+        turn = float(yaw_of(Rotation.from_matrix(after.R_WB @ before.R_WB.T))[0])
+        R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        shift = after.p_W[:2] - R @ before.p_W[:2]
+        rise = after.p_W[2] - before.p_W[2]
+        table = np.array(self.points).reshape(-1, 10)
+        table[:, 1:3] = table[:, 1:3] @ R.T + shift
+        table[:, 3] += rise
+        table[:, 5] = (table[:, 5] + math.degrees(turn) + 180.0) % 360.0 - 180.0
+        P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
+        table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
+        self.points = table.tolist()
+        self.revision += 1
+        self.map_frame = after.map_frame
+
+
+class Session:
+    """A device's stream. Not for several threads at once: its caller holds `hub`'s lock.
+
+    Args:
+        device: its name.
+        folder: for recordings.
+        new_navigator: makes a navigator for each track.
+    """
+
+    def __init__(self, device: str, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
+        self.device = device
+        self._folder, self._new_navigator = folder, new_navigator
+        self.running = True
+        self.drawn = Drawn()
+        self.problem = ""
+        self.words: list[dict[str, str]] = []
+        self.samples = self.ignored = self.fixes = 0
+        self.received = 0.0
+        self.rate = 0.0
+        self._revisions = 0
+        self._begin("")
+
+    def _begin(self, recording: str) -> None:
+        self._recording, self._merger = recording, Merger()
+        self._navigator, self._file = self._new_navigator(), None
+        self._first_ns = self._newest_ns = -1
+        self._words_at = -math.inf
+        self._revisions = self.drawn.revision + 1
+        self.drawn = Drawn(revision=self._revisions)
+        self.problem, self.words = "", []
+        self.samples = self.fixes = 0
+        self.rate = 0.0
+
+    _file: LiveFile | None
+
+    @property
+    def path(self) -> Path | None:
+        """The recording in progress, or the last one; None before the first sample."""
+        return None if self._file is None else self._file.path
+
+    def take(self, batch: Batch, received: float, accel_factor: float = 1.0) -> int:
+        """Take a batch in: first to disk, then to the navigator.
+
+        Args:
+            batch: of this device.
+            received: when it came [s since 1970].
+            accel_factor: turns its accelerometer into specific force in m/s^2.
+
+        Returns:
+            How many samples were taken.
+        """
+        self.received = received
+        if not self.running:
+            self.ignored += len(batch.readings)
+            return 0
+        if self._is_new(batch):
+            self.stop()
+            self.start(batch.recording)
+        self._recording = batch.recording
+        samples = [
+            (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
+            for time, gyro, a in self._merger.add(batch.readings)
+        ]
+        if not samples:
+            return 0
+        if self._file is None:
+            self._file = LiveFile(self._folder, self.device)
+            self._first_ns = samples[0][0]
+        self._file.append(samples, received)
+        for time_ns, gyro, accel in samples:
+            self._push((time_ns - self._first_ns) / 1e9, gyro, accel)
+        self._count(samples[0][0], samples[-1][0], len(samples))
+        return len(samples)
+
+    def start(self, recording: str = "") -> None:
+        """Begin a new track and a new recording."""
+        if self._file is not None:
+            self._file.close()
+        self._begin(recording)
+        self.running = True
+
+    def stop(self) -> None:
+        """End the track; what comes is ignored until `start`."""
+        self.running = False
+
+    def zero(self) -> None:
+        """Draw the newest position as the origin; the estimate and the recording stay.
+
+        Raises:
+            InputError: there is no position yet.
+        """
+        self.drawn.origin = self._state().p_W.copy()
+        self.drawn.revision += 1
+
+    def fix(self, x: float, y: float, sigma: float) -> None:
+        """The device is at x, y of the drawn map [m], known to sigma [m]; nothing of its height.
+
+        Raises:
+            InputError: there is no position yet.
+        """
+        before = self._state()
+        p_W = np.array([x, y, 0.0]) + self.drawn.origin
+        p_W[2] = before.p_W[2]
+        covariance = np.diag([sigma**2, sigma**2, before.covariance[8, 8] + 1.0])
+        self._navigator.update_position(before.time, p_W, covariance)
+        assert self._file is not None  # there is a state
+        self._file.append_fix(position_fix(before.time, p_W, covariance))
+        self.fixes += 1
+        after = self._state()
+        if after.map_frame != self.drawn.map_frame:
+            self.drawn.move(before, after)
+        self.drawn.add(after)
+        self._tell_health(after.time)
+
+    def close(self) -> None:
+        """Nothing follows."""
+        if self._file is not None:
+            self._file.close()
+
+    def status(self) -> dict[str, Any]:
+        """What the page shows beside the track."""
+        problem = self.problem
+        if not problem and self._merger.missing:
+            problem = f"no samples of {self._merger.missing}: switch it on in the logger"
+        return {
+            "id": self.device,
+            "running": self.running,
+            "samples": self.samples,
+            "rate": round(self.rate, 1),
+            "received": self.received,
+            "origin": self.drawn.origin.round(4).tolist(),
+            "fixes": self.fixes,
+            "dropped": self._merger.dropped,
+            "file": None if self.path is None else self.path.name,
+            "problem": problem,
+            "health": self.words,
+        }
+
+    def _is_new(self, batch: Batch) -> bool:
+        """Whether a batch belongs to another recording than those before."""
+        if self._newest_ns < 0 or not batch.readings:
+            return False
+        if self._recording and batch.recording and self._recording != batch.recording:
+            return True
+        times = sorted(reading.time_ns for reading in batch.readings)
+        jump = times[len(times) // 2] - self._newest_ns
+        return not -BACKWARD < jump < FORWARD
+
+    def _push(self, time: float, gyro: Any, accel: Any) -> None:
+        try:
+            state = self._navigator.push(time, gyro, accel)
+        except InputError as error:
+            self.problem = str(error)
+            return
+        if state is None:
+            return
+        self.problem = ""
+        self.drawn.add(state)
+        self._tell_health(state.time)
+
+    def _tell_health(self, time: float) -> None:
+        if time - self._words_at < _HEALTH_SECONDS:
+            return
+        self._words_at = time
+        found = findings(self._navigator.health)
+        self.words = [{"level": f.level, "text": f.text, "advice": f.advice} for f in found]
+
+    def _count(self, first_ns: int, last_ns: int, count: int) -> None:
+        """Samples so far, and their rate, smoothed over some batches."""
+        since = self._newest_ns if self._newest_ns >= 0 else first_ns
+        self._newest_ns = max(self._newest_ns, last_ns)
+        self.samples += count
+        if last_ns > since:
+            rate = 1e9 * count / (last_ns - since)
+            weight = min(1.0, (last_ns - since) / 2e9) if self.rate else 1.0
+            self.rate += weight * (rate - self.rate)
+
+    def _state(self) -> NavState:
+        state = self._navigator.state
+        if state is None:
+            raise InputError(self.device, "no position yet", "a second of samples first")
+        return state
+
+
+def point_of(state: NavState) -> Point:
+    """What is drawn of a state, rounded to what a screen shows."""
+    P = state.covariance
+    values = (
+        *state.p_W,
+        float(np.linalg.norm(state.v_W)),
+        math.degrees(float(yaw_of(Rotation.from_matrix(state.R_WB))[0])),
+        P[6, 6],
+        P[6, 7],
+        P[7, 7],
+        math.degrees(math.sqrt(P[2, 2])),
+    )
+    return [round(state.time, 4), *(round(float(value), 5) for value in values)]

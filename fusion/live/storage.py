@@ -1,0 +1,85 @@
+"""A live recording on disk: StarIO's own CSV, complete up to the last batch at any moment.
+
+Whole lines are handed to the system with one unbuffered write per batch, so that a program that is
+killed loses nothing of what it took in. `read_recording` reads the file while it grows, too. The
+last column, the time of receipt, is no data of the device: a line that was cut short lacks it, and
+is told from a whole one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from stario.fusion.fixes import Fix
+from stario.fusion.live.merging import Sample
+from stario.sequences.errors import InputError
+
+HEADER = (
+    "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],received [unix s]\n"
+)
+FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
+
+
+class LiveFile:
+    """A recording that grows, and its fixes beside it.
+
+    Args:
+        folder: to write into; it is made where it is missing.
+        device: part of the file's name.
+
+    Attributes:
+        path: of the recording.
+        fixes_path: of the fixes; there is a file once there is a fix.
+
+    Raises:
+        InputError: the folder or file cannot be made.
+    """
+
+    def __init__(self, folder: Path, device: str) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.path, self._file = _new_file(folder, device)
+        except OSError as error:
+            found = f"{folder}: {error.strerror or error}"
+            raise InputError("out", found, "a folder that can be written to") from error
+        self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
+        self._file.write(HEADER.encode())
+
+    def append(self, samples: Sequence[Sample], received: float) -> None:
+        """Add samples, received at a time [s since 1970]."""
+        self._file.write(
+            "".join(
+                f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},{received:.3f}\n"
+                for time, g, a in samples
+            ).encode()
+        )
+
+    def append_fix(self, fix: Fix) -> None:
+        """Add a position fix as `stario run --fixes` reads it, its time since the first sample."""
+        (x, y, z), sigma = fix.value.tolist(), fix.covariance.diagonal() ** 0.5
+        sx, sy, sz = sigma.tolist()
+        new = not self.fixes_path.exists()
+        with self.fixes_path.open("ab", buffering=0) as file:
+            line = f"{fix.time!r},position,{x!r},{y!r},{z!r},{sx!r},{sy!r},{sz!r}\n"
+            file.write(((FIXES_HEADER if new else "") + line).encode())
+
+    def close(self) -> None:
+        """No more follows."""
+        self._file.close()
+
+
+def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:
+    """A file that was not there before, named by time and device."""
+    slug = re.sub(r"[^A-Za-z0-9]+", "-", device).strip("-")[:32] or "device"
+    stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{slug}"
+    for number in range(1, 1000):
+        path = folder / (f"{stem}.csv" if number == 1 else f"{stem}-{number}.csv")
+        try:
+            return path, path.open("xb", buffering=0)
+        except FileExistsError:
+            continue
+    raise InputError("out", f"1000 files named {stem}", "room for another", "choose another folder")

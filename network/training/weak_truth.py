@@ -1,0 +1,332 @@
+"""Learning from weak truth: positions without attitude, and waypoints that were passed.
+
+A stretch of levelled IMU is cut into windows one second apart; the network's displacements d_k are
+chained along the gyroscope's yaw. A leg m lies between two instants of known position, D_m apart.
+With a_mk the seconds that window k and leg m have in common,
+
+    D^_m = sum_k a_mk d_k,   psi = arg sum_m conj(D^_m) D_m / T_m,   r_m = exp(i psi) D^_m - D_m
+
+(horizontal vectors as complex numbers). psi takes out the unknown yaw between levelled frame and
+map; no gradient goes through it. The known positions are uncertain, so neighbouring legs err with
+opposite signs: r is whitened by C = A diag(s^2) A' + q T, in which A takes positions to legs, s is
+a position's deviation and q the variance that a second of displacement adds. A robust loss of the
+whitened residuals times q is then on the scale of the windows' squared error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stario.network.training.augment import Augmentation, WindowSampler, heading_of, show
+from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.levelled_stream import levelled_streams
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES
+
+VARIANCE_RATE = 0.05
+"""Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
+
+_TRACK_STEP = 2.0
+"""Between the positions of a track that end its legs [s]."""
+
+_SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
+"""Legs that are shorter [s] or faster [m/s] are a tap by mistake, or a ride."""
+
+_FASTEST_STEP = 6.0
+"""A track that moves faster between two samples has jumped [m/s]."""
+
+_TRACK_SIGMA = 0.15
+"""Of a track's positions [m]: what carries the truth is not what carries the IMU."""
+
+_TAP_SIGMA, _TAP_TIME = 0.4, 0.3
+"""Of a waypoint's position [m], and of the time at which it is tapped [s]."""
+
+_HUBER = 3.0
+"""Whitened residuals beyond this many deviations count linearly."""
+
+
+@dataclass(frozen=True, eq=False)
+class LegStream:
+    """An unbroken stretch of levelled IMU with legs between known positions.
+
+    Attributes:
+        name: the recording's.
+        kind: of the positions, "waypoints" or "positions".
+        imu_N: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] in N.
+        facing_N: (N, 2) float32, which way the device faces.
+        start, stop: (M,) of the legs, from the stretch's beginning [s].
+        displacement: (M, 3) of the legs on the map [m]; of waypoints on a level floor.
+        sigma: deviation of each leg's ends (M, 2) [m].
+    """
+
+    name: str
+    kind: str
+    imu_N: NDArray[np.float32]
+    facing_N: NDArray[np.float32]
+    start: FloatArray
+    stop: FloatArray
+    displacement: FloatArray
+    sigma: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.imu_N)
+
+
+def leg_streams(sequence: ImuSequence, min_seconds: float) -> list[LegStream]:
+    """Cut a recording with known positions into unbroken stretches with two legs at least.
+
+    Raises:
+        InputError: it has no known positions, or its rate is not accepted.
+    """
+    if sequence.positions is None:
+        raise InputError(f"{sequence.name}: positions", "none", "positions or waypoints")
+    start, stop, displacement, sigma = _legs(sequence.positions)
+    streams = []
+    for stream in levelled_streams(sequence, min_seconds):
+        begin, end = stream.start, stream.start + len(stream) / WINDOW_RATE
+        inside = (start >= begin) & (stop <= end)
+        if inside.sum() < 2:
+            continue
+        streams.append(
+            LegStream(
+                sequence.name,
+                sequence.positions.kind,
+                stream.imu_N,
+                stream.facing_N,
+                start[inside] - begin,
+                stop[inside] - begin,
+                displacement[inside],
+                sigma[inside],
+            )
+        )
+    return streams
+
+
+def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Start and stop (M,) [s], displacement (M, 3) [m] and the ends' deviations (M, 2) [m]."""
+    time, position = known.time[known.valid], known.position_W[known.valid]
+    if position.shape[1] == 2:
+        position = np.column_stack([position, np.zeros(len(position))])
+    if known.kind == "waypoints":
+        ends = np.arange(len(time))
+        whole = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
+    else:
+        ends = np.searchsorted(time, np.arange(time[0], time[-1], _TRACK_STEP))
+        ends = np.unique(ends)
+        step = np.diff(time)
+        speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
+        broken = np.concatenate([[0], np.cumsum((speed > _FASTEST_STEP) | (step > 0.25))])
+        whole = np.diff(broken[ends]) == 0
+    start, stop = time[ends[:-1]], time[ends[1:]]
+    displacement = np.diff(position[ends], axis=0)
+    speed = np.linalg.norm(displacement, axis=1) / (stop - start)
+    keep = whole & (stop - start >= _SHORTEST_LEG) & (speed <= _FASTEST_LEG)
+    if known.kind == "waypoints":
+        sigma = np.hypot(_TAP_SIGMA, _TAP_TIME * speed)
+    else:
+        sigma = np.full(len(speed), _TRACK_SIGMA)
+    ends_sigma = np.stack([sigma, sigma], axis=1)
+    return start[keep], stop[keep], displacement[keep], ends_sigma[keep]
+
+
+@dataclass(frozen=True, eq=False)
+class LegBatch:
+    """S stretches of K windows with up to M legs each.
+
+    Attributes:
+        windows: (S, K, 6, 200) as the network is shown them.
+        R_NH: (S, K, 3, 3) takes the network's answers to N, the mirror image undone.
+        share: (S, M, K) seconds that a leg and a window have in common.
+        displacement: (S, M, 3) of the legs [m]; zero where there is none.
+        whitening: (S, M, M) takes residuals to ones of unit variance; zero where there is no leg.
+        variance: (S, M) of the legs by their ends alone [m^2].
+        seconds: (S, M) of the legs, 1 where there is none.
+        known: (S, M) whether there is a leg.
+    """
+
+    windows: Tensor
+    R_NH: Tensor
+    share: Tensor
+    displacement: Tensor
+    whitening: Tensor
+    variance: Tensor
+    seconds: Tensor
+    known: Tensor
+
+    def to(self, device: torch.device) -> LegBatch:
+        """The same on another device."""
+        return LegBatch(**{name: value.to(device) for name, value in vars(self).items()})
+
+
+class LegSampler:
+    """Draws stretches of consecutive windows with their legs.
+
+    Args:
+        streams: at least one of `seconds` or more.
+        seconds: windows in a row, K.
+        augmentation: how windows are shown.
+        generator: of all randomness; shared with the sampler of windows with full truth.
+
+    Raises:
+        InputError: no stream is long enough.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[LegStream],
+        seconds: int,
+        augmentation: Augmentation,
+        generator: torch.Generator,
+    ) -> None:
+        self._seconds, self.augmentation = seconds, augmentation
+        self._length = seconds * WINDOW_SAMPLES
+        self._streams = [s for s in streams if len(s) > self._length]
+        if not self._streams:
+            raise InputError("positions", "no stretch long enough", f"one of {seconds} s")
+        lengths = torch.tensor([len(s) - self._length for s in self._streams], dtype=torch.float64)
+        self._cumulative = (lengths / lengths.sum()).cumsum(0)
+        self._lengths = lengths
+        self._generator = generator
+
+    def batch(self, size: int) -> LegBatch:
+        """Stretches that hold two legs each; few that hold less may remain."""
+        drawn = [self._draw() for _ in range(size)]
+        imu_N = torch.from_numpy(np.stack([s.imu_N[o : o + self._length] for s, o in drawn]))
+        facing_N = torch.from_numpy(
+            np.stack([s.facing_N[o : o + self._length : HEADING_STEP] for s, o in drawn])
+        )
+        heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
+        imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
+        shown = show(imu_N, heading, self.augmentation, self._generator, self._seconds)
+        R_NH = shown.R_HW.mT * shown.mirror[:, None, 3:]
+        windows = shown.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
+        return LegBatch(
+            windows.contiguous(), R_NH.view(size, -1, 3, 3), *_padded(drawn, self._seconds)
+        )
+
+    def _draw(self) -> tuple[LegStream, int]:
+        for _ in range(20):
+            uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
+            index = int(torch.searchsorted(self._cumulative, uniform[0]))
+            index = min(index, len(self._streams) - 1)
+            stream, offset = self._streams[index], int(uniform[1] * self._lengths[index])
+            if len(_inside(stream, offset, self._seconds)) >= 2:
+                break
+        return stream, offset
+
+
+def _inside(stream: LegStream, offset: int, seconds: int) -> NDArray[np.int64]:
+    """Legs that lie within a stretch of the stream."""
+    begin = offset / WINDOW_RATE
+    return np.flatnonzero((stream.start >= begin) & (stream.stop <= begin + seconds))
+
+
+def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:
+    """The tensors of a `LegBatch` that tell of the legs."""
+    rows = [_inside(stream, offset, seconds) for stream, offset in drawn]
+    size, most = len(drawn), max(1, *(len(row) for row in rows))
+    share = np.zeros((size, most, seconds))
+    displacement, whitening = np.zeros((size, most, 3)), np.zeros((size, most, most))
+    variance, duration = np.zeros((size, most)), np.ones((size, most))
+    edges = np.arange(seconds)
+    for s, ((stream, offset), legs) in enumerate(zip(drawn, rows, strict=True)):
+        count = len(legs)
+        start = stream.start[legs, None] - offset / WINDOW_RATE
+        stop = stream.stop[legs, None] - offset / WINDOW_RATE
+        overlap = np.minimum(stop, edges + 1.0) - np.maximum(start, edges)
+        share[s, :count] = np.maximum(overlap, 0.0)
+        displacement[s, :count] = stream.displacement[legs]
+        duration[s, :count] = (stop - start)[:, 0]
+        C = ends_covariance(stream.start[legs], stream.stop[legs], stream.sigma[legs])
+        variance[s, :count] = np.diag(C)
+        C += VARIANCE_RATE * np.diag(duration[s, :count])
+        whitening[s, :count, :count] = np.linalg.inv(np.linalg.cholesky(C)) if count else 0.0
+    known = np.arange(most) < np.array([[len(row)] for row in rows])
+    arrays = [share, displacement, whitening, variance, duration]
+    return [torch.from_numpy(a).float() for a in arrays] + [torch.from_numpy(known)]
+
+
+def leg_samplers(
+    config: TrainingConfig, streams: Sequence[LegStream], beside: WindowSampler
+) -> list[tuple[LegSampler, int]]:
+    """A sampler for each kind of weak truth that there is, and how many stretches a step draws.
+
+    Raises:
+        InputError: a kind has no stretch that is long enough.
+        ConfigError: the network remembers earlier windows, which this does not serve.
+    """
+    if streams and config.successive > 1:
+        raise ConfigError("successive", str(config.successive), "1 beside positions or waypoints")
+    kinds = (
+        ("waypoints", config.waypoint_seconds, config.waypoint_stretches),
+        ("positions", config.track_seconds, config.track_stretches),
+    )
+    return [
+        (LegSampler(members, seconds, config.augmentation, beside.generator), stretches)
+        for kind, seconds, stretches in kinds
+        if (members := [stream for stream in streams if stream.kind == kind])
+    ]
+
+
+def ends_covariance(start: FloatArray, stop: FloatArray, sigma: FloatArray) -> FloatArray:
+    """A diag(s^2) A' (M, M) [m^2]: legs that share an end err with opposite signs there.
+
+    Args:
+        start: (M,) of the legs, in order [s].
+        stop: (M,) of them [s].
+        sigma: (M, 2) of their ends [m].
+    """
+    C = np.diag((sigma**2).sum(axis=1))
+    joined = np.flatnonzero(np.abs(stop[:-1] - start[1:]) < 1e-6)
+    common = sigma[joined, 1] * sigma[joined + 1, 0]
+    C[joined, joined + 1] -= common
+    C[joined + 1, joined] -= common
+    return C
+
+
+def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
+    """Residuals (S, M, 3) [m] of displacements (S, K, 3) in N, the map's yaw fitted."""
+    told = torch.einsum("smk,skc->smc", legs.share, displacement_N)
+    a, b = told.detach(), legs.displacement
+    weight = legs.known / legs.seconds
+    real = (weight * (a * b)[..., :2].sum(-1)).sum(1)
+    imaginary = (weight * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(1)
+    psi = torch.atan2(imaginary, real)[:, None]
+    turned = torch.stack(
+        [
+            psi.cos() * told[..., 0] - psi.sin() * told[..., 1],
+            psi.sin() * told[..., 0] + psi.cos() * told[..., 1],
+            told[..., 2],
+        ],
+        dim=-1,
+    )
+    return (turned - b) * legs.known[..., None]
+
+
+def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tuple[Tensor, Tensor]:
+    """Of answers (S, K, 3) [m] and log sigmas (S, K, 3), both as they were shown.
+
+    Returns:
+        the robust whitened loss with the likelihood of the sigmas beside it [m^2], as of windows
+        with full truth, and the mean of |r|^2 / T [m^2/s], horizontal.
+    """
+    displacement_N = (legs.R_NH @ displacement_H[..., None])[..., 0]
+    residual = leg_residuals(displacement_N, legs)
+    count = legs.known.sum().clamp(min=1)
+    white = torch.einsum("smn,snc->smc", legs.whitening, residual).norm(dim=-1)
+    huber = torch.where(white < _HUBER, white**2, _HUBER * (2.0 * white - _HUBER))
+    loss = VARIANCE_RATE * (huber * legs.known).sum() / count
+    variance = torch.exp(2.0 * log_sigma_H[..., :2]).mean(-1)
+    total = torch.einsum("smk,sk->sm", legs.share, variance) + legs.variance
+    squared = (residual.detach()[..., :2] ** 2).sum(-1)
+    total = torch.where(legs.known, total, torch.ones_like(total))
+    likelihood = ((0.5 * squared / total + total.log()) * legs.known).sum() / count
+    plain = (squared / legs.seconds).sum() / count
+    return loss + SIGMA_WEIGHT * likelihood, plain

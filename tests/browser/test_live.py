@@ -1,0 +1,107 @@
+"""The live page draws what phones send, steers the server, and agrees with the file it wrote."""
+
+import importlib.util
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, demonstration
+from stario.fusion.live.run import LiveServer
+from stario.network import load_model
+from stario.sequences import read_recording
+
+from .conftest import DESKTOP, PHONE
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "replay_live.py"
+LAST = "id => { const p = window.stario.devices.get(id)?.points; return p && p[p.length - 1]; }"
+
+
+@pytest.fixture(scope="module")
+def replay():
+    spec = importlib.util.spec_from_file_location("examples_replay_live", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.replay
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    model = load_model()
+    folder = tmp_path_factory.mktemp("live")
+    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    listening = threading.Event()
+    thread = threading.Thread(target=server.run, args=(listening.set,))
+    thread.start()
+    assert listening.wait(60.0)
+    yield server
+    server.stop()
+    thread.join()
+
+
+def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, server, replay):
+    url = f"http://127.0.0.1:{server.port}"
+    shown = show(url)
+    assert shown.page.is_visible("#empty")
+    phones = [
+        threading.Thread(target=replay, args=(demonstration(), f"{url}/data", 10.0, 6.0, name))
+        for name in ("anna <b>", "ben")
+    ]
+    for phone in phones:
+        phone.start()
+    for phone in phones:
+        phone.join()
+    for name in ("anna <b>", "ben"):
+        session = server.hub.sessions[name]
+        end = session.drawn.points[-1]
+        shown.page.wait_for_function(f"([id, t]) => ({LAST})(id)?.[0] >= t", arg=[name, end[0]])
+        track = Navigator(load_model()).run(read_recording(session.path))
+        drawn = shown.page.evaluate(LAST, name)
+        np.testing.assert_allclose(drawn[1:4], track.trajectory.position_W[-1], atol=1e-4)
+        assert shown.page.is_visible(f"[data-device='{name}'] .figures")
+    assert not shown.page.is_visible("#empty")
+    assert not shown.overflows()
+    assert shown.complaints == []
+
+
+def test_buttons_zero_place_and_stop_reach_the_server(show, server, replay):
+    url = f"http://127.0.0.1:{server.port}"
+    replay(demonstration(), f"{url}/data", 10.0, 4.0, "carla")
+    session = server.hub.sessions["carla"]
+    shown = show(url, PHONE)
+    card = shown.page.locator("[data-device=carla]")
+    card.get_by_text("Zero here").click()
+    shown.page.wait_for_function("() => window.stario.devices.get('carla').origin[0] !== 0")
+    np.testing.assert_allclose(session.drawn.origin, session.drawn.points[-1][1:4], atol=1e-3)
+    card.get_by_text("Place on map").click()
+    assert shown.page.is_visible("#tap")
+    before = session.drawn.points[-1][1:3]
+    box = shown.page.locator("#map .nsewdrag").first.bounding_box()
+    shown.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
+    shown.page.wait_for_function("() => window.stario.devices.get('carla').fixes === 1")
+    x, y = np.array(session.drawn.points[-1][1:3]) - before
+    assert x > 0.5
+    assert y > 0.5
+    card.get_by_text("Stop").click()
+    shown.page.wait_for_function("() => !window.stario.devices.get('carla').running")
+    assert not session.running
+    assert not shown.overflows()
+    assert shown.complaints == []
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_page_of_a_server_that_wants_a_token_loads_with_it(show, tmp_path, size):
+    server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0, lines_port=0)
+    listening = threading.Event()
+    thread = threading.Thread(target=server.run, args=(listening.set,))
+    thread.start()
+    assert listening.wait(60.0)
+    try:
+        shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}", size)
+        assert server.token in shown.page.inner_text("#push-url")
+        assert not shown.overflows()
+        assert shown.complaints == []
+    finally:
+        server.stop()
+        thread.join()

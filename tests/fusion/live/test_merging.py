@@ -1,0 +1,106 @@
+"""Sensors with their own clocks become samples at the gyroscope's times, however they arrive."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stario.fusion.live.merging import LONGEST_WAIT, Join, Merger
+from stario.fusion.live.payload import Reading
+
+SECOND = 10**9
+
+
+def linear(sensor: str, rate: float, offset_ns: int, seconds: float = 2.0, slope: float = 1.0):
+    """Readings whose axes are linear in time."""
+    times = [offset_ns + round(k * SECOND / rate) for k in range(int(seconds * rate))]
+    return [
+        Reading(sensor, t, (slope * t / SECOND, 2.0 * t / SECOND, 3.0 - t / SECOND)) for t in times
+    ]
+
+
+def phone(*groups):
+    """Readings as an app sends them: each batch of 0.2 s sensor by sensor."""
+    readings = [r for group in groups for r in group]
+    return sorted(readings, key=lambda r: (r.time_ns // (SECOND // 5), r.sensor))
+
+
+def test_interpolation_is_exact_where_acceleration_is_linear_in_time():
+    gyro = linear("gyroscope", 100, 0)
+    accel = linear("totalacceleration", 61.7, 1_234_567)
+    samples = Merger().add(phone(gyro, accel))
+    assert len(samples) > 190
+    for t, w, f in samples:
+        s = t / SECOND
+        assert w == pytest.approx((s, 2 * s, 3 - s), abs=1e-12)
+        assert f == pytest.approx((s, 2 * s, 3 - s), abs=1e-9)
+
+
+def test_linear_acceleration_and_gravity_are_added_at_common_times():
+    gyro = linear("gyroscope", 100, 0)
+    both = linear("accelerometer", 100, 700_000), linear("gravity", 52, 300_000, slope=5.0)
+    samples = Merger().add(phone(gyro, *both))
+    assert len(samples) > 190
+    for t, _, f in samples:
+        s = t / SECOND
+        assert f == pytest.approx((6 * s, 4 * s, 6 - 2 * s), abs=1e-9)
+
+
+def test_total_acceleration_is_preferred_and_uncalibrated_serves_where_there_is_nothing_else():
+    gyro, raw = linear("gyroscope", 100, 0), linear("gyroscopeuncalibrated", 100, 0, slope=9.0)
+    total = linear("totalacceleration", 100, 0)
+    others = linear("accelerometer", 100, 0, slope=7.0), linear("gravity", 100, 0, slope=7.0)
+    samples = Merger().add(phone(raw, gyro, *others, total))
+    assert samples[100][1:] == (gyro[100].value, total[100].value)
+    samples = Merger().add(phone(raw, linear("accelerometeruncalibrated", 100, 0)))
+    assert samples[100][1] == raw[100].value
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=20))
+def test_batches_of_any_size_give_the_same_samples(sizes):
+    readings = phone(linear("gyroscope", 100, 0), linear("totalacceleration", 80, 1_000_000))
+    whole = Merger().add(readings)
+    merger, samples, begin = Merger(), [], 0
+    cuts = np.cumsum(sizes) * 5
+    for end in [*cuts[cuts < len(readings)].tolist(), len(readings)]:
+        samples += merger.add(readings[begin:end])
+        begin = end
+    assert samples == whole
+
+
+def test_repeated_and_late_readings_are_dropped_and_counted():
+    readings = phone(linear("gyroscope", 100, 0), linear("totalacceleration", 100, 0))
+    merger = Merger()
+    first = merger.add(readings)
+    assert merger.add(readings) == []  # a push that the app sent once more
+    assert merger.dropped == {"late": len(readings)}
+    assert len(first) == 200
+
+
+def test_a_gap_of_the_accelerometer_is_not_interpolated_over():
+    accel = [r for r in linear("totalacceleration", 100, 0) if not 0.5 < r.time_ns / SECOND < 1.0]
+    merger = Merger()
+    times = [t / SECOND for t, _, _ in merger.add(phone(linear("gyroscope", 100, 0), accel))]
+    assert not [t for t in times if 0.505 < t < 0.995]
+    assert merger.dropped["without acceleration"] == pytest.approx(49, abs=1)
+
+
+def test_memory_stays_small_where_the_accelerometer_falls_silent():
+    join = Join()
+    join.add(1, 0, (0.0, 0.0, 9.8))
+    for k in range(1, 20_000):
+        join.add(0, k * SECOND // 100, (0.0, 0.0, 0.0))
+        join.ready()
+    assert len(join._first) <= LONGEST_WAIT // (SECOND // 100) + 1
+    assert join.alone == 19_999 - len(join._first)
+
+
+def test_what_a_device_does_not_send_is_named():
+    merger = Merger()
+    merger.add(linear("gyroscope", 100, 0))
+    assert "acceleration" in merger.missing
+    merger = Merger()
+    merger.add(linear("totalacceleration", 100, 0, seconds=30.0))
+    assert merger.missing == "gyroscope"
+    assert len(merger._waiting) < 600

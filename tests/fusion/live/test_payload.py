@@ -1,0 +1,118 @@
+"""What devices send is read right, or refused with the field that is wrong; never anything else."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stario.fusion.live.payload import Batch, parse_line, parse_push
+from stario.sequences.errors import InputError
+
+PUSH = {
+    "messageId": 7,
+    "sessionId": "s",
+    "deviceId": "d",
+    "payload": [
+        {
+            "name": "gyroscope",
+            "time": 1698501144401773001,
+            "values": {"z": 3, "y": 2.5, "x": 1},
+        },
+        {"name": "gravity", "time": "1698501144401773002", "x": 0, "y": 0, "z": 9.8},
+        {"name": "location", "time": 1, "values": {"latitude": None}},
+    ],
+}
+LINE = {"device": "rig", "t": 12.5, "gyro": [1, 2, 3], "accel": [4, 5, 6]}
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=8,
+)
+
+
+def changed(message: dict, path: tuple, value: object) -> bytes:
+    """The message with one field replaced, as JSON."""
+    copy = json.loads(json.dumps(message))
+    inner = copy
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return json.dumps(copy).encode()
+
+
+def test_push_keeps_every_nanosecond_and_skips_what_no_track_is_made_of():
+    batch = parse_push(json.dumps(PUSH).encode())
+    assert (batch.device, batch.recording) == ("d", "s")
+    gyro, gravity = batch.readings
+    assert (gyro.sensor, gyro.time_ns, gyro.value) == (
+        "gyroscope", 1698501144401773001, (1.0, 2.5, 3.0),
+    )  # fmt: skip
+    assert (gravity.sensor, gravity.time_ns, gravity.value) == (
+        "gravity", 1698501144401773002, (0.0, 0.0, 9.8),
+    )  # fmt: skip
+
+
+def test_line_is_a_sample_of_both_sensors_at_one_time():
+    batch = parse_line(json.dumps(LINE).encode(), "tcp")
+    assert {r.time_ns for r in batch.readings} == {12_500_000_000}
+    assert [r.value for r in batch.readings] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+    nameless = {"t_ns": 7, "accel": [0, 0, 9.8]}
+    batch = parse_line(json.dumps(nameless).encode(), "tcp 10.0.0.1")
+    assert (batch.device, batch.readings[0].time_ns) == ("tcp 10.0.0.1", 7)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "field"),
+    [
+        (("payload",), None, "payload"),
+        (("payload",), {}, "payload"),
+        (("deviceId",), "", "deviceId"),
+        (("deviceId",), None, "deviceId"),
+        (("payload", 0), 5, r"payload\[0\]"),
+        (("payload", 0, "name"), None, r"payload\[0\]\.name"),
+        (("payload", 0, "time"), -1, r"payload\[0\]\.time"),
+        (("payload", 0, "time"), 2**70, r"payload\[0\]\.time"),
+        (("payload", 0, "time"), True, r"payload\[0\]\.time"),
+        (("payload", 0, "values"), [1, 2, 3], r"payload\[0\]\.values"),
+        (("payload", 0, "values", "x"), "1", r"payload\[0\]\.values\.x"),
+        (("payload", 0, "values", "x"), None, r"payload\[0\]\.values\.x"),
+        (("payload", 0, "values", "x"), float("nan"), r"payload\[0\]\.values\.x"),
+        (("payload", 0, "values", "x"), 10**400, r"payload\[0\]\.values\.x"),
+        (("payload", 0, "values", "x"), 1e15, r"payload\[0\]\.values\.x"),
+        (("payload", 1, "time"), 5, "payload: found times"),
+    ],
+)
+def test_what_is_wrong_is_named(path, value, field):
+    with pytest.raises(InputError, match=f"^{field}"):
+        parse_push(changed(PUSH, path, value))
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 10_000, b"null", b"[]", b'"text"']
+)
+def test_no_json_object_is_refused(body):
+    for parse in (parse_push, lambda body: parse_line(body, "x")):
+        with pytest.raises(InputError):
+            parse(body)
+
+
+@given(st.binary() | json_values.map(lambda value: json.dumps(value).encode()))
+def test_anything_else_is_refused_too(body):
+    for parse in (parse_push, lambda body: parse_line(body, "x")):
+        with pytest.raises(InputError):
+            parse(body)
+
+
+PATHS = [("payload", 0, "values", "y"), ("payload", 0, "time"), ("payload", 1), ("deviceId",)]
+
+
+@given(st.sampled_from(PATHS), json_values)
+def test_one_field_replaced_by_anything_is_read_or_refused(path, value):
+    told = ""
+    try:
+        batch = parse_push(changed(PUSH, path, value))
+    except InputError as error:
+        told = str(error)
+    assert (0 < len(told) < 400) or isinstance(batch, Batch)

@@ -1,0 +1,267 @@
+"""The server takes pushes, refuses what is malformed, and draws what `stario run` would find."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from starlette.testclient import TestClient
+
+from stario.fusion import read_fixes
+from stario.fusion.live.hub import MOST_DEVICES, Viewer
+from stario.fusion.live.server import MOST_BYTES, live_app
+from stario.sequences import read_recording
+
+JSON = {"content-type": "application/json"}
+
+
+@pytest.fixture
+def client(hub):
+    with TestClient(live_app(hub), base_url="http://localhost") as client:
+        yield client
+
+
+def command(client, device, name, **content):
+    url = f"/devices/{device}/{name}"
+    return client.post(url, content=json.dumps(content), headers=JSON)
+
+
+def rerun(session, new_navigator):
+    """The track of the recording that a session wrote, with the fixes that it wrote."""
+    fixes = session._file.fixes_path
+    known = read_fixes(fixes) if fixes.exists() else ()
+    return new_navigator().run(read_recording(session.path), fixes=known)
+
+
+def test_drawn_end_is_that_of_the_recording_written(client, hub, pushes, new_navigator, walk):
+    taken = [client.post("/data", content=body).json()["samples"] for body in pushes()]
+    session = hub.sessions["phone"]
+    assert sum(taken) == session.samples == len(walk)
+    track = rerun(session, new_navigator)
+    np.testing.assert_allclose(
+        session.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-5
+    )
+    assert session.drawn.points[-1][0] == pytest.approx(track.time[-1], abs=1e-4)
+    recording = read_recording(session.path)
+    np.testing.assert_array_equal(recording.gyro, walk.gyro)
+    np.testing.assert_allclose(recording.time, walk.time - walk.time[0], atol=1e-9)
+
+
+def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pushes):
+    for body in pushes(seconds=3.0):
+        client.post("/data", content=body)
+    first = hub.sessions["phone"].path
+    for body in pushes(session="two", seconds=3.0):
+        client.post("/data", content=body)
+    session = hub.sessions["phone"]
+    assert session.path != first
+    assert session.samples == 300
+    assert len(read_recording(first)) == len(read_recording(session.path)) == 300
+
+
+def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
+    for offset in (2 * 10**18, 10**18):
+        for body in pushes(session="", offset_ns=offset, seconds=3.0):
+            client.post("/data", content=body)
+    assert hub.sessions["phone"].samples == 300
+
+
+def test_stop_ignores_and_start_begins_anew(client, hub, pushes):
+    bodies = pushes(seconds=6.0)
+    for body in bodies[:15]:
+        client.post("/data", content=body)
+    assert command(client, "phone", "stop").status_code == 200
+    assert client.post("/data", content=bodies[15]).json() == {"samples": 0}
+    session = hub.sessions["phone"]
+    assert session.samples == 300
+    assert command(client, "phone", "start").status_code == 200
+    for body in bodies[16:]:
+        client.post("/data", content=body)
+    assert session.samples == 280
+
+
+def test_zero_moves_what_is_drawn_and_not_the_estimate(client, hub, pushes, new_navigator):
+    bodies = pushes(seconds=8.0)
+    for body in bodies[:30]:
+        client.post("/data", content=body)
+    session = hub.sessions["phone"]
+    command(client, "phone", "zero")
+    at = session.drawn.points[-1][1:4]
+    np.testing.assert_allclose(session.status()["origin"], at, atol=1e-3)
+    for body in bodies[30:]:
+        client.post("/data", content=body)
+    end = rerun(session, new_navigator).trajectory.position_W[-1]
+    np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-5)
+
+
+def test_fixes_by_tap_move_and_turn_the_whole_drawn_track(client, hub, pushes, new_navigator):
+    bodies = pushes()
+    for body in bodies[:20]:
+        client.post("/data", content=body)
+    session = hub.sessions["phone"]
+    shape = np.array(session.drawn.points)[:, 1:3]
+    assert command(client, "phone", "fix", x=50.0, y=-20.0, sigma=0.1).status_code == 200
+    moved = np.array(session.drawn.points)[: len(shape), 1:3]
+    np.testing.assert_allclose(session.drawn.points[-1][1:3], [50.0, -20.0], atol=0.2)
+    np.testing.assert_allclose(moved - moved[0], shape - shape[0], atol=1e-4)
+    for body in bodies[20:90]:
+        client.post("/data", content=body)
+    walked = np.array(session.drawn.points[-1][1:3]) - [50.0, -20.0]
+    assert np.linalg.norm(walked) > 5.0
+    turned = [50.0 - walked[1], -20.0 + walked[0]]  # by a quarter to the left
+    command(client, "phone", "fix", x=turned[0], y=turned[1], sigma=0.1)
+    np.testing.assert_allclose(session.drawn.points[-1][1:3], turned, atol=0.5)
+    start = np.array(session.drawn.points[len(shape) // 2][1:3])
+    before = moved[len(shape) // 2] - [50.0, -20.0]
+    np.testing.assert_allclose(start - [50.0, -20.0], [-before[1], before[0]], atol=0.6)
+    for body in bodies[90:]:
+        client.post("/data", content=body)
+    end = rerun(session, new_navigator).trajectory.position_W[-1]
+    np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-3)
+    assert session.fixes == 2
+
+
+def test_apples_sign_and_g_are_turned_as_the_address_says(client, hub, pushes, walk):
+    for body in pushes(seconds=3.0):
+        message = json.loads(body)
+        for entry in message["payload"]:
+            if entry["name"] == "totalacceleration":
+                entry["values"] = {k: -v / 9.80665 for k, v in entry["values"].items()}
+        client.post("/data?accel_unit=-g", content=json.dumps(message))
+    recording = read_recording(hub.sessions["phone"].path)
+    np.testing.assert_allclose(recording.accel, walk.accel[:300], atol=1e-12)
+
+
+def test_a_wrong_unit_is_told_on_the_page_and_the_samples_are_kept(client, hub, pushes):
+    for body in pushes(seconds=3.0):
+        client.post("/data?accel_unit=g", content=body)
+    session = hub.sessions["phone"]
+    assert "m/s^2" in session.status()["problem"]
+    assert len(read_recording(session.path)) == 300
+
+
+BAD = st.one_of(
+    st.binary(max_size=60),
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+        max_leaves=5,
+    ).flatmap(
+        lambda junk: st.sampled_from(
+            [
+                junk,
+                {"deviceId": "phone", "payload": junk},
+                {"deviceId": "phone", "payload": [{"name": "gravity", "time": 1, "values": junk}]},
+                {"deviceId": "phone", "payload": [{"name": "gyroscope", "time": junk}]},
+                {"deviceId": junk, "payload": [{"name": "gravity", "values": {}}]},
+            ]
+        )
+    ).map(lambda value: json.dumps(value).encode()),
+)  # fmt: skip
+
+
+def test_a_thousand_malformed_pushes_leave_a_replay_as_it_is(client, hub, pushes, walk, tmp_path):
+    bodies = iter(pushes())
+    sent, refused = [], []
+
+    @settings(
+        max_examples=1000, deadline=None, database=None, derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(BAD)
+    def push(bad):
+        answer = client.post("/data", content=bad)
+        refused.append(answer.status_code)
+        if answer.status_code == 400:
+            assert answer.json()["error"]
+        else:  # a payload that is empty is none to refuse
+            assert answer.json() == {"samples": 0}
+        if len(refused) % 10 == 0 and (body := next(bodies, None)) is not None:
+            sent.append(client.post("/data", content=body).json()["samples"])
+
+    push()
+    for body in bodies:
+        sent.append(client.post("/data", content=body).json()["samples"])
+    assert len(refused) >= 1000
+    assert sum(sent) == len(walk)
+    assert list(hub.sessions) == ["phone"]
+    undisturbed = hub._new_navigator()
+    for row in zip(walk.time - walk.time[0], walk.gyro, walk.accel, strict=True):
+        undisturbed.push(*row)
+    end = hub.sessions["phone"].drawn.points[-1][1:4]
+    np.testing.assert_allclose(end, undisturbed.state.p_W, atol=1e-5)
+
+
+def test_too_large_too_many_and_elsewhere_are_refused(client, hub, pushes):
+    answer = client.post("/data", content=b" " * (MOST_BYTES + 1))
+    assert (answer.status_code, "bytes" in answer.json()["error"]) == (400, True)
+    body = pushes(seconds=0.2)[0]
+    for k in range(MOST_DEVICES):
+        client.post("/data", content=body.replace(b"phone", b"phone%d" % k))
+    answer = client.post("/data", content=body.replace(b"phone", b"another"))
+    assert (answer.status_code, "at most" in answer.json()["error"]) == (400, True)
+    assert client.get("/data").status_code == 405
+    foreign = client.post("/data", content=body, headers={"origin": "http://evil.example"})
+    assert foreign.status_code == 400
+    assert client.get("/", headers={"host": "evil.example"}).status_code == 400
+    assert command(client, "nobody", "stop").status_code == 400
+    assert command(client, "phone1", "explode").status_code == 400
+    assert command(client, "phone1", "zero").status_code == 400  # no position yet
+    for values in ({}, {"x": 1, "y": None, "sigma": 1}, {"x": 1, "y": 1, "sigma": 0}):
+        assert command(client, "phone1", "fix", **values).status_code == 400
+
+
+def test_off_loopback_nothing_goes_without_the_token(hub, pushes):
+    body = pushes(seconds=0.2)[0]
+    with TestClient(live_app(hub, "secret"), base_url="http://192.168.0.2:8000") as client:
+        for answer in (
+            client.get("/"),
+            client.get("/events"),
+            client.get("/plotly.js"),
+            client.post("/data", content=body),
+            client.post("/data?token=secre", content=body),
+            command(client, "phone", "stop"),
+        ):
+            assert answer.status_code == 401
+        assert hub.sessions == {}
+        assert client.post("/data?token=secret", content=body).status_code == 200
+        bearer = {"authorization": "Bearer secret"}
+        client.cookies.clear()
+        assert client.post("/data", content=body, headers=bearer).status_code == 200
+        assert client.get("/").status_code == 401
+        assert client.get("/?token=secret").status_code == 200
+        assert client.get("/live.js").status_code == 200  # by the cookie that the page set
+
+
+def test_viewers_are_sent_what_is_new_and_all_of_it_after_a_change(client, hub, pushes):
+    bodies = pushes(seconds=6.0)
+    for body in bodies[:15]:
+        client.post("/data", content=body)
+    viewer = Viewer(hub)
+    (first,) = viewer.message()["devices"]
+    assert first["fresh"]
+    assert viewer.message()["devices"][0]["points"] == []
+    for body in bodies[15:]:
+        client.post("/data", content=body)
+    (second,) = viewer.message()["devices"]
+    assert not second["fresh"]
+    assert first["points"] + second["points"] == hub.sessions["phone"].drawn.points
+    command(client, "phone", "fix", x=5, y=5, sigma=1)
+    (third,) = viewer.message()["devices"]
+    assert third["fresh"]
+    assert third["points"] == hub.sessions["phone"].drawn.points
+
+
+def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, monkeypatch):
+    from stario.fusion.live import session as module
+
+    monkeypatch.setattr(module, "MOST_POINTS", 50)
+    drawn, navigator = module.Drawn(), new_navigator()
+    for k in range(800):
+        state = navigator.push(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+        if state is not None:
+            drawn.add(state)
+            assert len(drawn.points) <= 50
+    assert drawn.revision >= 1
+    assert drawn.points[-1][0] == pytest.approx(navigator.state.time)

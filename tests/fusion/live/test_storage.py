@@ -1,0 +1,93 @@
+"""A live recording can be read at any moment, whatever became of the program that wrote it."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+
+import numpy as np
+import pytest
+
+from stario.fusion.live.storage import LiveFile
+from stario.sequences import read_recording
+
+SAMPLES = [
+    (10**18 + k * 10**7, (0.1 * k, 1 / 3, -2e-5), (1 / 7, 0.01 * k, 9.80665)) for k in range(40)
+]
+
+
+def test_recording_reads_back_to_the_bit_while_it_is_open(tmp_path):
+    file = LiveFile(tmp_path / "new", "my phone/..\\x")
+    file.append(SAMPLES[:15], 1.7e9)
+    file.append(SAMPLES[15:], 1.7e9)
+    recording = read_recording(file.path)
+    np.testing.assert_array_equal(recording.gyro, [g for _, g, _ in SAMPLES])
+    np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES])
+    np.testing.assert_array_equal(recording.time, [k * 10**7 / 1e9 for k in range(40)])
+    assert file.path.parent == tmp_path / "new"
+    file.close()
+
+
+def test_recordings_of_one_second_do_not_overwrite_each_other(tmp_path):
+    files = [LiveFile(tmp_path, "phone") for _ in range(3)]
+    assert len({file.path for file in files}) == 3
+    for file in files:
+        file.close()
+
+
+def test_recording_cut_at_any_byte_keeps_every_whole_sample(tmp_path, caplog):
+    file = LiveFile(tmp_path, "phone")
+    file.append(SAMPLES, 1.7e9)
+    file.close()
+    content = file.path.read_bytes()
+    caplog.set_level(logging.ERROR)
+    third = content.index(b"\n", content.index(b"\n", content.index(b"\n") + 1) + 1)
+    last = content[:-1].rindex(b"\n")
+    for cut in [*range(third, third + 200), *range(last - 90, len(content))]:
+        file.path.write_bytes(content[:cut])
+        whole = content[:cut].count(b"\n") - 1
+        recording = read_recording(file.path)
+        # Beyond the last column's comma all data of the line are there.
+        assert len(recording) - whole in (0, 1)
+        np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES[: len(recording)]])
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
+def test_a_killed_server_leaves_all_that_it_acknowledged(tmp_path, pushes):
+    command = "from stario.fusion.commands.cli import main; main()"
+    options = ["live", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
+    ) as server:
+        watchdog = threading.Timer(120.0, server.kill)
+        watchdog.start()
+        lines = [server.stderr.readline() for _ in range(2)]
+        url = lines[1].split()[-1]
+        acknowledged = 0
+        for body in pushes(seconds=4.0):
+            request = urllib.request.Request(url, body, {"content-type": "application/json"})
+            with urllib.request.urlopen(request) as answer:
+                acknowledged += json.load(answer)["samples"]
+        sender = threading.Thread(target=_push_on, args=(url, pushes(seconds=8.0)[20:]))
+        sender.start()
+        time.sleep(0.3)
+        os.kill(server.pid, signal.SIGKILL)
+        watchdog.cancel()
+        sender.join()
+    (path,) = tmp_path.glob("*.csv")
+    recording = read_recording(path)
+    assert len(recording) >= acknowledged >= 380
+    assert (np.diff(recording.time) > 0).all()
+
+
+def _push_on(url, bodies):
+    for body in bodies:
+        try:
+            urllib.request.urlopen(urllib.request.Request(url, body), timeout=5).close()
+        except OSError:
+            return
