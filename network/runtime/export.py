@@ -13,19 +13,21 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from stario.network.card import Card, dump_card, parse_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.model import DisplacementModel
 from stario.network.runtime.engines import OnnxEngine
 from stario.network.runtime.graph_form import graph_form
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
 
 CARD_KEY = "stario_card"
 """Of the metadata that holds the card as JSON."""
@@ -70,12 +72,11 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
         file.write(graph.SerializeToString())
 
 
-def load_onnx(path: Path, threads: int | None = None) -> tuple[OnnxEngine, Card]:
-    """The engine and the card of an exported file.
+def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
+    """The engine and the card of an exported file, on as many threads as PyTorch uses.
 
     Args:
         path: written by `export_onnx`.
-        threads: of ONNX Runtime; as many as PyTorch uses unless given.
 
     Raises:
         InputError: the extra `onnx` is not installed.
@@ -85,7 +86,7 @@ def load_onnx(path: Path, threads: int | None = None) -> tuple[OnnxEngine, Card]
     if not path.is_file():
         raise WeightsError(path, "file", "nothing there", "an exported model")
     options = runtime.SessionOptions()
-    options.intra_op_num_threads = threads or torch.get_num_threads()
+    options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
     try:
         session = runtime.InferenceSession(
