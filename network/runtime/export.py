@@ -13,19 +13,21 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from stario.network.card import Card, dump_card, parse_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.model import DisplacementModel
 from stario.network.runtime.engines import OnnxEngine
 from stario.network.runtime.graph_form import graph_form
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
 
 CARD_KEY = "stario_card"
 """Of the metadata that holds the card as JSON."""
