@@ -108,10 +108,9 @@ class EkfBackend:
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """The filter's states."""
-        estimator = filtered.estimator
-        transforms, prior = estimator.frames.transforms, estimator.gyro_prior
-        states = in_last_frame(nav_states(filtered.estimates, prior), transforms)
-        smoothed = smoothed_track(smoothed_poses(filtered.clones, prior), transforms)
+        transforms = filtered.estimator.frames.transforms
+        states = in_last_frame(nav_states(filtered.estimates), transforms)
+        smoothed = smoothed_track(smoothed_poses(filtered.clones), transforms)
         return Solution(states, smoothed, [])
 
 
@@ -126,13 +125,10 @@ class GraphBackend:
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """The whole optimised at once; the filter's states where that is not determined."""
-        estimator = filtered.estimator
-        transforms, wide = estimator.frames.filter_transforms, nav_states(filtered.estimates)
-        expected = estimator.expected_gyro_bias()
-        own = in_last_frame(wide, transforms)
-        whole = smooth(own, wide[0], filtered.measurements, transforms, config, expected)
-        states = EkfBackend().solve(filtered, config).states if whole.fell_back else whole.states
-        return Solution(states, None, [whole.note])
+        transforms, states = filtered.estimator.frames.transforms, nav_states(filtered.estimates)
+        own = in_last_frame(states, transforms)
+        whole = smooth(own, states[0], filtered.measurements, transforms, config)
+        return Solution(own if whole.fell_back else whole.states, None, [whole.note])
 
 
 BACKENDS: dict[str, Backend] = {"ekf": EkfBackend(), "graph": GraphBackend()}

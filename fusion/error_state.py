@@ -18,9 +18,6 @@ CORE = 15
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
-GYRO_BIAS = slice(9, 12)
-"""d_bg in the error state of a navigation state."""
-
 
 def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
     """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from stario.sequences.simulation.imu import PHONE_IMU as PHONE_IMU
     from stario.sequences.simulation.imu import ImuErrors as ImuErrors
     from stario.sequences.simulation.imu import simulate_imu as simulate_imu
+    from stario.sequences.simulation.magnetometer import INDOOR_FIELD as INDOOR_FIELD
+    from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
     from stario.sequences.simulation.walks import WalkStyle as WalkStyle
     from stario.sequences.simulation.walks import generate_walk as generate_walk
     from stario.sequences.units import with_units as with_units
@@ -41,10 +43,12 @@ if TYPE_CHECKING:
 _MODULES = {
     "ConfigError": "errors",
     "GOOD_IMU": "simulation.imu",
+    "INDOOR_FIELD": "simulation.magnetometer",
     "ImuErrors": "simulation.imu",
     "ImuNoise": "noise",
     "ImuSequence": "sequence",
     "InputError": "errors",
+    "MagneticField": "simulation.magnetometer",
     "Magnetometer": "sequence",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
@@ -73,5 +77,40 @@ _MODULES = {
     "write_tum": "files",
 }
 
-__all__ = [*_MODULES]
+__all__ = [
+    "GOOD_IMU",
+    "INDOOR_FIELD",
+    "PERFECT_IMU",
+    "PHONE_IMU",
+    "STANDARD_GRAVITY",
+    "ConfigError",
+    "ImuErrors",
+    "ImuNoise",
+    "ImuSequence",
+    "InputError",
+    "MagneticField",
+    "Magnetometer",
+    "PositionTrack",
+    "ReadError",
+    "Skipped",
+    "StarioError",
+    "Trajectory",
+    "WalkStyle",
+    "WeightsError",
+    "align",
+    "check_units",
+    "evaluate_track",
+    "find_recordings",
+    "generate_walk",
+    "inspect_recording",
+    "position_nees",
+    "read_recording",
+    "read_tum",
+    "simulate_imu",
+    "with_conventions",
+    "with_units",
+    "world_streams",
+    "write_csv",
+    "write_tum",
+]
 __getattr__ = lazy_attributes("stario.sequences", _MODULES)

@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
+from stario.sequences.magnetic import MagneticFindings, judge_magnetometer
 from stario.sequences.sequence import (
     GAP_STEPS,
     STANDARD_GRAVITY,
@@ -87,6 +88,7 @@ class Inspection:
         fit: between truth and gyroscope, None where they cannot be compared.
         problems: what is wrong, one line each, with what mends it.
         truth: what is known of the true track, in words.
+        magnetic: the magnetometer's, None without one or where there is too little of it.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Inspection:
     fit: TruthFit | None
     problems: tuple[str, ...]
     truth: str = "none"
+    magnetic: MagneticFindings | None = None
 
     def as_dict(self) -> dict[str, object]:
         """The findings as plain values, units in the names."""
@@ -143,6 +146,7 @@ class Inspection:
                 "axes": fit.axes(),
             },
             "known_of_truth": self.truth,
+            "magnetometer": self.magnetic and self.magnetic.as_dict(),
             "problems": list(self.problems),
         }
 
@@ -153,6 +157,7 @@ class Inspection:
             f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
+            *(self.magnetic.lines() if self.magnetic else []),
             *self._truth_lines(),
             *(f"! {problem}" for problem in self.problems or ()),
             *([] if self.problems else ["units, signs and axes: nothing wrong was found"]),
@@ -237,6 +242,8 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
                 problems.append(f"{sequence.name}: truth against gyroscope: {error}")
     if fit is not None:
         problems += _fit_problems(sequence.name, fit, " ".join(problems))
+    magnetic = _magnetic(sequence)
+    problems += magnetic.problems if magnetic else ()
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, int((~finite).sum())),
@@ -247,12 +254,20 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         fit=fit,
         problems=tuple(problems),
         truth=sequence.truth_words(),
+        magnetic=magnetic,
     )
 
 
 def _rest(sequence: ImuSequence) -> Rest | None:
     try:
         return find_rest(sequence)
+    except InputError:  # a rate that `check_units` has named already
+        return None
+
+
+def _magnetic(sequence: ImuSequence) -> MagneticFindings | None:
+    try:
+        return judge_magnetometer(sequence)
     except InputError:  # a rate that `check_units` has named already
         return None
 

@@ -1,5 +1,6 @@
 """What is installed is what is in the tree."""
 
+import importlib
 import subprocess
 import sys
 import tomllib
@@ -18,6 +19,18 @@ def test_every_package_of_the_tree_is_listed():
         for p in (ROOT / folder).rglob("__init__.py")
     }
     assert found == set(PROJECT["tool"]["setuptools"]["packages"])
+
+
+@pytest.mark.parametrize("package", ["fusion", "network", "sequences"])
+def test_what_a_package_offers_is_what_it_names(package):
+    module = importlib.import_module(f"stario.{package}")
+    assert set(module.__all__) == set(module._MODULES)
+
+
+def test_the_readme_of_sequences_names_every_public_name():
+    text = (ROOT / "sequences/README.md").read_text()
+    names = importlib.import_module("stario.sequences").__all__
+    assert not [name for name in names if f"`{name}" not in text]
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -82,6 +82,8 @@ def _run(
     told: bool,
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
+    import numpy as np
+
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
@@ -112,7 +114,8 @@ def _run(
     if not told:
         return record
     way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
-    typer.echo(f"{way} travelled by the estimate")
+    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
+    typer.echo(f"{way} travelled by the estimate, which ends {ends:.1f} m from its start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     elif sequence.positions is not None:

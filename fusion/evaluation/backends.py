@@ -68,9 +68,7 @@ def score_walk(seed: int, seconds: float) -> Score:
         update_rate=1,
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
-        gyro_corrected=0.0,
         accel_bias_sigma=errors.accel_turn_on,
-        accel_motion_noise=0.0,
     )
     config = NavigatorConfig(noise=errors.noise, filter=known)
     walk = generate_walk(seed, seconds)

@@ -89,9 +89,7 @@ def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, Na
     known = FilterConfig(
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
-        gyro_corrected=0.0,
         accel_bias_sigma=errors.accel_turn_on,
-        accel_motion_noise=0.0,
     )
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
     return sequence, NavigatorConfig(noise=noise, filter=known)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.fusion.error_state import CLONE, CORE, GYRO_BIAS, plain_covariance
+from stario.fusion.error_state import CLONE, CORE, plain_covariance
 from stario.fusion.filter.estimate import Estimate
 from stario.fusion.lie import FloatArray, skew
 from stario.sequences.errors import InputError
@@ -118,7 +118,7 @@ class EkfState:
     def estimate(self, in_gap: bool = False, map_frame: int = 0) -> Estimate:
         """The current pose and biases."""
         P = self.P[:CORE, :CORE]
-        return self._estimate(self.time, self.X[0], P, P[:, GYRO_BIAS], in_gap, map_frame)
+        return self._estimate(self.time, self.X[0], P, in_gap, map_frame)
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
         """A clone as it is known now.
@@ -129,7 +129,7 @@ class EkfState:
         time, first = self.time_of_clone(slot), CORE + CLONE * slot
         rows = self.P[first : first + CLONE]
         X, P = self.X[1 + slot][:, _CLONE_COLUMNS], rows[:, first : first + CLONE]
-        return self._estimate(time, X, P, rows[:, GYRO_BIAS], False, map_frame)
+        return self._estimate(time, X, P, False, map_frame)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Every pose in another frame: p <- R p + shift, likewise attitude and velocity.
@@ -177,16 +177,9 @@ class EkfState:
         return replace(self, P=self.P + sigma**2 * (N @ N.T))
 
     def _estimate(
-        self,
-        time: float,
-        X: FloatArray,
-        P: FloatArray,
-        P_g: FloatArray,
-        in_gap: bool,
-        map_frame: int,
+        self, time: float, X: FloatArray, P: FloatArray, in_gap: bool, map_frame: int
     ) -> Estimate:
-        P_gg, b_g, b_a = self.P[GYRO_BIAS, GYRO_BIAS], self.b_g, self.b_a
-        return Estimate(time, X, self.origin_W, b_g, b_a, P, P_g, P_gg, in_gap, map_frame)
+        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
 
     def _poses(self) -> list[tuple[int, int]]:
         """First rows of theta and rho_p of the current pose and of every clone."""

@@ -14,7 +14,6 @@ import numpy as np
 from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.engine import GateMode
 from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
@@ -22,13 +21,11 @@ from stario.fusion.filter.estimator_state import (
     IntervalMeasurements,
     Step,
 )
-from stario.fusion.filter.gyro_prior import GyroPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
     counted,
     innovation_row,
-    is_gated,
     stacked,
 )
 from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
@@ -63,7 +60,7 @@ class Estimator:
             last second is, since fixes may come late.
 
     Attributes:
-        ekf: the filter, by the wide one of the gyroscope's two priors (`gyro_prior`).
+        ekf: the filter.
         oldest: the newest pose that left the window, corrected by all of it; None at first.
         in_gap: whether the last interval had no samples.
     """
@@ -78,16 +75,14 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.gyro_prior = GyroPrior(config, start.time)
         oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
-        self._map_frame = MapFrame(prior is not None, oriented, f.gate, self.gyro_prior)
+        self._map_frame = MapFrame(prior is not None, oriented, f.gate)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
-        self._gated_since: float | None = None
         self.in_gap = False
         self._history: tuple[Step, ...] = ()
         self.oldest: Estimate | None = None
@@ -191,14 +186,12 @@ class Estimator:
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
         if not self._stillness.is_still(interval):
             return None
-        measured = zero_velocity(self._stillness, self._config.noise)
+        measured = zero_velocity(self._stillness)
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
             return None
-        # A filter that agrees with rest is not lost, whatever was left out before.
-        self._gated_since = None
         return measured
 
     def _update_displacement(
@@ -216,20 +209,11 @@ class Estimator:
                 R_WN @ d_N,
                 R_WN @ (covariance_N * f.overlap_scale) @ R_WN.T,
                 chi2_quantile(f.gate, 3),
-                self._gate_mode(interval.stop),
             )
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
-        if not is_gated(result):
-            self._gated_since = self._gated_since if result.reason else None
-        elif self._gated_since is None:
-            self._gated_since = interval.stop
         return (d_N, result.scale * covariance_N) if result.accepted else None
-
-    def _gate_mode(self, time: float) -> GateMode:
-        since = time if self._gated_since is None else self._gated_since
-        return "reject" if time - since < self._config.filter.gate_seconds else "inflate"
 
     def _clone(self) -> None:
         if len(self._clones) == self.ekf.slots:
@@ -243,7 +227,7 @@ class Estimator:
         """No displacement spans a gap: its clones are of no more use."""
         for slot in self._clones:
             self.ekf.release(slot)
-        self._clones, self._gated_since = (), None
+        self._clones = ()
 
     # --- what it knows ---------------------------------------------------------------------------
 
@@ -256,7 +240,6 @@ class Estimator:
             self._map_frame.state,
             self._stillness.window,
             self._counts,
-            self._gated_since,
             self.in_gap,
             self.oldest,
             self._history,
@@ -266,8 +249,8 @@ class Estimator:
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._counts, self._gated_since = s.counts, s.gated_since
-        self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
+        self._counts, self.in_gap, self.oldest = s.counts, s.in_gap, s.oldest
+        self._history = s.history
 
     @property
     def time(self) -> float:
@@ -292,25 +275,15 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`oldest` as callers get it."""
-        return smoothed_poses([self.oldest], self.gyro_prior)[0] if self.oldest else None
+        return smoothed_poses([self.oldest])[0] if self.oldest else None
 
     def estimate(self) -> Estimate:
-        """The filter's newest state, by the wide one of the gyroscope's priors."""
+        """The filter's newest state."""
         return self.ekf.state.estimate(self.in_gap, self.map_frame)
 
     def nav_state(self) -> NavState:
-        """The newest state, by both of them."""
-        return nav_states([self.estimate()], self.gyro_prior)[0]
-
-    def filtered(self) -> NavState:
-        """The newest state, by the wide one."""
+        """The newest state as callers get it."""
         return nav_states([self.estimate()])[0]
-
-    def expected_gyro_bias(self) -> FloatArray | None:
-        """Covariance (3, 3) to which the bias is expected to be zero beside the wide prior."""
-        now = self.estimate()
-        posterior = self.gyro_prior.posterior(np.array(now.time), now.b_g, now.P_gg)
-        return None if posterior is None else self.gyro_prior.covariance(float(posterior.weight))
 
     def innovations(self) -> Innovations:
         """Every innovation so far."""

@@ -56,7 +56,6 @@ class EstimatorState:
         map_frame: where the fixes' frame lies.
         stillness: the last second's sums (`StillnessDetector`).
         counts: what became of the updates.
-        gated_since: time from which on displacements were outliers [s].
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
         history: the steps of the last second of a stream.
@@ -67,7 +66,6 @@ class EstimatorState:
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
     counts: UpdateCounts
-    gated_since: float | None
     in_gap: bool
     oldest: Estimate | None
     history: tuple[Step, ...] = ()

@@ -78,7 +78,7 @@ def reinitialise(
     turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
     drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
     covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
-    # What both priors of the gyroscope say of the position hangs on this.
+    # Where the track is hangs on the bias that led there.
     covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
     yaw = yaw_twist(s.R_WB)
     turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))

@@ -10,17 +10,12 @@ of this shift or turn, then the fix is an ordinary measurement (README.md, "Fixe
 
 Behind a gap in which the direction was lost the same holds of the track from there on: the next
 position places it, the next direction turns it, and what was before the gap stays where it is.
-
-The filter knows the wide one of the gyroscope's two priors, callers see both (`gyro_prior`): two
-tracks that a drifting yaw may lead far apart until a fix brings them together. So a transform is
-two, one for the states that the filter holds and one for those given out, which also decide whether
-the direction is known.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,7 +24,6 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimate import nav_states
 from stario.fusion.filter.frame_transform import FrameTransform
-from stario.fusion.filter.gyro_prior import GyroPrior
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import FloatArray, exp_so3
 from stario.fusion.state import NavState
@@ -49,8 +43,6 @@ _MUCH_LARGER, _LARGEST = 1e3, 1e5
 """An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
 beyond, the covariance keeps no digits for the fix."""
 
-_ORIGINS = (np.zeros(3), np.zeros(3))
-
 
 @dataclass(frozen=True, eq=False)
 class MapFrameState:
@@ -60,16 +52,14 @@ class MapFrameState:
         placed: whether the track's position in it is known.
         oriented: whether its yaw is.
         transforms: of the states given out.
-        filter_transforms: of the states as the filter holds them; as many.
-        pivots: (3,) each, about which the filter's track and the one given out may be turned [m].
+        pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
     """
 
     placed: bool
     oriented: bool
     transforms: tuple[FrameTransform, ...] = ()
-    filter_transforms: tuple[FrameTransform, ...] = ()
-    pivots: tuple[FloatArray, FloatArray] = _ORIGINS
+    pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
 
 
@@ -80,86 +70,60 @@ class MapFrame:
         placed: whether the first position was given.
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
-        prior: by which the filter's states are given out.
 
     Attributes:
         state: what is known of the frame.
     """
 
-    def __init__(self, placed: bool, oriented: bool, gate: float, prior: GyroPrior) -> None:
+    def __init__(self, placed: bool, oriented: bool, gate: float) -> None:
         self.state = MapFrameState(placed, oriented)
-        self._gate, self._prior = gate, prior
+        self._gate = gate
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         """Take in a fix at the filter's time."""
         if fix.kind == "position" and not self.state.placed:
-            transforms = self._place(ekf, fix)
+            transform: FrameTransform | None = self._place(ekf, fix)
         elif self.state.oriented:
             return self._update(ekf, fix)
         else:
-            transforms = self._orient(ekf, fix)
-        if not transforms:
+            transform = self._orient(ekf, fix)
+        if transform is None:
             return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known")
         result = self._update(ekf, fix)
-        own, seen = (
-            self._with_uncertainty(transform, state)
-            for transform, state in zip(transforms, self._nav_states(ekf), strict=True)
-        )
-        s = self.state
-        self.state = replace(
-            s,
-            filter_transforms=(*s.filter_transforms, own),
-            transforms=(*s.transforms, seen),
-        )
+        done = self._with_uncertainty(transform, _nav_state(ekf))
+        self.state = replace(self.state, transforms=(*self.state.transforms, done))
         return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
-        if not self.state.oriented:
-            return
-        own, seen = self._nav_states(ekf)
-        if seen.covariance[2, 2] > KNOWN_YAW**2:
+        now = _nav_state(ekf)
+        if self.state.oriented and now.covariance[2, 2] > KNOWN_YAW**2:
             self.state = replace(
-                self.state,
-                placed=False,
-                oriented=False,
-                pivots=(own.p_W, seen.p_W),
-                since=ekf.state.time,
+                self.state, placed=False, oriented=False, pivot=now.p_W, since=now.time
             )
 
-    def _nav_states(self, ekf: StateCloningEkf) -> list[NavState]:
-        """The newest state as the filter holds it, and as it is given out."""
-        now = ekf.state.estimate()
-        return [*nav_states([now]), *nav_states([now], self._prior)]
-
-    def _place(self, ekf: StateCloningEkf, fix: Fix) -> list[FrameTransform]:
-        since = self.state.since
-        transforms = [
-            FrameTransform(fix.time, np.eye(3), fix.value - s.p_W, fix.value, True, since)
-            for s in self._nav_states(ekf)
-        ]
-        ekf.state = ekf.state.transformed(np.eye(3), transforms[0].shift)
+    def _place(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform:
+        now, since = _nav_state(ekf), self.state.since
+        transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
+        ekf.state = ekf.state.transformed(np.eye(3), transform.shift)
         left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
         sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
         ekf.state = ekf.state.with_position_inflated(sigma)
-        self.state = replace(self.state, placed=True, pivots=(fix.value, fix.value))
-        return transforms
+        self.state = replace(self.state, placed=True, pivot=fix.value)
+        return transform
 
-    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> list[FrameTransform]:
-        """Empty where the fix does not tell the direction."""
-        pivots, since = self.state.pivots, self.state.since
-        states = zip(self._nav_states(ekf), pivots, strict=True)
-        turns, sigmas = zip(*(_turn(s, pivot, fix) for s, pivot in states), strict=True)
-        if not (np.isfinite(turns).all() and (sigmas[1] < FAR_ENOUGH or fix.kind == "yaw")):
-            return []
-        transforms = []
-        for turn, pivot in zip(turns, pivots, strict=True):
-            R = exp_so3(np.array([0.0, 0.0, turn]))
-            transforms.append(FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since))
-        moved = ekf.state.transformed(transforms[0].R, transforms[0].shift)
-        ekf.state = moved.with_yaw_inflated(pivots[0], UNKNOWN_YAW)
+    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
+        """None where the fix does not tell the direction."""
+        pivot, since = self.state.pivot, self.state.since
+        turn, sigma = _turn(_nav_state(ekf), pivot, fix)
+        if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "yaw")):
+            return None
+        R = exp_so3(np.array([0.0, 0.0, turn]))
+        transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since)
+        moved = ekf.state.transformed(transform.R, transform.shift)
+        ekf.state = moved.with_yaw_inflated(pivot, UNKNOWN_YAW)
         self.state = replace(self.state, oriented=True)
-        return transforms
+        return transform
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
         """A transform with what is not known of it, by the state behind it."""
@@ -177,6 +141,10 @@ class MapFrame:
         if fix.kind == "velocity":
             return ekf.update_velocity_W(fix.value, fix.covariance, gate)
         return ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+
+
+def _nav_state(ekf: StateCloningEkf) -> NavState:
+    return nav_states([ekf.state.estimate()])[0]
 
 
 def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:

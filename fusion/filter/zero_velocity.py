@@ -17,9 +17,11 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import FloatArray
-from stario.sequences.noise import ImuNoise
 from stario.sequences.simulation.imu import PHONE_IMU
 from stario.sequences.windows import WINDOW_SECONDS
+
+_HIDDEN = 10.0 * PHONE_IMU.noise.accel_noise
+"""Ten times a phone's white noise: the slow motion of a device that only looks still [m/s^1.5]."""
 
 _BY_VELOCITY = np.eye(6, 3)
 _BY_BIAS = np.eye(6, 3, k=-3)
@@ -35,18 +37,15 @@ class ZeroVelocity(NamedTuple):
     once per second, hence so wide."""
 
 
-def zero_velocity(stillness: StillnessDetector, noise: ImuNoise) -> ZeroVelocity:
+def zero_velocity(stillness: StillnessDetector) -> ZeroVelocity:
     """The measurement of a still second.
 
-    The velocity is as uncertain as what white noise of the accelerometer hides over the second.
-
-    Args:
-        stillness: that found the second still.
-        noise: densities the filter assumes.
+    The velocity is as uncertain as what white noise of a phone's accelerometer hides over the
+    second: nothing moves, so the filter's own density, which stands for motion, is no measure here.
     """
     rates = stillness.mean_rates()
     n = len(rates)
-    hidden = max(noise.accel_noise, PHONE_IMU.noise.accel_noise) ** 2 * WINDOW_SECONDS
+    hidden = _HIDDEN**2 * WINDOW_SECONDS
     white = PHONE_IMU.noise.gyro_noise**2 / stillness.mean_seconds()
     spread = np.maximum(rates.var(axis=0), white)
     return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden] * 3, *(n * spread)]))

@@ -42,7 +42,6 @@ def smooth(
     measurements: Sequence[IntervalMeasurements],
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
-    gyro_covariance: FloatArray | None = None,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
@@ -52,8 +51,6 @@ def smooth(
         measurements: what the filter took in, interval by interval.
         transforms: of the frame since the start.
         config: noise, filter and graph settings.
-        gyro_covariance: (3, 3) to which the gyroscope's bias is taken for zero beside the prior
-            (`gyro_prior`), None for not at all.
 
     Returns:
         The graph's states with their marginal covariances; those given where the graph does not
@@ -66,8 +63,6 @@ def smooth(
         near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
         builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
     builder.close(local[-1])
-    if gyro_covariance is not None:
-        builder.expect_gyro_bias(gyro_covariance)
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:

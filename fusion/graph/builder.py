@@ -148,11 +148,6 @@ class GraphBuilder:
         graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
         return True
 
-    def expect_gyro_bias(self, covariance: FloatArray) -> None:
-        """Take in, wherever the graph begins, that the bias is zero to a covariance (3, 3)."""
-        for k in self.starts:
-            self.graph.add(GyroBias(k, np.zeros(3), covariance), gated=False)
-
     def forget(self, time: float) -> None:
         """Marginalise the keyframes before the last one up to a time [s].
 

@@ -129,7 +129,7 @@ class FixedLagEstimator:
     def nav_state(self) -> NavState:
         """The newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
-        return nav_states([ahead], self._filter.gyro_prior)[0].shifted(self._origin_W)
+        return nav_states([ahead])[0].shifted(self._origin_W)
 
     def health(self, counts: SampleCounts) -> Health:
         """The filter's report with the graph's sigmas, and how often the graph fell back."""
@@ -146,7 +146,7 @@ class FixedLagEstimator:
 
     def _begin(self, count: int) -> None:
         """A new graph from the filter's state."""
-        first = self._filter.filtered()
+        first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
         first = first.shifted(-self._origin_W)
         self._builder = GraphBuilder(self._config, first, count, streaming=True)

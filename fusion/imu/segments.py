@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, repeat
@@ -16,8 +15,6 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 
 _GAP_STEPS = 10
-
-_STEP = 0.02
 
 
 def segment_of(
@@ -83,7 +80,7 @@ def _unseen(
 
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
-    """White noise that grows with motion: scale and alignment errors act like it."""
+    """White noise, wider where a sensor was saturated."""
     noise, f = config.noise, config.filter
     gyro, accel = noise.gyro_noise, noise.accel_noise
     # What a saturated sensor missed is as unknown as what happens in a gap.
@@ -91,16 +88,4 @@ def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
         gyro = max(gyro, f.gap_gyro_noise)
     if interval.flags.accel:
         accel = max(accel, f.gap_accel_noise)
-    if f.gyro_motion_noise > 0.0:
-        rate = math.sqrt(float(np.vdot(interval.gyro, interval.gyro)) / len(interval.gyro))
-        gyro = _in_steps(math.hypot(gyro, f.gyro_motion_noise * rate))
-    if f.accel_motion_noise > 0.0:
-        excess = np.sqrt(np.einsum("ni,ni->n", interval.accel, interval.accel)) - config.gravity
-        motion = math.sqrt(float(excess @ excess) / len(excess))
-        accel = _in_steps(math.hypot(accel, f.accel_motion_noise * motion))
     return ImuNoise(gyro, accel, noise.gyro_walk, noise.accel_walk)
-
-
-def _in_steps(density: float) -> float:
-    """The next of densities 2 % apart: gtsam's parameters for it are then made once, not always."""
-    return math.exp(math.ceil(math.log(density) / _STEP) * _STEP) if density > 0.0 else 0.0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.advio import is_advio, read_advio
 from stario.sequences.readers.archive import (
     Where,
     archive_members,
@@ -19,17 +20,19 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.euroc import is_euroc, read_euroc
+from stario.sequences.readers.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.imunet import is_imunet, read_imunet
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv, write_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.phone import is_phone, read_phone
+from stario.sequences.readers.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.ridi import is_ridi, read_ridi
 from stario.sequences.readers.rnin import is_rnin, read_rnin
 from stario.sequences.readers.ronin import is_ronin, read_ronin
 from stario.sequences.readers.text import first_line, magic
 from stario.sequences.readers.tlio import is_tlio, read_tlio
+from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]
@@ -55,6 +58,22 @@ def _is_archive_or_member(path: Path) -> bool:
     return is_archive(path) or is_archive_member(path)
 
 
+def _read_zip(path: Path) -> ImuSequence:
+    """Read the one recording in a zip; its errors name the zip and the file in it."""
+    with unpacked(path) as folder:
+        try:
+            found = find_recordings(folder)
+            if len(found) > 1:
+                names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
+                expected = "one recording in a zip"
+                raise ReadError(path, "zip", f"{len(found)}, {names}", expected, "unpack it")
+            sequence = read_recording(found[0])
+        except ReadError as error:
+            field = error.field.replace(str(folder), str(path))
+            raise ReadError(path, field, error.found, error.expected, error.fix) from None
+    return replace(sequence, name=path.stem) if found[0] == folder else sequence
+
+
 FORMATS: dict[str, Format] = {
     "archive": Format(_is_archive_or_member, read_archive),
     "ronin": Format(is_ronin, read_ronin),
@@ -65,13 +84,17 @@ FORMATS: dict[str, Format] = {
     "bag": Format(is_bag, read_bag, options=("imu_topic", "truth_topic")),
     "euroc": Format(is_euroc, read_euroc),
     "oxiod": Format(is_oxiod, read_oxiod),
+    "advio": Format(is_advio, read_advio),
     "phone": Format(is_phone, read_phone),
+    "wide": Format(is_wide, read_wide),
+    "events": Format(is_event_lines, read_event_lines),
+    "zip": Format(is_zip, _read_zip),
     "csv": Format(is_own_csv, read_own_csv),
 }
 """Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
 well, `ridi` that of IMUNet's processed recordings."""
 
-_SUFFIXES = (".csv", ".txt", ".bag", ".mcap", ".db3", ".hdf5", ".h5")
+_SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".bag", ".mcap", ".db3", ".hdf5", ".h5", ".zip")
 """Files that may be a recording by themselves."""
 
 
@@ -136,6 +159,8 @@ def find_recordings(
         return _with_attributes([path], where)
     found = sorted(_below(path))
     if not found:
+        if poses := pose_files(path):
+            raise _poses_alone(path, poses[0])
         raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
     return _with_attributes(found, where)
 
@@ -219,13 +244,19 @@ def _names() -> str:
     return f"one of the formats {', '.join(FORMATS)}"
 
 
+def _poses_alone(path: Path, pose: Path) -> ReadError:
+    expected = "a gyroscope's and an accelerometer's file"
+    fix = "put the IMU's files beside them"
+    return ReadError(path, "content", f"poses alone, {pose.name}", expected, fix)
+
+
 def _unknown(path: Path) -> ReadError:
     """What was seen instead of a recording, in one line."""
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
     elif path.is_dir() and (poses := pose_files(path)):
-        found, fix = f"poses alone, {poses[0].name}", "put the IMU's files beside them"
+        return _poses_alone(path, poses[0])
     elif path.is_dir():
         there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")

@@ -5,7 +5,8 @@ separated by commas, semicolons or tabs as the rows below it; comments (`#`) may
 
 - `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
   IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
-  (-m/s^2 or -g where the device reports gravity, as Apple's do). Without a unit: s, rad/s, m/s^2.
+  (-m/s^2 or -g where the device reports gravity, as Apple's do). Without a unit: rad/s, m/s^2,
+  and of time the unit that makes a sensor's rate of it.
 - `mx,my,mz` [uT] (or nT, mT, T, gauss) magnetic field, in rows of its own or in those of the IMU;
   blank or nan where it was not sampled.
 - truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may leave
@@ -31,6 +32,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.files import atomic_write
 from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.columns import (
     HEADER,
     IMU,
@@ -127,7 +129,7 @@ def _rows_quickly(path: Path, header: Header) -> _Rows | None:
     if quick is None:
         return None
     stamps = quick.numbers(columns["t"].index)
-    per_second = unit_factor(path, columns["t"], TIME_UNITS)
+    per_second = _per_second(path, columns["t"], quick.values[:, 0])
     if stamps is not None and stamps.dtype.kind == "i":
         time = np.asarray((stamps - stamps[0]) / per_second, dtype=np.float64)
     elif stamps is not None and per_second == 1 and stamps[0] == 0.0:
@@ -291,7 +293,6 @@ def _seconds(
 ) -> FloatArray:
     """Seconds since the row `origin`, from the digits as they are written."""
     column = header.columns["t"]
-    per_second = unit_factor(path, column, TIME_UNITS)
     stamps = []
     for number, line in numbered:
         cell = line.split(header.separator, column.index + 1)[column.index].strip()
@@ -300,6 +301,8 @@ def _seconds(
         except InvalidOperation:
             where = f"line {number}, {column.title}"
             raise ReadError(path, where, repr(cell), "a time") from None
+    finite = np.array([float(stamp) for stamp in stamps if stamp.is_finite()])
+    per_second = _per_second(path, column, finite)
     start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
     return np.array([float((stamp - start) / per_second) for stamp in stamps])
 
@@ -308,6 +311,14 @@ def _magnetometer(path: Path, header: Header, rows: _Rows) -> Magnetometer | Non
     units = [unit_factor(path, header.columns[name], MAGNETIC_UNITS) for name in MAGNETIC]
     field = np.stack([rows.table[name] for name in MAGNETIC], axis=1) * np.array(units)
     return magnetometer(rows.time, field, held=False)
+
+
+def _per_second(path: Path, column: Column, time: FloatArray) -> int:
+    """The unit of time that the header names, else the one that makes a sensor's rate of it."""
+    if not column.unit:
+        with suppress(ReadError):
+            return time_unit(path, time)
+    return unit_factor(path, column, TIME_UNITS)
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:

@@ -1,20 +1,25 @@
-"""Folders of phone loggers: one text file for each sensor, each at its own clock.
+"""Phone loggers: a folder with a text file for each sensor, or one wide file with all of them.
 
 Written by many apps, each in its way (Sensor Logger, phyphox, SensLogs, the Android and iOS loggers
 of several data sets), so what a file holds is told by its name and content; see `sensor_words` and
 `sensor_table`. Time without a unit is in the one that makes 10 to 1200 samples a second of it;
 values without a unit are rad/s, m/s^2 and uT.
 
+A wide file (AndroSensor, Physics Toolbox, phyphox, `*_IMU.txt`) has a clock and columns for each
+sensor; cells of sensors that were not sampled are empty.
+
 Both sensors are brought onto the gyroscope's times of their common stretch. Where the
 accelerometer's file has lost gravity and there is one of gravity, that is added. Apple's
 accelerometers report the opposite of specific force, in g: that is known by the app and system that
 the folder tells of (Sensor Logger's `Metadata.csv`), or by the phone's own attitude beside it. A
-pose that an ARCore or ARKit logger wrote beside is the truth, see `poses`.
+pose that an ARCore or ARKit logger wrote beside is the truth, see `poses`; reference points
+(`*_ref.csv`: time, x, y [m]) are waypoints.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,12 +28,19 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import on_one_clock
-from stario.sequences.readers.phone_files import PhoneFiles, phone_recordings
+from stario.sequences.readers.own_csv import is_own_csv
+from stario.sequences.readers.phone_files import SUFFIXES, PhoneFiles, phone_recordings
 from stario.sequences.readers.phone_sign import accel_sign, is_in_g
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.sensor_table import Samples, SensorTable, read_samples
-from stario.sequences.readers.sensor_words import Sensor
-from stario.sequences.readers.text import seconds
+from stario.sequences.readers.reference_points import reference_points
+from stario.sequences.readers.sensor_table import (
+    Samples,
+    SensorTable,
+    read_samples,
+    sensor_table,
+)
+from stario.sequences.readers.sensor_words import Sensor, is_sensor_word, words_of
+from stario.sequences.readers.text import head_lines, seconds
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Magnetometer
 
 _log = logging.getLogger(__name__)
@@ -46,22 +58,98 @@ def read_phone(path: Path) -> ImuSequence:
     """
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
+    name = folder.resolve().name if path.is_dir() else files.key.replace(" ", "_") or path.stem
+    return assembled(folder, name, files, pose_files(folder, files.key))
+
+
+def read_wide(path: Path) -> ImuSequence:
+    """Read one file that holds all sensors in columns of their own.
+
+    Raises:
+        ReadError: the file is malformed.
+    """
+    files = _wide(path)
+    if files is None:
+        lines = head_lines(path)[:1]
+        found = repr(lines[0].strip()[:60]) if lines else "no line"
+        expected = "a header that names a clock, a gyroscope's and an accelerometer's axes"
+        raise ReadError(path, "header", found, expected)
+    return assembled(path.parent, path.stem, files, _wide_poses(path, files))
+
+
+def is_wide(path: Path) -> bool:
+    """Whether a file's header names a clock and the axes of both sensors.
+
+    A CSV of one's own is none, unless poses lie beside it or it holds forces of two kinds.
+    """
+    if not path.is_file() or path.suffix.lower() not in SUFFIXES:
+        return False
+    files = _wide(path)
+    if files is None:
+        return False
+    axes = files.tables["gyro"][0].axes
+    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx beside ax
+    return not is_own_csv(path) or bool(_wide_poses(path, files)) or more
+
+
+def _wide(path: Path) -> PhoneFiles | None:
+    table = sensor_table(path)
+    if table is None or not {"gyro"} < set(table.axes) or not {"accel", "linear"} & set(table.axes):
+        return None
+    words = words_of(path.stem)
+    key = " ".join(word for word in words if word != "imu" and not is_sensor_word(word))
+    sensors: tuple[Sensor, ...] = ("accel", "gyro", "mag", "gravity", "linear")
+    files = PhoneFiles(key, {sensor: [table] for sensor in sensors if sensor in table.axes})
+    if table.quaternion:
+        files.tables["attitude"] = [table]
+    return files
+
+
+def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
+    """Poses of the same name beside `*_IMU.txt`."""
+    return pose_files(path.parent, files.key) if "imu" in words_of(path.stem) else []
+
+
+def assembled(
+    folder: Path,
+    name: str,
+    files: PhoneFiles,
+    poses: list[Path],
+    orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
+    g_unnamed: bool = False,
+) -> ImuSequence:
+    """The recording of a set of files.
+
+    Args:
+        folder: where they lie, for errors.
+        name: the recording's.
+        files: by sensor.
+        poses: files of poses beside them.
+        orders: as for `with_pose`.
+        g_unnamed: whether numbers about one long are known to be g.
+
+    Raises:
+        ReadError: a file is malformed or the sensors have no stretch in common.
+    """
     gyro = _read(files.tables["gyro"][0], "gyro")
-    accel, converted = _force(files, gyro)
+    accel, converted = _force(files, gyro, g_unnamed)
     stamps, rate, force = on_one_clock(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
     if gyro.unit not in ("", "rad/s"):
         converted |= {"gyro"}
     sequence = ImuSequence(
-        name=folder.resolve().name if path.is_dir() else files.key.replace(" ", "_") or path.stem,
+        name=name,
         time=seconds(stamps, stamps[0]),
         gyro=rate,
         accel=force,
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0]),
     )
-    return with_pose(sequence, stamps[0], pose_files(folder, files.key))
+    sequence = with_pose(sequence, stamps[0], poses, orders)
+    if sequence.truth is not None:
+        return sequence
+    return replace(sequence, positions=reference_points(folder, files.key, stamps[0]))
 
 
 def is_phone(path: Path) -> bool:
@@ -101,7 +189,7 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
     return read_samples(table, sensor, axes)
 
 
-def _force(files: PhoneFiles, gyro: Samples) -> tuple[Samples, set[str]]:
+def _force(files: PhoneFiles, gyro: Samples, g_unnamed: bool) -> tuple[Samples, set[str]]:
     """Specific force, and whether its unit or sign were converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     whole = next((found for found in candidates if _has_gravity(found)), None)
@@ -118,9 +206,9 @@ def _force(files: PhoneFiles, gyro: Samples) -> tuple[Samples, set[str]]:
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: gravity added from its own file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
-    sign = accel_sign(files, accel)
-    in_g = not accel.unit and is_in_g(accel.values) and sign < 0
-    if sign < 0:
+    sign = accel_sign(files, accel, told=not g_unnamed)
+    in_g = not accel.unit and is_in_g(accel.values) and (sign < 0 or g_unnamed)
+    if sign < 0 or in_g:
         converted |= {"accel"}
     factor = sign * (STANDARD_GRAVITY if in_g else 1.0)
     return replace(accel, values=factor * accel.values), converted

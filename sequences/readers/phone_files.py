@@ -19,7 +19,7 @@ from stario.sequences.readers.sensor_words import (
     words_of,
 )
 
-_SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
+SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _NEEDED: tuple[Sensor, ...] = ("accel", "linear")
 
 
@@ -60,7 +60,7 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
 
 
 def _may_hold(file: Path) -> bool:
-    return file.suffix.lower() in _SUFFIXES and file.is_file() and not file.name.startswith(".")
+    return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
 
 
 def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:

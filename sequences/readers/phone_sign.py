@@ -41,13 +41,21 @@ def is_in_g(values: FloatArray) -> bool:
     return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
 
 
-def accel_sign(files: PhoneFiles, accel: Samples) -> float:
-    """1.0, or -1.0 where the accelerometer has Apple's sign."""
+def accel_sign(files: PhoneFiles, accel: Samples, told: bool = True) -> float:
+    """1.0, or -1.0 where the accelerometer has Apple's sign.
+
+    Args:
+        files: the recording's.
+        accel: its accelerometer's samples.
+        told: say what cannot be known.
+    """
     folder = files.gyro.parent
     sign = _by_attitude(files, accel)
     if sign is None:
         sign = _by_system(folder)
-    if sign is None and is_in_g(accel.values) and not accel.unit:
+    if sign is None and accel.unit == "g" and _has_core_motion(files):
+        sign = -1.0
+    if told and sign is None and is_in_g(accel.values) and not accel.unit:
         _log.warning(
             "%s: an accelerometer in g: if an iPhone wrote it, pass "
             "`--accel-unit g --accel-sign apple`", folder,
@@ -71,6 +79,14 @@ def _by_system(folder: Path) -> float | None:
     if not any(word in system for word in ("ios", "iphone", "ipad")):
         return 1.0 if system else None
     return 1.0 if told.get("standardisation", told.get("standardization")) == "true" else -1.0
+
+
+def _has_core_motion(files: PhoneFiles) -> bool:
+    """Whether a wide file has columns that apps call after Apple's CMDeviceMotion."""
+    titles = [
+        place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
+    ]
+    return any(title.startswith("motion") for title in titles)
 
 
 def _by_attitude(files: PhoneFiles, accel: Samples) -> float | None:

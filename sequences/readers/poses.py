@@ -11,6 +11,7 @@ mean specific force. Of several that agree the one that is turned least is the s
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.sensor_table import first_row
-from stario.sequences.readers.sensor_words import is_sensor_word, words_of
+from stario.sequences.readers.sensor_words import words_of
 from stario.sequences.readers.text import IntArray, head_lines, read_table, seconds
 from stario.sequences.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -32,16 +33,24 @@ from stario.sequences.windows import clean_samples
 
 _log = logging.getLogger(__name__)
 
-_WORDS = {"pose", "poses", "arcore", "arkit"}
+_NAMES = ("pose", "arcore", "arkit")
 _OTHER = {"point", "points", "cloud", "intrinsics", "image", "frames"}
 _SUFFIXES = (".txt", ".csv")
 
-_AGREES = 0.8
+_AGREES = 0.9
 """Correlation of the turning from which a pose is that of the IMU's device."""
 
 _ALIKE = 0.02
-_OWN_AXES_RAD = np.deg2rad(8.0)
-"""A smaller turn against the IMU is the estimate's error: the pose is in the IMU's own axes."""
+_DOWN = 0.985
+"""Cosine to a world's y or z from which a mean force points down it."""
+
+_SQUARE_RAD = np.deg2rad(15.0)
+"""A turn against the IMU that is nearer to right angles than this is by right angles: cameras and
+displays are mounted along a phone's edges, and the rest is the estimate's error."""
+
+_SAME_AXES_RAD = np.deg2rad(1.0)
+_SAME_CLOCK_S = 0.1
+"""A lag between pose and gyroscope that is larger is not one of the same clock."""
 
 
 @dataclass(frozen=True)
@@ -67,27 +76,33 @@ def pose_files(folder: Path, key: str = "") -> list[Path]:
     """The files of poses of a recording, by their names; `key` is what all its names share."""
     found = []
     for file in sorted(folder.iterdir()):
-        words = words_of(file.stem)
-        if file.suffix.lower() not in _SUFFIXES or not _WORDS & set(words) or _OTHER & set(words):
+        words = set(words_of(file.stem))
+        named = any(name in "".join(words_of(file.stem)) for name in _NAMES)
+        if file.suffix.lower() not in _SUFFIXES or not named or _OTHER & words:
             continue
-        plain = [w for w in words if w not in _WORDS and not is_sensor_word(w)]
-        if not key or set(key.split()) <= set(plain):
+        if set(key.split()) <= words:
             found.append(file)
     return found
 
 
-def with_pose(sequence: ImuSequence, start_ns: np.int64 | int, files: list[Path]) -> ImuSequence:
+def with_pose(
+    sequence: ImuSequence,
+    start_ns: np.int64 | int,
+    files: list[Path],
+    orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
+) -> ImuSequence:
     """The recording with the truth that the best of the pose files gives, if one agrees.
 
     Args:
         sequence: a recording without truth.
         start_ns: its first sample on the poses' clock [ns].
         files: of poses; others in the same form.
+        orders: in which attitudes may be written, where a data set says so.
 
     Raises:
         ReadError: a file's rows are malformed.
     """
-    ways = [way for file in files for way in pose_rows(file)]
+    ways = [way for file in files for way in pose_rows(file) if way.order in orders]
     fits = [(way, fit) for way in ways if (fit := _fitted(sequence, start_ns, way)) is not None]
     if not fits:
         if ways:
@@ -143,12 +158,17 @@ def pose_rows(file: Path) -> list[PoseRows]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How a pose stands to the IMU: its times on the IMU's clock, which rows, the turn [rad]."""
+    """How a pose stands to the IMU: its times on the IMU's clock, which rows, the mount R_PB."""
 
     time: FloatArray
     rows: IntArray
     aligned: BodyAlignment
-    turn: float
+    mount: Rotation
+
+    @property
+    def turn(self) -> float:
+        """Angle between the pose's axes and the IMU's [rad]."""
+        return float(self.mount.magnitude())
 
 
 def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseRows) -> _Fit | None:
@@ -160,15 +180,26 @@ def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseRows) -> _
     attitude = way.attitude[rows]
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
-        if pose_time[0] > time[-1] or pose_time[-1] < time[0]:
+        overlap = pose_time[0] < time[-1] and pose_time[-1] > time[0]
+        aligned = None
+        if overlap:
+            aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
+        if aligned is None or aligned.correlation < _AGREES or abs(aligned.lag) > _SAME_CLOCK_S:
             pose_time = pose_time + clock_offset(time, gyro, pose_time, attitude, valid)
-        aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
+            aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
     except InputError:
         return None
     if aligned.correlation < _AGREES:
         return None
-    turn = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2].magnitude()
-    return _Fit(pose_time, rows, aligned, float(turn))
+    mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
+    return _Fit(pose_time, rows, aligned, mount)
+
+
+def _squared(mount: Rotation) -> Rotation:
+    """A mount by right angles where it is near one, else itself."""
+    square = Rotation.create_group("O")
+    away = (square.inv() * mount).magnitude()
+    return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
 
 
 def _say(
@@ -179,7 +210,7 @@ def _say(
         sequence.name, way.file.name, way.order, np.degrees(fit.turn), fit.aligned.correlation,
     )  # fmt: skip
     for other, its in fits:
-        if other.file != way.file and its.turn > _OWN_AXES_RAD:
+        if other.file != way.file and its.turn > _SAME_AXES_RAD:
             _log.warning(
                 "%s: %s is taken as the truth; %s is %.0f degrees off the IMU's axes",
                 sequence.name, way.file.name, other.file.name, np.degrees(its.turn),
@@ -188,9 +219,7 @@ def _say(
 
 def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
     aligned = fit.aligned
-    attitude_PB = aligned.leveling_WW.inv() * aligned.attitude_WB  # in the poses' own world
-    if fit.turn < _OWN_AXES_RAD:
-        attitude_PB = way.attitude[fit.rows]
+    attitude_PB = way.attitude[fit.rows] * fit.mount
     time = fit.time + aligned.lag
     truth = Trajectory(time, way.position[fit.rows], attitude_PB, valid=aligned.valid)
     sequence = accel_axes(sequence, truth)
@@ -200,6 +229,10 @@ def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
         [np.interp(pose.time, sequence.time, sequence.accel[:, k]) for k in range(3)], axis=1
     )
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
+    if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
+        _log.warning("%s: the accelerometer has Apple's sign, turned over", sequence.name)
+        converted = sequence.converted | {"accel"}
+        sequence, up = replace(sequence, accel=-sequence.accel, converted=converted), -up
     R_WP = tilt_aligning(up)
     try:
         truth = replace(

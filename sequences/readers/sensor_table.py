@@ -101,6 +101,8 @@ def sensor_table(file: Path) -> SensorTable | None:
     rows = [_cells(line, delimiter, decimal) for _, line in numbered[first:-1]][:_LOOKED_AT]
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
     rows = [row for row in rows if len(row) == width]
+    if len(rows) < 2:
+        return None
     head = np.array([[_number(cell) for cell in row] for row in rows])
     layout = None
     if first:
@@ -180,11 +182,14 @@ def read_quaternion(
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
 
 
-def first_row(numbered: list[tuple[int, str]]) -> tuple[int, str | None, str] | None:
+def first_row(
+    numbered: list[tuple[int, str]], least: int = 4
+) -> tuple[int, str | None, str] | None:
     """Which line is the first row of numbers, what separates its cells, and its decimal mark.
 
     Args:
         numbered: lines of a file with their numbers, blank ones left out.
+        least: numbers that a row must hold.
     """
     for k, (_, line) in enumerate(numbered):
         if line.lstrip().startswith("#"):
@@ -193,7 +198,7 @@ def first_row(numbered: list[tuple[int, str]]) -> tuple[int, str | None, str] | 
                                    (None, "."), (None, ",")):  # fmt: skip
             cells = _cells(line, delimiter, decimal)
             numbers = sum(np.isfinite(_number(cell)) for cell in cells)
-            if numbers >= 4 and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
+            if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
                 return k, delimiter, decimal
     return None
 

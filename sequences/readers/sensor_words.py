@@ -16,6 +16,7 @@ from stario.sequences.units import TIME_UNITS, unit_named
 Sensor = Literal["accel", "gyro", "mag", "gravity", "linear", "attitude"]
 
 _WORD = re.compile(r"[A-Z]{2,}(?![a-z])|[A-Z]?[a-z]+|[A-Z]|\d+|[^\W\d_]+")
+_G_FORCE = re.compile(r"(?<![a-z])g[-_ ]?f(orce)?(?=[\W_xyz]|$)", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
 _BEGINNINGS: tuple[tuple[str, Sensor], ...] = (
@@ -61,7 +62,8 @@ _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
 
 def words_of(name: str) -> list[str]:
     """The words of a name in lower case, brackets left out."""
-    return [word.lower() for word in _WORD.findall(_BRACKETS.sub(" ", name))]
+    plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", name))
+    return [word.lower() for word in _WORD.findall(plain)]
 
 
 def unit_of(name: str) -> str:

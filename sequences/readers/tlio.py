@@ -3,7 +3,8 @@
 Resampled (Liu et al., RA-L 2020; 200 Hz): `imu0_resampled_description.json` names the columns and
 their widths: time [us], gyroscope [rad/s] and specific force [m/s^2], compensated and already
 turned into the world, attitude `qxyzw_World_Device` (`qwxyz_...` in some copies: the name says),
-position [m] and velocity [m/s]. They are turned back into the device's axes by the attitude.
+position [m] and, in most copies, velocity [m/s]. They are turned back into the device's axes by the
+attitude, unless they are in these already, as in copies of other data sets: the attitude tells.
 
 Raw: time [ns], temperature, gyroscope [rad/s], accelerometer [m/s^2] at about 1 kHz. With
 `calibration.json`, and as the authors' filter does, R^-1 x - b: R is the `RectificationMatrix`, b
@@ -35,8 +36,8 @@ _WIDTHS = {
     "gyr_compensated_rotated_in_World": 3,
     "acc_compensated_rotated_in_World": 3,
     "pos_World_Device": 3,
-    "vel_World": 3,
 }
+_VELOCITY = "vel_World"
 _QUATERNIONS = {"qxyzw_World_Device": "xyzw", "qwxyz_World_Device": "wxyz"}
 _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
@@ -77,16 +78,32 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     attitude_WB = rotations(file, quat_name, quat, order, first_row=0)
     stamps_us = np.rint(table[:, places["ts_us"]][:, 0]).astype(np.int64)
     time = (table[:, places["ts_us"]][:, 0] - table[0, places["ts_us"]]) * 1e-6
+    gyro = table[:, places["gyr_compensated_rotated_in_World"]]
+    accel = table[:, places["acc_compensated_rotated_in_World"]]
+    if not _in_body_axes(time, gyro, attitude_WB):
+        gyro, accel = (attitude_WB.apply(values, inverse=True) for values in (gyro, accel))
+    velocity_W = table[:, places[_VELOCITY]] if _VELOCITY in places else None
     sequence = ImuSequence(
         name=file.resolve().parent.name,
         time=time,
-        gyro=attitude_WB.apply(table[:, places["gyr_compensated_rotated_in_World"]], inverse=True),
-        accel=attitude_WB.apply(table[:, places["acc_compensated_rotated_in_World"]], inverse=True),
-        truth=trajectory(
-            time, table[:, places["pos_World_Device"]], attitude_WB, table[:, places["vel_World"]]
-        ),
+        gyro=gyro,
+        accel=accel,
+        truth=trajectory(time, table[:, places["pos_World_Device"]], attitude_WB, velocity_W),
     )
     return stamps_us, sequence
+
+
+def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
+    """Whether rates (N, 3) are those of the body's axes, whatever their name says.
+
+    Over a step the attitude turns by R_k^T R_k+1 in the body's axes, R_k+1 R_k^T in the world's.
+    """
+    if len(time) < 2:
+        return False
+    turned = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    steps_B = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
+    steps_W = attitude_WB[:-1].apply(steps_B)
+    return bool(np.abs(turned - steps_B).sum() < np.abs(turned - steps_W).sum())
 
 
 def _array(file: Path) -> FloatArray:

@@ -10,7 +10,7 @@ length. That is the derivative of the very attitude given as truth, at the cost 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -27,6 +27,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
+from stario.sequences.simulation.magnetometer import MagneticField, simulate_magnetometer
 
 _MIN_POSES = 6
 """A quintic spline passes through at least this many points."""
@@ -123,9 +124,10 @@ def simulate_imu(
     seed: int = 0,
     gravity: float = STANDARD_GRAVITY,
     name: str = "simulated",
+    magnetic_field: MagneticField | None = None,
 ) -> ImuSequence:
     """The recording of `simulate`, without its biases. Arguments and errors are the same."""
-    return simulate(trajectory, rate, errors, seed, gravity, name).sequence
+    return simulate(trajectory, rate, errors, seed, gravity, name, magnetic_field).sequence
 
 
 def simulate(
@@ -135,6 +137,7 @@ def simulate(
     seed: int = 0,
     gravity: float = STANDARD_GRAVITY,
     name: str = "simulated",
+    magnetic_field: MagneticField | None = None,
 ) -> Simulation:
     """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
 
@@ -146,6 +149,7 @@ def simulate(
         seed: of every random draw; the same seed gives the same recording.
         gravity: its magnitude [m/s^2].
         name: of the sequence.
+        magnetic_field: that a magnetometer beside it meets; None for no magnetometer.
 
     Raises:
         InputError: too few poses, a gap between valid ones longer than 0.1 s and than their usual
@@ -165,7 +169,11 @@ def simulate(
         accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
         errors.accel_scale, errors.misalignment, errors.accel_range,
     )  # fmt: skip
-    return Simulation(ImuSequence(name, truth.time, gyro, accel, truth), b_g, b_a)
+    sequence = ImuSequence(name, truth.time, gyro, accel, truth)
+    if magnetic_field is not None:
+        measured = simulate_magnetometer(truth, magnetic_field, seed)
+        sequence = replace(sequence, magnetometer=measured)
+    return Simulation(sequence, b_g, b_a)
 
 
 def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:

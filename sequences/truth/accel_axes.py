@@ -14,9 +14,10 @@ from stario.sequences.sequence import ImuSequence, Trajectory
 _log = logging.getLogger(__name__)
 
 _GRAVITY_KEPT = 0.9
-"""Share of the force's size that its mean in the world keeps where axes are right."""
+"""Share of the force's size that its mean along the vertical keeps where axes are right."""
 
-_BETTER = 0.2
+_BETTER, _SHARPER = 0.2, 0.02
+"""By how much another order must keep more than the one as logged, and than the next best."""
 
 
 def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
@@ -27,7 +28,7 @@ def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
 
     Args:
         sequence: the recording.
-        truth: its poses, in any world with a constant vertical.
+        truth: its poses, in a world with y or z up.
     """
     finite = np.isfinite(sequence.time) & np.isfinite(sequence.accel).all(axis=1)
     times, first = np.unique(sequence.time[finite], return_index=True)
@@ -38,12 +39,13 @@ def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
     R_WB, force = pose.attitude_WB[pose.valid], accel[pose.valid]
     size = float(np.linalg.norm(force, axis=1).mean())
     turns = Rotation.create_group("O")
-    kept = [float(np.linalg.norm(R_WB.apply(turn.apply(force)).mean(axis=0))) for turn in turns]
+    up = np.array([R_WB.apply(turn.apply(force)).mean(axis=0) for turn in turns]) / size
+    kept = up[:, 1:].max(axis=1)
     same = int(np.argmin(turns.magnitude()))
-    best = int(np.argmax(kept))
-    if kept[same] > _GRAVITY_KEPT * size or kept[best] < kept[same] + _BETTER * size:
+    best, second = np.argsort(kept)[[-1, -2]]
+    if np.abs(up[same, 1:]).max() > _GRAVITY_KEPT:  # perhaps upside down: Apple's sign
         return sequence
-    if kept[best] < _GRAVITY_KEPT * size:
+    if kept[best] < max(_GRAVITY_KEPT, kept[same] + _BETTER, kept[second] + _SHARPER):
         return sequence
     R = turns[best]
     _log.warning(

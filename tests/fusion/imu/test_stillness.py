@@ -116,7 +116,9 @@ def test_rest_says_nothing_of_yaw(still_model: Any) -> None:
 def test_an_even_glide_is_not_stopped(still_model: Any) -> None:
     """No vibration, and no network that knows: what the filter knows of its speed decides."""
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
-    track = Navigator(still_model, CONFIG, fast).run(lying(3.0, bias=np.zeros(3)))
+    quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
+    config = replace(CONFIG, noise=PHONE_IMU.noise, filter=quiet)
+    track = Navigator(still_model, config, fast).run(lying(3.0, bias=np.zeros(3)))
     assert track.health.zero_velocity == {"gated": 21}
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 

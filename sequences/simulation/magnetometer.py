@@ -1,0 +1,112 @@
+"""A magnetometer along any trajectory: the earth's field, a building, magnets and the phone's own.
+
+The field of a building is the gradient of a smooth random potential, as a field without currents
+must be; it depends on the place alone, so that who comes back finds it again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
+
+_WAVES = 128
+_STREAM = 0x6D6167
+"""Draws are the magnetometer's own: the same seed gives the same IMU with and without it."""
+
+
+@dataclass(frozen=True)
+class MagneticField:
+    """What a magnetometer meets and adds.
+
+    Attributes:
+        strength: of the earth's field [uT].
+        dip: of it below the horizontal [rad], negative south of the magnetic equator.
+        azimuth: of its horizontal part in W, counter-clockwise from x [rad].
+        disturbance: root mean square of a building's field [uT].
+        length: over which that changes [m].
+        hard_iron: constant offset that the device adds in B [uT].
+        noise: deviation of a sample, per axis [uT].
+        magnets: start [s], end [s] and size [uT] of fields that move with the device.
+        rate: of the samples [Hz].
+        lag: by which their stamps are late [s].
+
+    Raises:
+        InputError: a value is not finite, or a size, length or rate is not positive.
+    """
+
+    strength: float = 48.0
+    dip: float = math.radians(63.0)
+    azimuth: float = 0.0
+    disturbance: float = 0.0
+    length: float = 3.0
+    hard_iron: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    noise: float = 0.4
+    magnets: tuple[tuple[float, float, float], ...] = ()
+    rate: float = 50.0
+    lag: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not np.isfinite(np.asarray(value, dtype=np.float64)).all():
+                raise InputError(item.name, repr(value), "finite numbers")
+            least = {"strength": 0.0, "disturbance": 0.0, "noise": 0.0}.get(item.name)
+            if least is not None and value < least:
+                raise InputError(item.name, repr(value), "a size >= 0 uT")
+            if item.name in ("length", "rate") and value <= 0.0:
+                raise InputError(item.name, repr(value), "a number > 0")
+
+
+INDOOR_FIELD = MagneticField(disturbance=8.0, length=2.0, hard_iron=(3.0, -2.0, 4.0), lag=0.03)
+"""A phone in a building of concrete and steel."""
+
+
+def simulate_magnetometer(
+    truth: Trajectory, magnetic_field: MagneticField, seed: int = 0
+) -> Magnetometer:
+    """The samples of a magnetometer whose axes are the IMU's.
+
+    Args:
+        truth: poses without gaps at the IMU's rate or another that shows the turning.
+        magnetic_field: what it meets.
+        seed: of every random draw.
+
+    Raises:
+        InputError: the track is shorter than one sample.
+    """
+    rng = np.random.default_rng([seed, _STREAM])
+    count = int((truth.time[-1] - truth.time[0]) * magnetic_field.rate) + 1
+    time = np.minimum(truth.time[0] + np.arange(count) / magnetic_field.rate, truth.time[-1])
+    pose = truth.at(time)
+    field_W = _earth(magnetic_field) + _building(magnetic_field, pose.position_W, rng)
+    field_B = pose.attitude_WB.apply(field_W, inverse=True) + np.array(magnetic_field.hard_iron)
+    for start, stop, size in magnetic_field.magnets:
+        direction = rng.standard_normal(3)
+        near = (time >= start) & (time <= stop)
+        field_B[near] += size * direction / np.linalg.norm(direction)
+    field_B += magnetic_field.noise * rng.standard_normal(field_B.shape)
+    return Magnetometer(time + magnetic_field.lag, field_B)
+
+
+def _earth(magnetic_field: MagneticField) -> FloatArray:
+    """The earth's field (3,) in W [uT]."""
+    dip, azimuth = magnetic_field.dip, magnetic_field.azimuth
+    level = [math.cos(dip) * math.cos(azimuth), math.cos(dip) * math.sin(azimuth), -math.sin(dip)]
+    return magnetic_field.strength * np.array(level)
+
+
+def _building(
+    magnetic_field: MagneticField, position_W: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """The building's field (N, 3) in W [uT] at positions (N, 3)."""
+    waves = rng.standard_normal((_WAVES, 3)) / magnetic_field.length
+    phases = rng.uniform(0.0, 2.0 * math.pi, _WAVES)
+    # Of the potential sum cos(k p + phase); its gradient has this mean square.
+    size = math.sqrt(0.5 * float(np.square(waves).sum()))
+    slopes = np.sin(position_W @ waves.T + phases)
+    return np.asarray(magnetic_field.disturbance / size * slopes @ waves, dtype=np.float64)

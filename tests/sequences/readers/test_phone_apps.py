@@ -1,0 +1,385 @@
+"""Files as apps export them, in their own spelling: what is read must be the walk that was written.
+
+Each writer imitates an app's file names, headers, units and habits; the walk behind them is
+simulated, so that values, signs and axes are known.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences import (
+    ImuSequence,
+    Magnetometer,
+    ReadError,
+    Trajectory,
+    find_recordings,
+    read_recording,
+)
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+RAW = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "raw"
+FIELD_W = np.array([18.0, 5.0, -43.0])
+START_NS = 1_718_030_736_872_695_300
+ZYX = "time,seconds_elapsed,z,y,x"
+Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
+    return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)
+
+
+def pose(walk: ImuSequence) -> Trajectory:
+    assert walk.truth is not None
+    return walk.truth
+
+
+def field(walk: ImuSequence) -> FloatArray:
+    return np.asarray(pose(walk).attitude_WB.apply(FIELD_W, inverse=True))
+
+
+def gravity(walk: ImuSequence) -> FloatArray:
+    up = [0.0, 0.0, STANDARD_GRAVITY]
+    return np.asarray(pose(walk).attitude_WB.apply(up, inverse=True))
+
+
+def ns(walk: ImuSequence) -> list[int]:
+    return [START_NS + round(t * 1e9) for t in walk.time.tolist()]
+
+
+def save(path: Path, header: str, *columns: object, joint: str = ",", decimal: str = ".") -> None:
+    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
+    rows = [
+        joint.join(str(x).replace(".", decimal) for part in row for x in part)
+        for row in zip(*parts, strict=True)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
+
+
+def sensor_logger(folder: Path, walk: ImuSequence) -> None:
+    """Columns z, y, x; a linear acceleration that must not be taken for the total one."""
+    for name, values in (
+        ("TotalAcceleration", walk.accel), ("Gyroscope", walk.gyro),
+        ("Accelerometer", walk.accel - gravity(walk)), ("Magnetometer", field(walk)),
+        ("GyroscopeUncalibrated", walk.gyro + 1.0), ("MagnetometerUncalibrated", field(walk) + 99),
+    ):  # fmt: skip
+        save(
+            folder / f"{name}.csv",
+            "time,seconds_elapsed,z,y,x",
+            ns(walk),
+            walk.time,
+            values[:, ::-1],
+        )
+    save(folder / "Metadata.csv", "version,device name,platform", [["3", "Pixel 8", "android"]])
+    save(folder / "Annotation.csv", "time,seconds_elapsed,text", ns(walk)[:2], [[0.1, 2], [0.2, 3]])
+
+
+def sensor_logger_ios(folder: Path, walk: ImuSequence) -> None:
+    """No total acceleration, Apple's sign."""
+    linear = walk.accel - gravity(walk)
+    for name, values in (("Accelerometer", -linear), ("Gravity", -gravity(walk)),
+                         ("Gyroscope", walk.gyro), ("Magnetometer", field(walk))):  # fmt: skip
+        save(
+            folder / f"{name}.csv",
+            "time,seconds_elapsed,z,y,x",
+            ns(walk),
+            walk.time,
+            values[:, ::-1],
+        )
+    header = "version,device name,platform,standardisation"
+    save(folder / "Metadata.csv", header, [["3", "iPhone 14", "ios", "false"]])
+
+
+def sensor_logger_attitude(folder: Path, walk: ImuSequence) -> None:
+    """The same without metadata: the phone's own attitude tells the sign."""
+    sensor_logger_ios(folder, walk)
+    (folder / "Metadata.csv").unlink()
+    header = "time,seconds_elapsed,qz,qy,qx,qw,roll,pitch,yaw"
+    quaternion = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
+    save(
+        folder / "Orientation.csv",
+        header,
+        ns(walk),
+        walk.time,
+        quaternion,
+        np.zeros((len(walk), 3)),
+    )
+
+
+def phyphox(folder: Path, walk: ImuSequence) -> None:
+    """Semicolons and decimal commas, as exported for a German spreadsheet."""
+    for name, unit, values in (
+        ("Accelerometer", "m/s^2", walk.accel), ("Gyroscope", "rad/s", walk.gyro),
+        ("Magnetometer", "µT", field(walk)),
+        ("Linear Accelerometer", "m/s^2", walk.accel - gravity(walk)),
+    ):  # fmt: skip
+        header = f'"Time (s)";"X ({unit})";"Y ({unit})";"Z ({unit})"'
+        save(folder / f"{name}.csv", header, walk.time, values, joint=";", decimal=",")
+    save(folder / "meta/time.csv", '"event","experiment time"', [["START", 0.0]])
+
+
+def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
+    """No header, g and Apple's sign without a word, attitude w first."""
+    t = 55687.0 + walk.time
+    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, joint=" ")
+    save(folder / "gyroscope.txt", "", t, walk.gyro, joint=" ")
+    save(folder / "magnetometer.txt", "", t, field(walk) + 200.0, joint=" ")
+    accuracy = np.full(len(walk), 2)
+    save(folder / "magnetometer-calibrated.txt", "", t, field(walk), accuracy, joint=" ")
+    save(folder / "attitude.txt", "", t, pose(walk).quat_xyzw[:, [3, 0, 1, 2]], joint=" ")
+
+
+def senslogs_android(folder: Path, walk: ImuSequence) -> None:
+    """Only uncalibrated rows, with the bias that the phone estimates behind them."""
+    for name, values, bias in (("gyroscope", walk.gyro, 0.02), ("magnetometer", field(walk), 60.0)):
+        biases = np.tile([bias, -bias, 2.0 * bias], (len(walk), 1))
+        save(folder / f"{name}.txt", "", walk.time, values + biases, biases, joint=" ")
+    save(folder / "accelerometer.txt", "", walk.time, walk.accel, joint=" ")
+
+
+def two_clocks(folder: Path, walk: ImuSequence) -> None:
+    """The app's milliseconds beside the sensor's nanoseconds."""
+    millis = (1_539_940_408_606 + np.round(1e3 * walk.time)).astype(np.int64)
+    for name, values in (("Accelerometer", walk.accel), ("Gyroscope", walk.gyro),
+                         ("MagneticField", field(walk))):  # fmt: skip
+        save(folder / f"{name}.csv", "timeMillis,timeNanos,x,y,z", millis, ns(walk), values)
+
+
+def prefixed(folder: Path, walk: ImuSequence) -> None:
+    """Scientific milliseconds, no header."""
+    for name, values in (("acc", walk.accel), ("gyr", walk.gyro), ("mag", field(walk))):
+        rows = np.column_stack([1.606391908305e12 + 1e3 * walk.time, values])
+        folder.mkdir(exist_ok=True)
+        np.savetxt(folder / f"Eight_{name}.csv", rows)
+
+
+def androsensor(folder: Path, walk: ImuSequence) -> None:
+    names = (("ACCELEROMETER", "m/s²"), ("GRAVITY", "m/s²"), ("LINEAR ACCELERATION", "m/s²"),
+             ("GYROSCOPE", "rad/s"), ("MAGNETIC FIELD", "μT"))  # fmt: skip
+    header = ";".join(f"{name} {axis} ({unit})" for name, unit in names for axis in "XYZ")
+    header += ";ORIENTATION Z (azimuth °);Time since start in ms ;YYYY-MO-DD HH-MI-SS_SSS"
+    clock = ["2015-10-30 10:13:40:921"] * len(walk)
+    columns: list[object] = [
+        walk.accel,
+        gravity(walk),
+        walk.accel - gravity(walk),
+        walk.gyro,
+        field(walk),
+    ]
+    millis = np.round(1e3 * walk.time).astype(np.int64)
+    save(
+        folder / "log_AndroSensor.csv",
+        header,
+        *columns,
+        np.zeros(len(walk)),
+        millis,
+        clock,
+        joint=";",
+    )
+
+
+def physics_toolbox(folder: Path, walk: ImuSequence) -> None:
+    """`ax` is the linear acceleration, the force is `gFx` in g."""
+    header = "time,gFx,gFy,gFz,ax,ay,az,wx,wy,wz,Bx,By,Bz"
+    columns = [walk.accel / STANDARD_GRAVITY, walk.accel - gravity(walk), walk.gyro, field(walk)]
+    save(folder / "toolbox.csv", header, walk.time, *columns)
+
+
+def trace(folder: Path, walk: ImuSequence) -> None:
+    """Lines by type, two of them without a break between, with taps."""
+    lines = ["#\tstartTime:1560828400000"]
+    for k, t in enumerate(walk.time.tolist()):
+        stamp = 1_560_828_400_000 + round(1e3 * t)
+        for kind, values in (("ACCELEROMETER", walk.accel), ("GYROSCOPE", walk.gyro),
+                             ("MAGNETIC_FIELD", field(walk))):  # fmt: skip
+            lines.append("\t".join([str(stamp), f"TYPE_{kind}", *map(str, values[k]), "3"]))
+        if k in (200, 700):
+            lines.append(f"{stamp}\tTYPE_WAYPOINT\t{k}.5\t7.25")
+    folder.mkdir()
+    text = "\n".join(lines)
+    (folder / "5d07.txt").write_text(text.replace("\t3\n", "\t3", 1))
+
+
+def get_sensor_data(folder: Path, walk: ImuSequence) -> None:
+    lines = ["% LogFile created by the 'GetSensorData' App"]
+    for k, t in enumerate(walk.time.tolist()):
+        for code, values in (("ACCE", walk.accel), ("GYRO", walk.gyro), ("MAGN", field(walk))):
+            lines.append(";".join([code, f"{t + 5.0:.3f}", f"{t:.4f}", *map(str, values[k]), "3"]))
+    lines.append("POSI;7.000;1;40.0;-3.0;0;0")
+    lines.append("POSI;9.000;2;40.0001;-3.0;0;0")
+    folder.mkdir()
+    (folder / "log.txt").write_text("\n".join(lines) + "\n")
+
+
+APPS: dict[str, Callable[[Path, ImuSequence], None]] = {
+    write.__name__: write
+    for write in (
+        sensor_logger, sensor_logger_ios, sensor_logger_attitude, phyphox, senslogs_ios,
+        senslogs_android, two_clocks, prefixed, androsensor, physics_toolbox, trace,
+        get_sensor_data,
+    )
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_an_apps_export_is_the_walk(app: str, walk: ImuSequence, tmp_path: Path) -> None:
+    APPS[app](tmp_path / "s", walk)
+    (found,) = find_recordings(tmp_path / "s")
+    read = read_recording(found)
+    assert len(read) == len(walk)
+    np.testing.assert_allclose(read.time, walk.time, atol=1e-3)
+    np.testing.assert_allclose(read.gyro, walk.gyro, atol=1e-9)
+    np.testing.assert_allclose(read.accel, walk.accel, atol=1e-8)
+    assert isinstance(read.magnetometer, Magnetometer)
+    np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
+    np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
+
+
+@pytest.mark.parametrize("inner", ["", "walk/"])
+@pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
+def test_a_zip_is_the_folder_in_it(app: str, inner: str, walk: ImuSequence, tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    APPS[app](folder, walk)
+    (tmp_path / "zips").mkdir()
+    path = tmp_path / "zips/export.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        for one in folder.rglob("*.csv"):
+            file.write(one, inner + str(one.relative_to(folder)))
+        file.writestr("__MACOSX/._Gyroscope.csv", "junk")
+    assert find_recordings(tmp_path / "zips") == [path]
+    read = read_recording(path)
+    assert read.name == ("walk" if inner else "export")
+    np.testing.assert_array_equal(read.accel, read_recording(folder).accel)
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(ReadError, match=r"export\.zip"):
+        read_recording(path)
+
+
+def test_what_is_wrong_in_a_zip_names_the_zip_and_the_file(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    sensor_logger(tmp_path / "s", walk)
+    path = tmp_path / "export.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        for one in (tmp_path / "s").iterdir():
+            text = one.read_text()
+            file.writestr(
+                one.name, text.replace("time,", "time [ticks],") if "Gyro" in one.name else text
+            )
+    with pytest.raises(ReadError, match=r"export\.zip/Gyroscope\.csv: time: found unit 'ticks'"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+@pytest.mark.parametrize("turn", ["x,y,z", "camera"])
+def test_poses_beside_the_imu_are_truth_in_its_axes(
+    order: str, turn: str, walk: ImuSequence, tmp_path: Path
+) -> None:
+    """30 Hz, y up, of the camera or of the sensor, in either order, whatever the header says."""
+    truth, every = pose(walk), slice(None, None, 3)
+    mount = Rotation.from_euler("z", 90.0 if turn == "camera" else 0.0, degrees=True)
+    attitude = (Y_UP * truth.attitude_WB * mount.inv())[every].as_quat()
+    quat = attitude if order == "xyzw" else attitude[:, [3, 0, 1, 2]]
+    stem = tmp_path / "2019-06-18_105450"
+    header = "Timestamp,Tx,Ty,Tz,Qw,Qx,Qy,Qz"
+    rows = [ns(walk)[every], Y_UP.apply(truth.position_W)[every], quat]
+    save(Path(f"{stem}_ARCore.txt"), header, *rows)
+    save(Path(f"{stem}_IMU.txt"), "Timestamp,Ax,Ay,Az,Gx,Gy,Gz", ns(walk), walk.accel, walk.gyro)
+    (found,) = find_recordings(tmp_path)
+    read = read_recording(found)
+    assert read.truth is not None
+    assert read.truth.valid.mean() > 0.9
+    np.testing.assert_allclose(read.truth.time, truth.time[every], atol=0.01)
+    away = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
+    assert np.degrees(np.abs(away)).max() < 3.0
+    np.testing.assert_allclose(read.truth.position_W, truth.position_W[every], atol=0.1)
+
+
+def test_poses_alone_are_told_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+    rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
+    save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, joint=" ")
+    for read in (read_recording, find_recordings):
+        with pytest.raises(
+            ReadError, match=r"poses alone, ARCore_sensor_pose\.txt, expected a gyr"
+        ):
+            read(tmp_path / "s")
+
+
+def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_put_right(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
+    walk = simulate_imu(generate_walk(3, 60.0, style=style), 50.0, PERFECT_IMU)
+    poses = np.hstack(
+        [Y_UP.apply(pose(walk).position_W), (Y_UP * pose(walk).attitude_WB).as_quat()]
+    )
+    wrong = -walk.accel[:, [1, 0, 2]]
+    for name, values in (("acce", wrong), ("gyro", walk.gyro), ("ARKit_pose", poses)):
+        save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, joint=" ")
+    read = read_recording(tmp_path / "s")
+    assert "turned to its -y,-x,-z" in caplog.text
+    np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
+
+
+def test_a_clock_among_the_values_is_named_with_its_file_and_column(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    for name in ("accel", "gyro"):
+        values = np.column_stack([ns(walk), walk.gyro[:, :2]])
+        save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
+    told = r"gyro\.csv: x, y, z: found 1\.72e\+18, expected what a sensor can give, in rad/s"
+    with pytest.raises(ReadError, match=told):
+        read_recording(tmp_path / "s")
+
+
+def test_waypoints_and_reference_points_are_positions(walk: ImuSequence, tmp_path: Path) -> None:
+    trace(tmp_path / "t", walk)
+    taps = read_recording(tmp_path / "t/5d07.txt").positions
+    assert taps is not None
+    np.testing.assert_allclose(taps.time, [2.0, 7.0], atol=1e-3)
+    np.testing.assert_allclose(taps.position_W, [[200.5, 7.25], [700.5, 7.25]])
+    get_sensor_data(tmp_path / "g", walk)
+    points = read_recording(tmp_path / "g/log.txt").positions
+    assert points is not None
+    np.testing.assert_allclose(points.time, [2.0, 4.0], atol=1e-3)
+    np.testing.assert_allclose(points.position_W, [[0.0, 0.0], [0.0, 11.12]], atol=0.01)
+    prefixed(tmp_path / "p", walk)
+    (tmp_path / "p/Eight_ref.csv").write_text("1606391910305 566578.7 5932830.4 19.6\n" * 2)
+    beside = read_recording(tmp_path / "p").positions
+    assert beside is not None
+    np.testing.assert_allclose(beside.time, [2.0])
+
+
+KINDS = {
+    "sensor_logger/university_loop": "none", "sensor_logger/shopping_mall_eight": "none",
+    "phyphox": "none", "canlang_logger": "none", "pyojinkim_android": "none",
+    "senslogs_tyrex_android": "none", "senslogs_tyrex_ios": "none", "ipin21_hcu": "waypoints",
+    "imunet_txt/Walk7S9": "poses", "tlio_npy_ridi/dan_body1": "poses", "advio/advio-15": "none",
+    "imu_pose_android_recorder/2019-06-18_105450_IMU.txt": "poses",
+}  # fmt: skip
+
+
+@pytest.mark.skipif(not RAW.is_dir(), reason="the apps' own files are not here")
+@pytest.mark.parametrize("name", KINDS)
+def test_the_apps_own_files_hold_gravity_and_what_is_known_of_truth(name: str) -> None:
+    read = read_recording(RAW / name)
+    assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
+    assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0
+    assert KINDS[name] in read.truth_words()
+    if read.truth is not None:
+        known = read.truth.at(read.time[::10])
+        up = known.attitude_WB.apply(read.accel[::10])[known.valid].mean(axis=0)
+        assert np.linalg.norm(up[:2]) < 0.5
+        assert up[2] == pytest.approx(9.8, abs=0.3)
