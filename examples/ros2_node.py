@@ -1,7 +1,7 @@
 """A ROS 2 node around StarIO, a skeleton to start from: ROS is needed only to run as a node.
 
-    subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any mounting
-                           does, the device is levelled by gravity)
+    subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
+                           mounting does, the device is levelled by gravity)
                 fix        geometry_msgs/PoseWithCovarianceStamped, a position in `map`, if there is
     publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
                 tf         map -> odom -> base_link (REP 105)

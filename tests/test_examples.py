@@ -91,7 +91,6 @@ def test_streaming_onnx_never_imports_torch_and_gives_torchs_track(tmp_path):
     states = load("streaming").main(seconds=10.0)
     assert told["states"] == len(states)
     np.testing.assert_allclose(told["p_W"], states[-1].p_W, atol=1e-3)
-    assert told["memory_MB"] < 500
 
 
 def check_odometry(outputs, largest_step=1.5):

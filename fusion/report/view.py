@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,43 +107,50 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
         half_sizes=_SIGMAS * np.sqrt(np.maximum(values, 0.0)),
         quaternions=Rotation.from_matrix(vectors).as_quat(),
     )
-    stream.send_columns("world/3 sigma", index, columns.partition(count))
+    stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
 
 
 def _log_sensors(rr: Any, stream: Any, sequence: ImuSequence, start: float) -> None:
     known = np.isfinite(sequence.time)
     index = _times(rr, sequence.time[known] - start)
     for name, values in (
-        ("sensors/gyroscope [rad/s]", sequence.gyro),
-        ("sensors/specific force [m/s^2]", sequence.accel),
+        ("gyroscope [rad/s]", sequence.gyro),
+        ("specific force [m/s^2]", sequence.accel),
     ):
-        _log_lines(rr, stream, name, index, values[known], "xyz")
+        _log_lines(rr, stream, ("sensors", name), index, values[known], "xyz")
 
 
 def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
     index = _times(rr, track.time - start)
+    lines: list[tuple[str, FloatArray | None, Sequence[str]]] = [
+        ("gyroscope bias [rad/s]", track.b_g, "xyz"),
+        ("accelerometer bias [m/s^2]", track.b_a, "xyz"),
+    ]
     if track.trajectory.velocity_W is not None:
         speed = np.linalg.norm(track.trajectory.velocity_W, axis=1)[:, None]
-        _log_lines(rr, stream, "estimate/speed [m/s]", index, speed, ("speed",))
-    for name, values in (
-        ("estimate/gyroscope bias [rad/s]", track.b_g),
-        ("estimate/accelerometer bias [m/s^2]", track.b_a),
-    ):
-        if values is not None:
-            _log_lines(rr, stream, name, index, values, "xyz")
+        lines.append(("speed [m/s]", speed, ["speed"]))
     if track.covariance is not None:
         sigma = np.sqrt(track.covariance[:, range(15), range(15)])
-        _log_lines(rr, stream, "estimate/sigma of position [m]", index, sigma[:, 6:9], "xyz")
-        _log_lines(rr, stream, "estimate/sigma of yaw [rad]", index, sigma[:, 2:3], ("yaw",))
+        lines.append(("sigma of position [m]", sigma[:, 6:9], "xyz"))
+        lines.append(("sigma of yaw [rad]", sigma[:, 2:3], ["yaw"]))
+    for name, values, labels in lines:
+        if values is not None:
+            _log_lines(rr, stream, ("estimate", name), index, values, labels)
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        at = _times(rr, innovations.time - start)
-        _log_lines(rr, stream, "estimate/NIS [1]", at, innovations.nis[:, None], ("NIS",))
+        at, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
+        _log_lines(rr, stream, ("estimate", "NIS [1]"), at, nis, ["NIS"])
 
 
 def _log_lines(
-    rr: Any, stream: Any, name: str, index: list[Any], values: FloatArray, labels: Any
+    rr: Any,
+    stream: Any,
+    path: Sequence[str],
+    index: list[Any],
+    values: FloatArray,
+    labels: Sequence[str],
 ) -> None:
+    name = rr.new_entity_path(list(path))
     stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
     colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
     stream.log(name, rr.SeriesLines(colors=colours, names=list(labels)), static=True)
