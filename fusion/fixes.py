@@ -48,7 +48,7 @@ class Fix:
     covariance: FloatArray
 
     def shifted(self, by: FloatArray) -> Fix:
-        """The fix in a world whose origin lies at -`by` (3,) [m]."""
+        """The fix in a frame whose origin lies at -`by` (3,) [m]."""
         return replace(self, value=self.value + by) if self.kind == "position" else self
 
     def fault(self) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -74,42 +75,7 @@ def exp_so3(theta: FloatArray) -> FloatArray:
 
 def log_so3(R: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3) [rad], of norm up to pi, of rotation matrices (..., 3, 3)."""
-    # Through the unit quaternion: its largest component is never small, so neither half turns nor
-    # tiny angles lose digits.
-    m = np.moveaxis(R, (-2, -1), (0, 1))
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    products = np.stack([1.0 + 2.0 * m[k, k] - trace for k in range(3)] + [1.0 + trace], axis=-1)
-    odd = np.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], axis=-1)
-    even = np.stack([m[1, 2] + m[2, 1], m[0, 2] + m[2, 0], m[0, 1] + m[1, 0]], axis=-1)
-    x, y, z, w = np.moveaxis(products, -1, 0)
-    rows = np.stack(  # 4 q q^T, one row per candidate for the largest component
-        [
-            np.stack([x, even[..., 2], even[..., 1], odd[..., 0]], axis=-1),
-            np.stack([even[..., 2], y, even[..., 0], odd[..., 1]], axis=-1),
-            np.stack([even[..., 1], even[..., 0], z, odd[..., 2]], axis=-1),
-            np.stack([odd[..., 0], odd[..., 1], odd[..., 2], w], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = products.argmax(axis=-1)[..., None, None]
-    quat_xyzw = np.take_along_axis(rows, largest, axis=-2)[..., 0, :]
-    quat_xyzw = quat_xyzw * np.where(quat_xyzw[..., 3:] < 0.0, -1.0, 1.0)
-    sine = np.linalg.norm(quat_xyzw[..., :3], axis=-1, keepdims=True)
-    cosine = quat_xyzw[..., 3:]
-    angle = 2.0 * np.arctan2(sine, cosine)
-    tiny = sine < 1e-12 * cosine
-    scale = np.where(tiny, 2.0 / np.where(tiny, cosine, 1.0), angle / np.where(tiny, 1.0, sine))
-    return np.asarray(quat_xyzw[..., :3] * scale, dtype=np.float64)
-
-
-def left_jacobian_so3(theta: FloatArray) -> FloatArray:
-    """J_l (..., 3, 3): exp(theta + d) = exp(J_l d) exp(theta) to first order."""
-    return exp_and_left_jacobian(theta)[1]
-
-
-def right_jacobian_so3(theta: FloatArray) -> FloatArray:
-    """J_r (..., 3, 3): exp(theta + d) = exp(theta) exp(J_r d) to first order."""
-    return exp_and_left_jacobian(-theta)[1]
+    return np.asarray(Rotation.from_matrix(R, assume_valid=True).as_rotvec(), dtype=np.float64)
 
 
 def exp_se23(xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -128,7 +94,7 @@ def exp_se23(xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
     """Logarithm (..., 9) of SE_2(3), the inverse of `exp_se23` for angles below pi."""
     theta = log_so3(R)
-    J = left_jacobian_so3(theta)
+    _, J = exp_and_left_jacobian(theta)
     rho = np.linalg.solve(J, np.stack([v, p], axis=-1))
     return np.concatenate([theta, rho[..., 0], rho[..., 1]], axis=-1)
 

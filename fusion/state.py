@@ -133,7 +133,7 @@ class Health:
         mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
         fixes: absolute fixes applied (of these gated), and left out by reason.
-        zero_velocity: measurements of rest (one per state at rest) applied, and left out by reason.
+        zero_velocity: updates at rest (one per state there) applied, and left out by reason.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.

@@ -19,7 +19,7 @@ from stario.network.runtime.engines import Engine, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import WINDOW_SAMPLES, WINDOW_SECONDS
+from stario.sequences.windows import WINDOW_SAMPLES
 
 if TYPE_CHECKING:  # an exported graph does without PyTorch
     from stario.network.displacement import DisplacementNetwork
@@ -95,14 +95,6 @@ class DisplacementModel:
         mean, log_sigma, after = self._engine.run(window, state)
         assert after is not None  # a state that is given comes back
         return *self._calibrated(mean, log_sigma), after
-
-    def predict_velocity(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Mean velocity over each window (B, 3) [m/s] and covariance (B, 3, 3) [m^2/s^2].
-
-        The arguments and errors are those of `predict`.
-        """
-        displacement, covariance = self.predict(windows)
-        return displacement / WINDOW_SECONDS, covariance / WINDOW_SECONDS**2
 
     def _calibrated(
         self, mean: NDArray[np.float32], log_sigma: NDArray[np.float32]

@@ -52,9 +52,9 @@ class Wing(nn.Module):
 class DualWingStarBlock(nn.Module):
     """DWSB: depthwise convolution, star operation, channel wing plus time wing."""
 
-    def __init__(self, channels: int, expansion: int = 2) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        inner = expansion * channels
+        inner = 2 * channels
         self.depthwise = nn.Conv1d(channels, channels, 3, padding=1, groups=channels, bias=False)
         self.norm = nn.BatchNorm1d(channels)
         self.branch_gate = nn.Conv1d(channels, inner, 1)

@@ -64,7 +64,7 @@ class Coverage:
         rate_hz: median rate of the truth [Hz].
         gaps: in it, longer than what is interpolated across.
         longest_gap_s: [s].
-        path_m: length of the way [m].
+        path_m: length of the path [m].
     """
 
     share: float

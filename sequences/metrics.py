@@ -24,7 +24,7 @@ CONVENTIONS: dict[str, str] = {
     "rte_m": "relative trajectory error [m]: root mean square of the norm of the displacement "
     "error over 60 s, in world axes; for tracks shorter than that the end-to-end displacement "
     "error scaled by 60 s / length",
-    "pde": "position drift error [1]: final position error / length of the true way",
+    "pde": "position drift error [1]: final position error / length of the true path",
     "aye_rad": "absolute yaw error [rad]: root mean square of the wrapped yaw error, which is the "
     "twist about the vertical of R_estimate R_truth^T",
     "nees": "normalised estimation error squared of the position [1]: error^T covariance^-1 error, "
@@ -33,11 +33,11 @@ CONVENTIONS: dict[str, str] = {
     "the number of components",
     "coverage": "share [1] of the estimate's poses at whose time the truth is known; the truth is "
     "interpolated linearly, never across its gaps",
-    "path_m": "length of the true way [m] along 1 s chords, within the times compared",
+    "path_m": "length of the true path [m] along 1 s chords, within the times compared",
     "duration_s": "time [s] between the first and the last pose compared",
     "alignment": "what is done to the estimate before: none; first (yaw and position of the first "
     "common pose); yaw (least squares in yaw and position); tilt is never changed",
-    "horizontal": "true: position errors and way in x and y alone; false: in x, y and z",
+    "horizontal": "true: position errors and path in x and y alone; false: in x, y and z",
     "convention": "rms as said above; ronin averages the squares over coordinates too, as RoNIN's "
     "code does, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
     "norms, not squares, as TLIO's code does; PDE and AYE are the same in all",
@@ -49,7 +49,7 @@ class TrackMetrics:
     """Errors of one track, see `CONVENTIONS`; lengths in m, angles in rad, times in s.
 
     `rte_m` is nan where gaps leave no pair of poses `rte_interval_s` apart, `pde` where the true
-    way has no length. `rte_scaled` tells that the track was shorter than the interval.
+    path has no length. `rte_scaled` tells that the track was shorter than the interval.
     """
 
     ate_m: float

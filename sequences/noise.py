@@ -31,3 +31,7 @@ class ImuNoise:
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(item.name, repr(value), "a finite density >= 0")
+
+
+PHONE_NOISE = ImuNoise(gyro_noise=2e-4, accel_noise=2e-3, gyro_walk=2e-5, accel_walk=2e-4)
+"""Of a phone's own sensors; what a filter assumes is larger, for errors of scale count as noise."""

@@ -79,23 +79,24 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     Raises:
         InputError: there is nothing to draw.
     """
-    ways = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
+    paths = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
     way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
-    boxes = {name: box_of(way) for name, way in ways.items() if np.isfinite(way).any()}
+    boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
     if way_truth is not None and np.isfinite(way_truth[1]).any():
-        way_home = way_truth[1]
+        typical = way_truth[1]
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track that did not run away.
-        way_home = ways[sorted(boxes, key=lambda name: size_of(boxes[name]))[(len(boxes) - 1) // 2]]
+        by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
+        typical = paths[by_size[(len(boxes) - 1) // 2]]
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
-    home = box_of(way_home)
+    home = box_of(typical)
     near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
     frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
-    fine = 0.6 if rounds(way_home, home) > _CROWDED else 1.0
+    fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
     if way_truth is not None:
         _draw_way(axes, way_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
@@ -103,7 +104,7 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
         far = excess(box, home)
         if far > 0.5 * size_of(home):
             label += f" (leaves the figure, by {_distance(far)})"
-        _draw_way(axes, ways[name], label, colour, width=1.3 * fine, order=3)
+        _draw_way(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
     axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
@@ -307,7 +308,7 @@ def _broken(
 
 
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Speed [m/s] along 1 s chords, as the length of the way is measured."""
+    """Speed [m/s] along 1 s chords, as the length of the path is measured."""
     step = 1.0
     ticks = second_ticks(truth.time)
     if len(ticks) < 2 or truth.valid.sum() < 2:
@@ -323,10 +324,10 @@ def _distance(metres: float) -> str:
 
 
 def _draw_way(
-    axes: Axes, way: FloatArray, label: str, colour: str, width: float, order: int
+    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
 ) -> None:
-    axes.plot(way[:, 0], way[:, 1], color=colour, lw=width, label=label, zorder=order)
-    known = way[np.isfinite(way).all(axis=1)]
+    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
+    known = path[np.isfinite(path).all(axis=1)]
     axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
     axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
 

@@ -149,7 +149,7 @@ class Trajectory:
         )
 
     def path_length(self) -> float:
-        """Length of the way [m] along 1 s chords, so that sensor noise does not add to it."""
+        """Length of the path [m] along 1 s chords, so that sensor noise does not add to it."""
         known = np.flatnonzero(self.valid)
         if len(known) < 2:
             return 0.0

@@ -67,6 +67,11 @@ class WorldStream:
     def __len__(self) -> int:
         return len(self.imu_W)
 
+    def part(self, start: int, stop: int) -> WorldStream:
+        """Samples from start to before stop, none where there are none."""
+        part = slice(start, max(stop, start))
+        return WorldStream(self.name, self.imu_W[part], self.position_W[part], self.facing_W[part])
+
 
 @dataclass(frozen=True, eq=False)
 class LevelledImu:
@@ -132,18 +137,20 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     return np.where((widths > 0.25 * step)[:, None], means, _interpolate(grid, time, values))
 
 
+_SHORTEST_SECONDS = 2.0 * WINDOW_SECONDS
+
+
 def world_streams(
     sequence: ImuSequence,
-    min_seconds: float = 2.0 * WINDOW_SECONDS,
     attitude: Attitude = "levelled",
 ) -> list[WorldStream]:
     """Cut a recording with truth into unbroken 200 Hz stretches in the world frame.
 
-    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`).
+    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); those
+    shorter than two windows are left out.
 
     Args:
         sequence: the recording.
-        min_seconds: shorter stretches are left out [s].
         attitude: "levelled" by the IMU with the true heading, or "true". A device that was mounted
             askew, or a truth that is, shows in the mean specific force under the true attitude:
             a network learns from it which way the device faces, and misses that in use.
@@ -165,7 +172,7 @@ def world_streams(
             facing_W=world.facing[start:stop],
         )
         for start, stop in runs(world.usable)
-        if (stop - start) / WINDOW_RATE >= min_seconds
+        if (stop - start) / WINDOW_RATE >= _SHORTEST_SECONDS
     ]
 
 

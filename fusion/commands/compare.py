@@ -90,8 +90,8 @@ def _print_comparison(comparison: Comparison) -> None:
 
     sequence = comparison.sequence
     path = comparison.path_m
-    way = f"truth: {sequence.truth_words()}" if path is None else f"{path:.1f} m"
-    typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {way}")
+    length = f"truth: {sequence.truth_words()}" if path is None else f"{path:.1f} m"
+    typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {length}")
     time = comparison.tracks["ekf"].time
     words = metric_words(comparison.alignment)
     typer.echo(track_table(comparison.metrics, time, sequence.truth, words))

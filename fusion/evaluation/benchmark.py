@@ -19,6 +19,12 @@ from stario.fusion.lie import FloatArray
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 
+_DURATION, _IMU_RATE, _UPDATE_RATE, _WINDOW = 5.0, 200.0, 20.0, 1.0
+"""Of the data [s], [Hz], [Hz], [s]."""
+
+_RUNS = 9
+"""Of each engine, in turn; the fastest counts."""
+
 
 class DenseEkf(StateCloningEkf):
     """The same filter through filterpy's own `predict` and `update` on the full matrices."""
@@ -67,46 +73,27 @@ class FilterSpeed:
         return self.dense / self.structured
 
 
-def filter_speed(
-    duration: float = 5.0,
-    imu_rate: float = 200.0,
-    update_rate: float = 20.0,
-    window: float = 1.0,
-    runs: int = 9,
-    seed: int = 0,
-) -> FilterSpeed:
-    """Time the filter on a swaying device that is measured by displacements.
-
-    Args:
-        duration: length of the data [s]; its cost is scaled to a minute.
-        imu_rate: samples per second [Hz].
-        update_rate: displacements per second [Hz].
-        window: length of the displacement's window [s].
-        runs: how often each engine runs, in turn; the fastest counts.
-        seed: of the sensor's and the measurement's noise.
-    """
-    data = _SwayingDevice(duration, imu_rate, update_rate, window, seed)
-    slots = round(update_rate * window) + 1
+def filter_speed() -> FilterSpeed:
+    """Time the filter on a swaying device that is measured by displacements."""
+    data, slots = _SwayingDevice(), round(_UPDATE_RATE * _WINDOW) + 1
     engines = [StateCloningEkf(slots), DenseEkf(slots)]
     best = np.full(3, np.inf)
-    for _ in range(runs):
+    for _ in range(_RUNS):
         seconds = [_timed(data.run, ekf) for ekf in engines]
         best = np.minimum(best, [*seconds, _timed(data.preintegrate)])
-    structured, dense, folding = (best * 60.0 / duration).tolist()
+    structured, dense, folding = (best * 60.0 / _DURATION).tolist()
     return FilterSpeed(structured, dense, folding, engines[0].dim_x)
 
 
 class _SwayingDevice:
     """IMU samples and displacements of a device that sways about one place."""
 
-    def __init__(
-        self, duration: float, imu_rate: float, update_rate: float, window: float, seed: int
-    ) -> None:
-        rng = np.random.default_rng(seed)
-        self.per_segment = round(imu_rate / update_rate)
-        self.per_window = round(update_rate * window)
-        n = round(duration * update_rate) * self.per_segment + 1
-        self.time = np.arange(n) / imu_rate
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.per_segment = round(_IMU_RATE / _UPDATE_RATE)
+        self.per_window = round(_UPDATE_RATE * _WINDOW)
+        n = round(_DURATION * _UPDATE_RATE) * self.per_segment + 1
+        self.time = np.arange(n) / _IMU_RATE
         sway = np.sin(2.0 * np.pi * self.time)[:, None]
         self.gyro = sway * [0.5, -0.3, 0.8] + rng.normal(0.0, 0.01, (n, 3))
         self.accel = np.array([0.0, 0.0, STANDARD_GRAVITY]) + sway + rng.normal(0.0, 0.1, (n, 3))

@@ -55,13 +55,13 @@ METRIC_WORDS = {
 }
 """What every figure in `metrics.json` means."""
 
-_FITTED = "yaw and position of least squared error over all poses, for fixes gave the world"
+_FITTED = "yaw and position of least squared error over all poses, for fixes gave the frame"
 
 
 def alignment_with(fixes: Sequence[Fix]) -> Alignment:
     """How a track is aligned with the truth.
 
-    Where fixes give the world, the first pose's yaw is the one that is known least.
+    Where fixes give the frame, the first pose's yaw is the one that is known least.
     """
     return "yaw" if fixes else "first"
 
@@ -90,7 +90,7 @@ class Comparison:
 
     @property
     def path_m(self) -> float | None:
-        """Length of the true way [m], None without truth."""
+        """Length of the true path [m], None without truth."""
         truth = self.sequence.truth
         return None if truth is None else truth.path_length()
 

@@ -128,7 +128,7 @@ def consistency(
 
 @dataclass(frozen=True, eq=False)
 class AnalyticWalk:
-    """A walk along a bending way with the bounce and sway of steps, by its closed form.
+    """A walk along a bending path with the bounce and sway of steps, by its closed form.
 
     Attributes:
         time: (N,) [s].
@@ -218,7 +218,7 @@ def _run(
 def _first_errors(
     walk: AnalyticWalk, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
-    """What is believed of the first pose, and the biases (N, 3) that are not."""
+    """The prior of the first pose, and the true biases (N, 3)."""
     f = config.filter
     tilt, yaw, velocity, position = f.tilt_sigma, yaw_sigma, f.velocity_sigma, _POSITION_SIGMA
     theta = np.array([tilt, tilt, yaw]) * rng.normal(size=3)

@@ -5,12 +5,17 @@ Drawn as those of `stario.sequences.plots`, without pyplot.
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample
+from stario.fusion.evaluation.tables import PROTOCOLS, Entry, NetworkTable, Sample, table_dict
+from stario.sequences.files import atomic_write, write_json
 from stario.sequences.sequence import FloatArray
 
 if TYPE_CHECKING:
@@ -24,6 +29,25 @@ _COLOURS = (
 )  # fmt: skip
 _STYLES = ("-", "--", ":")
 _AGAINST = "R-ResNet"
+
+
+def write_table(folder: Path, table: NetworkTable) -> list[Path]:
+    """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
+    from stario.sequences.plots import save_figure
+
+    text = io.StringIO()
+    names = list(Entry.__dataclass_fields__)
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(entry) for entry in table.entries)
+    with atomic_write(folder / "networks.csv") as file:
+        file.write(text.getvalue())
+    write_json(folder / "networks.json", table_dict(table))
+    written = [folder / "networks.csv", folder / "networks.json"]
+    for name, figure in figures(table).items():
+        save_figure(figure, folder / name)
+        written.append(folder / name)
+    return written
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:
@@ -98,7 +122,7 @@ def _pde_boxes(table: NetworkTable) -> Figure:
         axes.set_title(words, loc="left", fontsize=10)
         axes.set_ylim(bottom=0.0)
         _dress(axes)
-    panels[0].set_ylabel("PDE [% of the way]")
+    panels[0].set_ylabel("PDE [% of the path]")
     return fig
 
 
@@ -120,8 +144,8 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
 
 
 def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
-    way = sample.truth.position_W[sample.truth.valid]
-    axes.plot(way[:, 0], way[:, 1], color="black", lw=2.0, label="truth")
+    path = sample.truth.position_W[sample.truth.valid]
+    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label="truth")
     names = list(sample.tracks)
     if _AGAINST in names:
         ours = [name for name in names if name.startswith("StarIO")]
@@ -130,7 +154,7 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
         track, colour = sample.tracks[name].position_W, colours[name]
         axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=name)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
-    axes.plot(*way[0, :2], "o", mfc="white", mec=_INK, ms=8)
+    axes.plot(*path[0, :2], "o", mfc="white", mec=_INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")

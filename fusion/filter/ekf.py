@@ -227,36 +227,32 @@ class StateCloningEkf(ErrorStateEngine):
         p_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
         """Current position (3,) [m] with covariance (3, 3) [m^2]."""
         predicted = self.state.X[0, :, 4]
         residual = p_W - self.state.origin_W - predicted
         blocks = position_jacobian(predicted)
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode)
+        return self.update_linear(residual, blocks, covariance, gate)
 
     def update_velocity_W(
         self,
         v_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
     ) -> UpdateResult:
         """Current velocity (3,) [m/s] in W itself, not in its estimate, covariance (3, 3)."""
         predicted = self.state.v_W
         blocks = velocity_jacobian(predicted)
-        return self.update_linear(v_W - predicted, blocks, covariance, gate, gate_mode)
+        return self.update_linear(v_W - predicted, blocks, covariance, gate)
 
-    def update_yaw(
-        self, yaw: float, sigma: float, gate: float | None = None, gate_mode: GateMode = "inflate"
-    ) -> UpdateResult:
+    def update_yaw(self, yaw: float, sigma: float, gate: float | None = None) -> UpdateResult:
         """Current yaw [rad] as `yaw_twist` defines it; refused where the device is upside down."""
         R = self.state.R_WB
         residual = np.array([math.remainder(yaw - yaw_twist(R), 2.0 * math.pi)])
         if not math.isfinite(residual[0]):
             return UpdateResult(math.nan, 1, False, reason="yaw not defined upside down")
         covariance = np.array([[sigma * sigma]])
-        return self.update_linear(residual, yaw_jacobian(R), covariance, gate, gate_mode)
+        return self.update_linear(residual, yaw_jacobian(R), covariance, gate)
 
     def _inject(self) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""

@@ -161,7 +161,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self._log_likelihood = self._likelihood = self._mahalanobis = None
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
-        """(I - K H) P (I - K H)^T + K R K^T: dearer, but no difference of large numbers."""
+        """(I - K H) P (I - K H)^T + K R K^T: slower, but without differences of large numbers."""
         A = np.eye(self.dim_x)
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H

@@ -46,7 +46,7 @@ class Estimate:
 
 
 def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
-    """(N, n, n) of errors about the world's axes, each true minus estimate."""
+    """(N, n, n) of errors about W's axes, each true minus estimate."""
     P, X = (np.array([getattr(e, name) for e in estimates]) for name in ("P", "X"))
     return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
 

@@ -68,7 +68,7 @@ def position_jacobian(p_W: FloatArray) -> list[Block]:
 
 
 def velocity_jacobian(v_W: FloatArray) -> list[Block]:
-    """Jacobian of a velocity in the true world: theta -[v]x, rho_v I."""
+    """Jacobian of a velocity in the true W: theta -[v]x, rho_v I."""
     H = _LAST_EYE.copy()
     H[:, :3] = -skew(v_W)
     return [(0, H)]

@@ -17,10 +17,10 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import FloatArray
-from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.windows import WINDOW_SECONDS
 
-_HIDDEN = 10.0 * PHONE_IMU.noise.accel_noise
+_HIDDEN = 10.0 * PHONE_NOISE.accel_noise
 """Ten times a phone's white noise: the slow motion of a device that only looks still [m/s^1.5]."""
 
 _BY_VELOCITY = np.eye(6, 3)
@@ -46,7 +46,7 @@ def zero_velocity(stillness: StillnessDetector) -> ZeroVelocity:
     rates = stillness.mean_rates()
     n = len(rates)
     hidden = _HIDDEN**2 * WINDOW_SECONDS
-    white = PHONE_IMU.noise.gyro_noise**2 / stillness.mean_seconds()
+    white = PHONE_NOISE.gyro_noise**2 / stillness.mean_seconds()
     spread = np.maximum(rates.var(axis=0), white)
     return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden] * 3, *(n * spread)]))
 

@@ -150,7 +150,7 @@ class Prior:
 class Displacement:
     """The network's displacement from keyframe i to keyframe j.
 
-    The network saw the window in a levelled frame N, whose yaw against the world is that of
+    The network saw the window in a levelled frame N, whose yaw against W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
     pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also learn
     tilt from it, which on some recordings doubles the error.

@@ -33,7 +33,7 @@ class ImuInterval:
         gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
         anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
         flags: whether samples of either sensor are saturated or were spikes.
-        suspect: whether samples of the window's are.
+        window_flagged: whether samples of the window's are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
         update: whether windows begin and end at this interval's end.

@@ -1,10 +1,10 @@
 """Stillness: when little but a sensor's own noise is in a second of samples.
 
 The scatter of both sensors over the last second is held against the white noise of a phone's IMU
-(`PHONE_IMU`), which a hand's tremor or a trolley's wheels exceed. The filter's own densities are no
-measure here: they stand for errors of scale and alignment, which only motion brings. That an even
-glide looks still as well is left to the zero-velocity update's own chi-square test (README.md,
-"Zero velocity").
+(`PHONE_NOISE`), which a hand's tremor or a trolley's wheels exceed. The filter's own densities are
+no measure here: they stand for errors of scale and alignment, which only motion brings. That an
+even glide looks still as well is left to the zero-velocity update's own chi-square test
+(README.md, "Zero velocity").
 
 Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
 sensors); the scatter about the mean replaces their known gravity and bias.
@@ -17,7 +17,7 @@ import numpy as np
 from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray
-from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.noise import PHONE_NOISE
 
 _PROBABILITY = 0.999
 """That a sensor at rest looks still."""
@@ -67,7 +67,7 @@ class StillnessDetector:
         total = accel.sum(axis=0)
         scatter = float(np.vdot(accel, accel) - total @ total / count)
         bound = self._bound(count * self._intervals, count / (interval.stop - interval.start))
-        return scatter > bound * PHONE_IMU.noise.accel_noise**2
+        return scatter > bound * PHONE_NOISE.accel_noise**2
 
     def _quiet(self, sums: FloatArray) -> bool:
         """Whether a second may scatter like this."""
@@ -76,8 +76,8 @@ class StillnessDetector:
         bound = self._bound(count, count / float(sums[1]))
         gyro, accel = float(scatter[:3].sum()), float(scatter[3:].sum())
         return (
-            gyro <= bound * PHONE_IMU.noise.gyro_noise**2
-            and accel <= bound * PHONE_IMU.noise.accel_noise**2
+            gyro <= bound * PHONE_NOISE.gyro_noise**2
+            and accel <= bound * PHONE_NOISE.accel_noise**2
         )
 
     def _bound(self, count: float, rate: float) -> float:

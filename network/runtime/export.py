@@ -13,18 +13,20 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.model import DisplacementModel
 from stario.network.runtime.graph_form import graph_form
 from stario.network.runtime.onnx_file import CARD_KEY, onnx_packages
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
 
 _UNITS = {
     "windows": "rows gyro xyz [rad/s], accel xyz (specific force) [m/s^2]; 200 samples at 200 Hz",

@@ -28,9 +28,10 @@ from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers, workers
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegSampler, LegStream, leg_loss, leg_samplers
+from stario.network.training.weak_truth import LegSampler, leg_loss, leg_samplers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
+from stario.sequences.legs import LegStream
 from stario.sequences.windows import WorldStream
 
 log = logging.getLogger(__name__)
@@ -58,6 +59,7 @@ def train(
     start_from: DisplacementModel | None = None,
     keep_calibration: bool = False,
     legs: Sequence[LegStream] = (),
+    validation_legs: Sequence[LegStream] = (),
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
@@ -74,6 +76,7 @@ def train(
         keep_calibration: keep that model's calibration, for a last stage that learns from the
             validation recordings as well: their errors then say nothing any more.
         legs: stretches of weak truth, positions or waypoints, to learn from besides.
+        validation_legs: some that choose the weights besides.
 
     Returns:
         Path of the model's weights.
@@ -88,14 +91,14 @@ def train(
         raise InputError("streams", "none", "stretches of at least 2 s with truth")
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
-        material = _material([streams, validation, legs], weights, start_from)
+        material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = _Run(config, sampler, leg_samplers(config, legs, sampler), material, folder, these)
         if start_from is not None:
             run.start_from(start_from)
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
-        held_out = ValidationSet(validation, run.device)
+        held_out = ValidationSet(validation, run.device, validation_legs, config)
         while run.step < config.steps and run.epochs_since_best() < config.patience:
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)

@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
+from stario.sequences.noise import PHONE_NOISE, ImuNoise
 from stario.sequences.sequence import (
     GAP_STEPS,
     MAX_TRUTH_GAP,
@@ -78,7 +78,7 @@ PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
 """No error at all."""
 
 PHONE_IMU = ImuErrors(
-    noise=ImuNoise(gyro_noise=2e-4, accel_noise=2e-3, gyro_walk=2e-5, accel_walk=2e-4),
+    noise=PHONE_NOISE,
     gyro_turn_on=5e-3,
     accel_turn_on=0.05,
     gyro_scale=0.01,

@@ -38,8 +38,12 @@ def stretch(name: str, seconds: float) -> ImuSequence:
     return recording.slice(start, start + seconds)
 
 
-@pytest.mark.parametrize("name", [OXIOD, TUMVI, EUROC])
-def test_recordings_of_every_format_run_through(model: DisplacementModel, name: str) -> None:
+# Measured 0.24, 0.82 and 20 m in 20 s; a platform in flight is not for a network of walks, but the
+# IMU alone is 300 m off there.
+@pytest.mark.parametrize(("name", "worst_m"), [(OXIOD, 0.5), (TUMVI, 1.5), (EUROC, 40.0)])
+def test_recordings_of_every_format_run_through(
+    model: DisplacementModel, name: str, worst_m: float
+) -> None:
     recording = stretch(name, 20.0)
     result = compare(model, recording, NavigatorConfig())
     track = result.tracks["ekf"]
@@ -51,8 +55,7 @@ def test_recordings_of_every_format_run_through(model: DisplacementModel, name: 
         assert np.isfinite(figures["ate_m"]), name_
     sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
     assert (sigma > 0.0).all()
-    # A platform in flight is not for a network of walks; it too must not run away.
-    assert result.metrics["ekf"]["ate_m"] < max(5.0, result.metrics["inertial"]["ate_m"])
+    assert result.metrics["ekf"]["ate_m"] < worst_m
 
 
 @pytest.mark.parametrize("name", [OXIOD, TUMVI])
