@@ -6,6 +6,8 @@ from types import ModuleType
 
 import numpy as np
 
+from stario.network import load_model
+
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 
 
@@ -17,7 +19,15 @@ def load(name: str) -> ModuleType:
 
 
 def test_every_example_is_tested_here():
-    tested = {"run_recording", "compare_tracks", "streaming", "train_own", "cluster", "replay_live"}
+    tested = {
+        "run_recording",
+        "compare_tracks",
+        "streaming",
+        "train_own",
+        "cluster",
+        "replay_live",
+        "fine_tune",
+    }
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
 
 
@@ -45,6 +55,13 @@ def test_train_own_leaves_weights_that_predict(tmp_path):
     mean, covariance = model.predict(np.zeros((2, 6, 200)))
     assert mean.shape == (2, 3)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
+    model = load("fine_tune").main(tmp_path)
+    assert model.card.calibration == load_model("default").card.calibration
+    mean, _ = model.predict(np.zeros((1, 6, 200)))
+    assert np.isfinite(mean).all()
 
 
 def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken_one(tmp_path):
