@@ -71,7 +71,8 @@ class DisplacementModel:
                 into a gravity-aligned frame (z up, any yaw).
 
         Returns:
-            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame.
+            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; wider
+            where a window lies outside what the weights know (`stario.network.known_motion`).
 
         Raises:
             InputError: the shape does not fit or a value is not finite.
@@ -80,7 +81,7 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self._engine.run(batch)
-        return self._calibrated(mean, log_sigma)
+        return self._calibrated(batch, mean, log_sigma)
 
     def predict_after(
         self, window: NDArray[np.float32], state: NDArray[np.float32] | None
@@ -94,12 +95,17 @@ class DisplacementModel:
             state = self._engine.first_state()
         mean, log_sigma, after = self._engine.run(window, state)
         assert after is not None  # a state that is given comes back
-        return *self._calibrated(mean, log_sigma), after
+        return *self._calibrated(window, mean, log_sigma), after
 
     def _calibrated(
-        self, mean: NDArray[np.float32], log_sigma: NDArray[np.float32]
+        self,
+        windows: NDArray[np.float32],
+        mean: NDArray[np.float32],
+        log_sigma: NDArray[np.float32],
     ) -> tuple[FloatArray, FloatArray]:
         variance = self.card.calibration.variance(log_sigma.astype(np.float64))
+        if self.card.known_motion is not None:
+            variance *= self.card.known_motion.variance_factor(windows)[:, None]
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from stario.sequences.files import read_tum as read_tum
     from stario.sequences.files import write_tum as write_tum
     from stario.sequences.inspection import inspect_recording as inspect_recording
+    from stario.sequences.legs import LegStream as LegStream
+    from stario.sequences.legs import leg_streams as leg_streams
     from stario.sequences.metrics import align as align
     from stario.sequences.metrics import evaluate_track as evaluate_track
     from stario.sequences.metrics import position_nees as position_nees
@@ -50,6 +52,8 @@ _MODULES = {
     "InputError": "errors",
     "MagneticField": "simulation.magnetometer",
     "Magnetometer": "sequence",
+    "LegStream": "legs",
+    "leg_streams": "legs",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
     "PositionTrack": "sequence",
@@ -88,6 +92,7 @@ __all__ = [
     "ImuNoise",
     "ImuSequence",
     "InputError",
+    "LegStream",
     "MagneticField",
     "Magnetometer",
     "PositionTrack",
@@ -103,6 +108,7 @@ __all__ = [
     "find_recordings",
     "generate_walk",
     "inspect_recording",
+    "leg_streams",
     "position_nees",
     "read_recording",
     "read_tum",

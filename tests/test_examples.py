@@ -11,6 +11,8 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from stario.network import load_model
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples"
 
@@ -23,8 +25,17 @@ def load(name: str) -> ModuleType:
 
 
 def test_every_example_is_tested_here():
-    tested = {"run_recording", "compare_tracks", "streaming", "train_own", "cluster"}
-    tested |= {"replay_live", "streaming_onnx", "ros2_node"}
+    tested = {
+        "run_recording",
+        "compare_tracks",
+        "streaming",
+        "train_own",
+        "cluster",
+        "replay_live",
+        "fine_tune",
+        "streaming_onnx",
+        "ros2_node",
+    }
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
 
 
@@ -54,6 +65,13 @@ def test_train_own_leaves_weights_that_predict(tmp_path):
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
+def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
+    model = load("fine_tune").main(tmp_path)
+    assert model.card.calibration == load_model("default").card.calibration
+    mean, _ = model.predict(np.zeros((1, 6, 200)))
+    assert np.isfinite(mean).all()
+
+
 def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken_one(tmp_path):
     scores, skipped, workers = load("cluster").main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
@@ -66,7 +84,6 @@ def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken
 
 def test_replay_live_ends_where_a_run_on_the_recording_it_left_does():
     from stario.fusion import Navigator
-    from stario.network import load_model
     from stario.sequences import read_recording
 
     taken, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
@@ -79,7 +96,6 @@ def test_replay_live_ends_where_a_run_on_the_recording_it_left_does():
 def test_streaming_onnx_never_imports_torch_and_gives_torchs_track(tmp_path):
     pytest.importorskip("onnxscript", reason="pip install 'stario[onnx]'")
     pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
-    from stario.network import load_model
     from stario.network.runtime.export import export_onnx
 
     model, path = load_model("default"), tmp_path / "default.onnx"
@@ -118,7 +134,6 @@ def fix_at(stamp_ns, xyz, sigma):
 
 def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
     from stario.fusion import Navigator
-    from stario.network import load_model
 
     example = load("ros2_node")
     check_odometry(example.main(seconds=6.0))

@@ -192,8 +192,8 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 def _force(files: PhoneFiles, gyro: Samples, g_unnamed: bool) -> tuple[Samples, set[str]]:
     """Specific force, and whether its unit or sign were converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
-    whole = next((found for found in candidates if _has_gravity(found)), None)
-    gravity = None if whole else _gravity(files)
+    gravity = _gravity(files)
+    whole = next((one for one in candidates if _has_gravity(one, gravity is None)), None)
     linear = files.first("linear")
     if whole is None and not candidates and linear is not None:
         candidates = [_read(linear, "linear")]
@@ -219,9 +219,10 @@ def gyro_folder(files: PhoneFiles) -> Path:
     return files.gyro.parent
 
 
-def _has_gravity(accel: Samples) -> bool:
+def _has_gravity(accel: Samples, or_g: bool) -> bool:
+    """Whether samples hold gravity, in m/s^2 or perhaps in g."""
     size = float(np.median(np.linalg.norm(accel.values, axis=1)))
-    return size >= _GRAVITY_REMOVED or is_in_g(accel.values)
+    return size >= _GRAVITY_REMOVED or (or_g and is_in_g(accel.values))
 
 
 def _gravity(files: PhoneFiles) -> Samples | None:

@@ -247,6 +247,34 @@ def test_an_apps_export_is_the_walk(app: str, walk: ImuSequence, tmp_path: Path)
     np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
 
 
+def test_old_apps_unit_signs_and_other_languages_are_read(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    androsensor(tmp_path / "s", walk)
+    (path,) = (tmp_path / "s").iterdir()
+    path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
+    np.testing.assert_allclose(read_recording(path).accel, walk.accel)
+    for name, words, values in (
+        ("Beschleunigungssensor", "Beschleunigung", walk.accel), ("Gyroskop", "Drehrate", walk.gyro)
+    ):  # fmt: skip
+        header = '"Zeit (s)","' + '","'.join(f"{words} {axis}" for axis in "xyz") + '"'
+        save(tmp_path / f"t/{name}.csv", header, walk.time, values)
+    np.testing.assert_allclose(read_recording(tmp_path / "t").accel, walk.accel)
+
+
+def test_a_linear_acceleration_of_about_one_is_not_gravity_in_g(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    """Its size is that of g; the file of gravity beside says what it is."""
+    sensor_logger_ios(tmp_path / "s", walk)
+    (tmp_path / "s/Metadata.csv").unlink()
+    steady = np.tile([0.6, -0.6, 0.5], (len(walk), 1))
+    for name, values in (("Accelerometer", steady), ("Gravity", gravity(walk))):
+        save(tmp_path / f"s/{name}.csv", ZYX, ns(walk), walk.time, values[:, ::-1])
+    read = read_recording(tmp_path / "s")
+    np.testing.assert_allclose(read.accel, gravity(walk) + steady, atol=1e-8)
+
+
 @pytest.mark.parametrize("inner", ["", "walk/"])
 @pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
 def test_a_zip_is_the_folder_in_it(app: str, inner: str, walk: ImuSequence, tmp_path: Path) -> None:
