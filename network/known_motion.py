@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.legs import LegStream
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
@@ -25,7 +26,7 @@ from stario.sequences.windows import (
     WINDOW_SECONDS,
     WorldStream,
     window_starts,
-    windows_at,
+    windows_in,
 )
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
@@ -150,28 +151,39 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
     return np.asarray(frequency[walked][np.argmax(power[:, walked], axis=1)])
 
 
-def known_motion(streams: Sequence[WorldStream], seed: int = 0) -> KnownMotion:
+def known_motion(
+    streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
+) -> KnownMotion:
     """What weights know that were trained on these streams.
 
     Args:
         streams: at least a window in all.
+        legs: those of weak truth.
         seed: of the choice of windows and of the first centres.
     """
-    stride = max(20, sum(len(stream) for stream in streams) // _MOST_WINDOWS)
-    parts = [
-        (features(windows), np.linalg.norm(displacement[:, :2], axis=1) / WINDOW_SECONDS)
-        for stream in streams
-        if len(starts := window_starts(stream, stride))
-        for windows, displacement in (windows_at(stream, starts),)
-    ]
-    values = np.concatenate([part for part, _ in parts])
+    levelled = [*(s.imu_W for s in streams), *(s.imu_N for s in legs)]
+    stride = max(20, sum(map(len, levelled)) // _MOST_WINDOWS)
+    parts = [features(windows_in(imu, starts)) for imu in levelled
+             if len(starts := window_starts(imu, stride))]  # fmt: skip
+    values = np.concatenate(parts)
     told = {
-        "step_rate": np.concatenate([step_rates(stream.imu_W) for stream in streams]),
-        "speed": np.concatenate([speed for _, speed in parts]),
+        "step_rate": np.concatenate([step_rates(imu) for imu in levelled]),
+        "speed": np.concatenate([*map(_speeds, streams), *map(_leg_speeds, legs)]),
     }
     centres, limit = _centres(described(values), seed)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
+
+
+def _speeds(stream: WorldStream) -> FloatArray:
+    """Mean horizontal speed of each second [m/s]."""
+    moved = np.diff(stream.position_W[::WINDOW_SAMPLES, :2], axis=0)
+    return np.asarray(np.linalg.norm(moved, axis=1) / WINDOW_SECONDS, dtype=np.float64)
+
+
+def _leg_speeds(legs: LegStream) -> FloatArray:
+    moved = np.linalg.norm(legs.displacement[:, :2], axis=1)
+    return np.asarray(moved / (legs.stop - legs.start))
 
 
 def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...], float]:
