@@ -11,7 +11,7 @@ twice the mean NIS, but only 2 to 22 % by the ranges.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
-from stario.sequences.windows import (
-    WINDOW_RATE,
-    WINDOW_SAMPLES,
-    WINDOW_SECONDS,
-    WorldStream,
-    window_starts,
-    windows_in,
-)
+from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
 """Root mean square of linear acceleration [m/s^2] and rate [rad/s]; shares [1] of the
@@ -38,6 +31,7 @@ STEP_SECONDS = 5.0
 
 _CENTRES = 200
 _MOST_WINDOWS = 20_000
+_AT_ONCE = 256
 _WALKING = 0.3
 _PERCENTILE = 95.0
 
@@ -157,33 +151,34 @@ def known_motion(
     """What weights know that were trained on these streams.
 
     Args:
-        streams: at least a window in all.
-        legs: those of weak truth.
+        streams: with full truth; at least a window in all.
+        legs: with weak truth.
         seed: of the choice of windows and of the first centres.
     """
-    levelled = [*(s.imu_W for s in streams), *(s.imu_N for s in legs)]
-    stride = max(20, sum(map(len, levelled)) // _MOST_WINDOWS)
-    parts = [features(windows_in(imu, starts)) for imu in levelled
-             if len(starts := window_starts(imu, stride))]  # fmt: skip
-    values = np.concatenate(parts)
+    imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
+    stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
+    values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
     told = {
-        "step_rate": np.concatenate([step_rates(imu) for imu in levelled]),
-        "speed": np.concatenate([*map(_speeds, streams), *map(_leg_speeds, legs)]),
+        "step_rate": np.concatenate([step_rates(imu) for imu in imus]),
+        "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
     centres, limit = _centres(described(values), seed)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
 
 
-def _speeds(stream: WorldStream) -> FloatArray:
-    """Mean horizontal speed of each second [m/s]."""
-    moved = np.diff(stream.position_W[::WINDOW_SAMPLES, :2], axis=0)
-    return np.asarray(np.linalg.norm(moved, axis=1) / WINDOW_SECONDS, dtype=np.float64)
+def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
+    """Windows (B, 6, 200) every `stride` samples, few at a time."""
+    starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
+    for first in range(0, len(starts), _AT_ONCE):
+        rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
+        yield imu[rows].transpose(0, 2, 1)
 
 
-def _leg_speeds(legs: LegStream) -> FloatArray:
-    moved = np.linalg.norm(legs.displacement[:, :2], axis=1)
-    return np.asarray(moved / (legs.stop - legs.start))
+def _speeds(stream: WorldStream, stride: int) -> FloatArray:
+    """Horizontal speeds over the windows (B,) [m/s]."""
+    moved = stream.position_W[WINDOW_SAMPLES::stride] - stream.position_W[:-WINDOW_SAMPLES:stride]
+    return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
 
 
 def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...], float]:

@@ -14,7 +14,6 @@ lies upside down all the while, where any heading is as good as another.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sized
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -279,8 +278,8 @@ def windows_of(stream: WorldStream, stride: int) -> tuple[NDArray[np.float32], N
     return windows_at(stream, window_starts(stream, stride))
 
 
-def window_starts(stream: Sized, stride: int) -> NDArray[np.int64]:
-    """Of a stream or its samples: first samples (M,) of the windows every `stride` samples."""
+def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
+    """First samples (M,) of the windows every `stride` samples."""
     return np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
 
 
@@ -291,14 +290,9 @@ def windows_at(
 
     Frame H is that turned by minus `headings_at`.
     """
-    windows = windows_in(stream.imu_W, starts)
-    return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
-
-
-def windows_in(imu: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Windows (M, 6, 200) of samples (N, 6) that begin at `starts` (M,)."""
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    return np.ascontiguousarray(imu[rows].transpose(0, 2, 1))
+    windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
+    return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
 
 
 def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> FloatArray:
