@@ -11,22 +11,16 @@ twice the mean NIS, but only 2 to 22 % by the ranges.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.legs import LegStream
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
-from stario.sequences.windows import (
-    WINDOW_RATE,
-    WINDOW_SAMPLES,
-    WINDOW_SECONDS,
-    WorldStream,
-    window_starts,
-    windows_at,
-)
+from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
 """Root mean square of linear acceleration [m/s^2] and rate [rad/s]; shares [1] of the
@@ -37,6 +31,7 @@ STEP_SECONDS = 5.0
 
 _CENTRES = 200
 _MOST_WINDOWS = 20_000
+_AT_ONCE = 256
 _WALKING = 0.3
 _PERCENTILE = 95.0
 
@@ -150,28 +145,40 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
     return np.asarray(frequency[walked][np.argmax(power[:, walked], axis=1)])
 
 
-def known_motion(streams: Sequence[WorldStream], seed: int = 0) -> KnownMotion:
+def known_motion(
+    streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
+) -> KnownMotion:
     """What weights know that were trained on these streams.
 
     Args:
-        streams: at least a window in all.
+        streams: with full truth; at least a window in all.
+        legs: with weak truth.
         seed: of the choice of windows and of the first centres.
     """
-    stride = max(20, sum(len(stream) for stream in streams) // _MOST_WINDOWS)
-    parts = [
-        (features(windows), np.linalg.norm(displacement[:, :2], axis=1) / WINDOW_SECONDS)
-        for stream in streams
-        if len(starts := window_starts(stream, stride))
-        for windows, displacement in (windows_at(stream, starts),)
-    ]
-    values = np.concatenate([part for part, _ in parts])
+    imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
+    stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
+    values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
     told = {
-        "step_rate": np.concatenate([step_rates(stream.imu_W) for stream in streams]),
-        "speed": np.concatenate([speed for _, speed in parts]),
+        "step_rate": np.concatenate([step_rates(imu) for imu in imus]),
+        "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
     centres, limit = _centres(described(values), seed)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
+
+
+def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
+    """Windows (B, 6, 200) every `stride` samples, few at a time."""
+    starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
+    for first in range(0, len(starts), _AT_ONCE):
+        rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
+        yield imu[rows].transpose(0, 2, 1)
+
+
+def _speeds(stream: WorldStream, stride: int) -> FloatArray:
+    """Horizontal speeds over the windows (B,) [m/s]."""
+    moved = stream.position_W[WINDOW_SAMPLES::stride] - stream.position_W[:-WINDOW_SAMPLES:stride]
+    return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
 
 
 def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...], float]:

@@ -106,7 +106,7 @@ def train(
             if these.leads:
                 on_epoch(report)
         calibration = start_from.card.calibration if start_from and keep_calibration else None
-        return run.finish(held_out, list(trained_on), calibration, known_motion(streams))
+        return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 
 class _Run:
