@@ -8,20 +8,21 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import safetensors
-import safetensors.torch
 from numpy.typing import ArrayLike, NDArray
 
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
-from stario.network.displacement import DisplacementNetwork as DisplacementNetwork
 from stario.network.runtime.engines import Engine, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:  # an exported graph does without PyTorch
+    from stario.network.displacement import DisplacementNetwork
 
 
 class DisplacementModel:
@@ -150,6 +151,8 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
         The card with the checksum filled in.
     """
     state = {k: v.detach().cpu().contiguous() for k, v in network.network.state_dict().items()}
+    import safetensors.torch
+
     content = safetensors.torch.save(state, metadata={"architecture": card.architecture})
     card = Card(**{**vars(card), "sha256": hashlib.sha256(content).hexdigest()})
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -173,7 +176,7 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """
     path = Path(name_or_path)
     if path.suffix == ".onnx":
-        from stario.network.runtime.export import load_onnx
+        from stario.network.runtime.onnx_file import load_onnx
 
         return DisplacementModel(*load_onnx(path))
     packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
@@ -183,6 +186,10 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"
         raise WeightsError(card_path(path), "architecture", repr(card.architecture), known)
+    import safetensors.torch
+
+    from stario.network.displacement import DisplacementNetwork
+
     network = DisplacementNetwork(build_network(card.architecture))
     try:
         network.network.load_state_dict(safetensors.torch.load_file(path))
