@@ -168,7 +168,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
 
     Args:
         name_or_path: of weights in the package ("default", or "walks-36min", those before them),
-            a safetensors file with its card beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then computes.
+            a safetensors file with its card beside it, or an ONNX file of `export_onnx`, which
+            ONNX Runtime then computes.
 
     Raises:
         WeightsError: the file or its card is missing, cut short, or they do not match.
