@@ -113,6 +113,8 @@ def recording_files(path: Path) -> list[Path]:
         path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
     if path.is_dir():
         return sorted(p for p in path.rglob("*") if p.is_file())
+    if any(FORMATS[name].recognises(path) for name in ("phone", "wide")):
+        return sorted(p for p in path.parent.iterdir() if p.is_file())  # sensors, poses beside
     if not FORMATS["oxiod"].recognises(path):
         return [path]
     number = "".join(filter(str.isdigit, path.stem))

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from stario.network.architectures import architecture, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
+from stario.network.known_motion import KnownMotion, known_motion
 from stario.network.model import DisplacementModel, save_model
 from stario.network.training.augment import WindowSampler, reach_of
 from stario.network.training.calibrate import calibrate
@@ -105,7 +106,7 @@ def train(
             if these.leads:
                 on_epoch(report)
         calibration = start_from.card.calibration if start_from and keep_calibration else None
-        return run.finish(held_out, list(trained_on), calibration)
+        return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 
 class _Run:
@@ -303,7 +304,11 @@ class _Run:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
 
     def finish(
-        self, held_out: ValidationSet, trained_on: list[str], kept: Calibration | None
+        self,
+        held_out: ValidationSet,
+        trained_on: list[str],
+        kept: Calibration | None,
+        known: KnownMotion,
     ) -> Path:
         """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
         path = self.folder / "model.safetensors"
@@ -316,6 +321,7 @@ class _Run:
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
             figures={"validation_mse_m2": held_out.errors(self.averaged)},
+            known_motion=known,
         )
         save_model(path, self.averaged, card)
         return path
