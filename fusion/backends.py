@@ -152,7 +152,7 @@ def track_recording(
     return track_from_states(
         solution.states,
         estimator.innovations(),
-        replace(health, notes=solution.notes),
+        replace(health, notes=[*health.notes, *solution.notes]),
         smoothed=solution.smoothed,
         seconds_network=recording.seconds_network,
         seconds_filter=recording.seconds_front_end + perf_counter() - began,

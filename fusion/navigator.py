@@ -263,7 +263,7 @@ class Navigator:
             self._network.restart()
         displacement = None
         if interval.window is not None:
-            (displacement,) = displacements_of(self._network, [interval])
+            (displacement,) = displacements_of(self._network, [interval], self._front_end.counts)
         self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         return self._estimator.nav_state()
 

@@ -13,7 +13,7 @@ from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.imu.front_end import FrontEnd, cut_recording
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
@@ -74,7 +74,7 @@ def preprocess(
     progress(0.1)
     began = perf_counter()
     network = StatefulInference(model, config.filter.window_updates)
-    measurements = _displacements(intervals, network, progress)
+    measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
         intervals, measurements, front_end, seconds_front_end, seconds_network
@@ -82,10 +82,15 @@ def preprocess(
 
 
 def displacements_of(
-    network: StatefulInference, intervals: Sequence[ImuInterval]
+    network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
 ) -> list[Displacement]:
-    """The network's displacements of the intervals' windows, as far as it can be trusted."""
+    """The network's displacements of the intervals' windows, as far as it can be trusted.
+
+    The windows, and those that move as nothing the weights know, are counted.
+    """
     windows_N = np.stack([_window(interval) for interval in intervals])
+    counts.windows += len(windows_N)
+    counts.unfamiliar += network.unfamiliar(windows_N)
     heading = np.array([interval.heading for interval in intervals])
     return [
         (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
@@ -94,7 +99,10 @@ def displacements_of(
 
 
 def _displacements(
-    intervals: Sequence[ImuInterval], network: StatefulInference, progress: Progress
+    intervals: Sequence[ImuInterval],
+    network: StatefulInference,
+    counts: SampleCounts,
+    progress: Progress,
 ) -> list[Displacement | None]:
     measurements: list[Displacement | None] = [None] * len(intervals)
     for batch in _batches(intervals, unbroken=network.remembers):
@@ -102,7 +110,7 @@ def _displacements(
             network.restart()
         known = [k for k in batch if intervals[k].window is not None]
         if known:
-            found = displacements_of(network, [intervals[k] for k in known])
+            found = displacements_of(network, [intervals[k] for k in known], counts)
             for k, displacement in zip(known, found, strict=True):
                 measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from stario.network.known_motion import KnownMotion, known_from
 from stario.sequences.errors import WeightsError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
@@ -69,6 +70,7 @@ class Card:
         trained_on: recordings and simulations, in words.
         recipe: the command and settings that made the weights.
         figures: results on named recordings.
+        known_motion: the training windows summed up, None where nobody did.
     """
 
     architecture: str
@@ -82,6 +84,7 @@ class Card:
     trained_on: list[str] = field(default_factory=list)
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
+    known_motion: KnownMotion | None = None
     format: int = FORMAT
 
 
@@ -92,7 +95,11 @@ def card_path(weights: Path) -> Path:
 
 def dump_card(card: Card) -> str:
     """The card as JSON text."""
-    return json.dumps(asdict(card), indent=2) + "\n"
+    known = card.known_motion
+    content = {k: v for k, v in asdict(card).items() if k != "known_motion" or known is not None}
+    if known is not None:
+        content["known_motion"] = known.as_dict()
+    return json.dumps(content, indent=2) + "\n"
 
 
 def read_card(weights: Path) -> Card:
@@ -136,10 +143,12 @@ def parse_card(text: str, path: Path) -> Card:
     try:
         content = json.loads(text)
         calibration = _calibration(content.pop("calibration"))
+        known = content.pop("known_motion", None)
+        known = None if known is None else known_from(known)
         unknown = set(content) - {f.name for f in fields(Card)}
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
-        card = Card(calibration=calibration, **content)
+        card = Card(calibration=calibration, known_motion=known, **content)
         for name in ("architecture", "sha256"):
             if not isinstance(getattr(card, name), str):
                 raise ValueError(f"{name} {getattr(card, name)!r}")

@@ -8,20 +8,21 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import safetensors
-import safetensors.torch
 from numpy.typing import ArrayLike, NDArray
 
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
-from stario.network.displacement import DisplacementNetwork as DisplacementNetwork
 from stario.network.runtime.engines import Engine, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:  # an exported graph does without PyTorch
+    from stario.network.displacement import DisplacementNetwork
 
 
 class DisplacementModel:
@@ -70,7 +71,8 @@ class DisplacementModel:
                 into a gravity-aligned frame (z up, any yaw).
 
         Returns:
-            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame.
+            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; wider
+            where a window lies outside what the weights know (`stario.network.known_motion`).
 
         Raises:
             InputError: the shape does not fit or a value is not finite.
@@ -79,7 +81,7 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self._engine.run(batch)
-        return self._calibrated(mean, log_sigma)
+        return self._calibrated(batch, mean, log_sigma)
 
     def predict_after(
         self, window: NDArray[np.float32], state: NDArray[np.float32] | None
@@ -93,12 +95,17 @@ class DisplacementModel:
             state = self._engine.first_state()
         mean, log_sigma, after = self._engine.run(window, state)
         assert after is not None  # a state that is given comes back
-        return *self._calibrated(mean, log_sigma), after
+        return *self._calibrated(window, mean, log_sigma), after
 
     def _calibrated(
-        self, mean: NDArray[np.float32], log_sigma: NDArray[np.float32]
+        self,
+        windows: NDArray[np.float32],
+        mean: NDArray[np.float32],
+        log_sigma: NDArray[np.float32],
     ) -> tuple[FloatArray, FloatArray]:
         variance = self.card.calibration.variance(log_sigma.astype(np.float64))
+        if self.card.known_motion is not None:
+            variance *= self.card.known_motion.variance_factor(windows)[:, None]
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
@@ -144,6 +151,8 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
         The card with the checksum filled in.
     """
     state = {k: v.detach().cpu().contiguous() for k, v in network.network.state_dict().items()}
+    import safetensors.torch
+
     content = safetensors.torch.save(state, metadata={"architecture": card.architecture})
     card = Card(**{**vars(card), "sha256": hashlib.sha256(content).hexdigest()})
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -158,8 +167,9 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: "default" for the weights in the package, a safetensors file with its card
-            beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then computes.
+        name_or_path: of weights in the package ("default", or "walks-36min", those before them),
+            a safetensors file with its card beside it, or an ONNX file of `export_onnx`, which
+            ONNX Runtime then computes.
 
     Raises:
         WeightsError: the file or its card is missing, cut short, or they do not match.
@@ -167,16 +177,20 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """
     path = Path(name_or_path)
     if path.suffix == ".onnx":
-        from stario.network.runtime.export import load_onnx
+        from stario.network.runtime.onnx_file import load_onnx
 
         return DisplacementModel(*load_onnx(path))
-    if str(name_or_path) == "default":
-        folder = importlib.resources.files("stario.network.weights")
-        path = Path(str(folder.joinpath("default.safetensors")))
+    packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
+    if path.parent == Path() and not path.suffix and packaged.is_file():
+        path = packaged
     card = read_card(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"
         raise WeightsError(card_path(path), "architecture", repr(card.architecture), known)
+    import safetensors.torch
+
+    from stario.network.displacement import DisplacementNetwork
+
     network = DisplacementNetwork(build_network(card.architecture))
     try:
         network.network.load_state_dict(safetensors.torch.load_file(path))

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from stario.sequences.files import read_tum as read_tum
     from stario.sequences.files import write_tum as write_tum
     from stario.sequences.inspection import inspect_recording as inspect_recording
+    from stario.sequences.legs import LegStream as LegStream
+    from stario.sequences.legs import leg_streams as leg_streams
     from stario.sequences.metrics import align as align
     from stario.sequences.metrics import evaluate_track as evaluate_track
     from stario.sequences.metrics import position_nees as position_nees
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.readers.own_csv import write_csv as write_csv
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
+    from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
     from stario.sequences.sequence import Magnetometer as Magnetometer
     from stario.sequences.sequence import PositionTrack as PositionTrack
@@ -42,6 +45,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "ConfigError": "errors",
+    "DeviceAttitude": "sequence",
     "GOOD_IMU": "simulation.imu",
     "INDOOR_FIELD": "simulation.magnetometer",
     "ImuErrors": "simulation.imu",
@@ -50,6 +54,8 @@ _MODULES = {
     "InputError": "errors",
     "MagneticField": "simulation.magnetometer",
     "Magnetometer": "sequence",
+    "LegStream": "legs",
+    "leg_streams": "legs",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
     "PositionTrack": "sequence",
@@ -84,10 +90,12 @@ __all__ = [
     "PHONE_IMU",
     "STANDARD_GRAVITY",
     "ConfigError",
+    "DeviceAttitude",
     "ImuErrors",
     "ImuNoise",
     "ImuSequence",
     "InputError",
+    "LegStream",
     "MagneticField",
     "Magnetometer",
     "PositionTrack",
@@ -103,6 +111,7 @@ __all__ = [
     "find_recordings",
     "generate_walk",
     "inspect_recording",
+    "leg_streams",
     "position_nees",
     "read_recording",
     "read_tum",

@@ -166,9 +166,13 @@ def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
         lost.append("the truth's velocity has no column in CSV")
     if truth is not None and truth.position_covariance_W is not None:
         lost.append("the truth's covariance has no column")
-    if sequence.positions is not None:
-        lost.append(f"{sequence.positions.kind} without attitude have no column: write an .h5")
+    if sequence.positions is not None and layout == "euroc":
+        lost.append(
+            f"{sequence.positions.kind} have no file in the EuRoC layout: write .csv or .h5"
+        )
     if sequence.magnetometer is not None and layout == "euroc":
         lost.append("the magnetometer has no file in the EuRoC layout: write a .csv or .h5")
+    if sequence.device_attitude is not None:
+        lost.append("the device's own attitude has no column: write an .h5")
     for words in lost:
         log.warning("%s: %s", sequence.name, words)

@@ -20,16 +20,18 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
+from numpy.typing import NDArray
 
 from stario.sequences.batch import Skipped, each
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
+from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.oxiod import capture_file
@@ -37,6 +39,11 @@ from stario.sequences.sequence import ImuSequence, too_slow
 from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
+
+Stream = WorldStream | LegStream
+"""What a network learns from: with poses, or with legs between known positions."""
+
+_TABLES = {"poses": ("imu_W", "position_W", "facing_W"), "legs": ("imu_N", "facing_N", "legs")}
 
 _SUFFIX = ".streams"
 _ABANDONED_S = 3600.0
@@ -56,11 +63,11 @@ def recorded(
     folder: Path,
     jobs: int | None = None,
     attitude: Attitude = "levelled",
-) -> Iterator[list[WorldStream] | Skipped]:
+) -> Iterator[list[Stream] | Skipped]:
     """The streams of each recording, from the cache or read, checked and put there.
 
     Args:
-        paths: recordings with truth.
+        paths: recordings with poses, positions or waypoints.
         read: how a path is read; can be pickled.
         options: what `read` depends on besides the path, as plain values.
         folder: the cache's; shared with the processes that read.
@@ -80,8 +87,8 @@ def recorded(
 
 
 def cached(
-    key: Mapping[str, object], build: Callable[[], list[WorldStream]], folder: Path
-) -> list[WorldStream]:
+    key: Mapping[str, object], build: Callable[[], Sequence[Stream]], folder: Path
+) -> Sequence[Stream]:
     """What `build` returns, from the cache where something of this key is there.
 
     Args:
@@ -93,8 +100,8 @@ def cached(
     streams = _opened(file)
     if streams is not None:
         return streams
-    streams = build()
-    return (_opened(file) if _written(file, streams) else None) or streams
+    built = build()
+    return (_opened(file) if _written(file, built) else None) or built
 
 
 def recording_files(path: Path) -> list[Path]:
@@ -106,6 +113,8 @@ def recording_files(path: Path) -> list[Path]:
         path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
     if path.is_dir():
         return sorted(p for p in path.rglob("*") if p.is_file())
+    if any(FORMATS[name].recognises(path) for name in ("phone", "wide")):
+        return sorted(p for p in path.parent.iterdir() if p.is_file())  # sensors, poses beside
     if not FORMATS["oxiod"].recognises(path):
         return [path]
     number = "".join(filter(str.isdigit, path.stem))
@@ -126,7 +135,7 @@ def _stored(
     options: Mapping[str, object],
     folder: Path,
     attitude: Attitude,
-) -> Path | list[WorldStream]:
+) -> Path | list[Stream]:
     """The cache's file of a recording, or its streams where nothing can be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
@@ -139,9 +148,18 @@ def _stored(
     return file if _written(file, streams) else streams
 
 
-def _streams(sequence: ImuSequence, attitude: Attitude) -> list[WorldStream]:
+def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     check_units(sequence)
-    streams = world_streams(sequence, attitude=attitude)
+    if sequence.truth is None and sequence.positions is not None:
+        legs = leg_streams(sequence)
+        if not legs:
+            raise InputError(
+                f"{sequence.name}: {sequence.positions.kind}",
+                "no two legs in an unbroken stretch of 12 s",
+                "legs of 1.5 s and more at walking speed",
+            )
+        return list(legs)
+    streams: list[Stream] = list(world_streams(sequence, attitude=attitude))
     if not streams:
         raise InputError(
             f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from",
@@ -172,17 +190,18 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-def _written(file: Path, streams: list[WorldStream]) -> bool:
+def _written(file: Path, streams: Sequence[Stream]) -> bool:
     """Whether the streams could be put into the cache, which runs do without if need be."""
     if not streams:
         return False
-    imu_W = np.concatenate([s.imu_W for s in streams])
-    position_W = np.concatenate([s.position_W for s in streams])
-    facing_W = np.concatenate([s.facing_W for s in streams])
-    streams_of = json.dumps([(stream.name, len(stream)) for stream in streams])
+    tables = [_tables(stream) for stream in streams]
+    told = [
+        {"name": s.name, "kind": getattr(s, "kind", "poses"), "rows": [len(v) for v in t.values()]}
+        for s, t in zip(streams, tables, strict=True)
+    ]
     content = safetensors.numpy.save(
-        {"imu_W": imu_W, "position_W": position_W, "facing_W": facing_W},
-        metadata={"streams": streams_of},
+        {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
+        metadata={"streams": json.dumps(told)},
     )
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -202,35 +221,57 @@ def _sweep(file: Path) -> None:
             left.unlink(missing_ok=True)
 
 
-def _opened(file: Path) -> list[WorldStream] | None:
+def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
+    """A stream's numbers, by name; those of one name have their rows in common over streams."""
+    if isinstance(stream, WorldStream):
+        return {name: getattr(stream, name) for name in _TABLES["poses"]}
+    legs = [stream.start, stream.stop, stream.displacement, stream.sigma]
+    return {
+        "imu_N": stream.imu_N,
+        "facing_N": stream.facing_N,
+        "legs": np.column_stack(legs).astype(np.float64),
+    }
+
+
+def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
+    """The stream of `_tables`."""
+    if kind == "poses":
+        return WorldStream(name, **tables)
+    legs = tables["legs"]
+    return LegStream(
+        name, kind, tables["imu_N"], tables["facing_N"],
+        legs[:, 0], legs[:, 1], legs[:, 2:5], legs[:, 5:7],
+    )  # fmt: skip
+
+
+def _opened(file: Path) -> list[Stream] | None:
     """Streams whose numbers are read when they are used; None where the file is not whole."""
     try:
         size = file.stat().st_size
         with file.open("rb") as source:
             length = int.from_bytes(source.read(8), "little")
             header = json.loads(source.read(min(length, size)))
-        names, lengths = zip(*json.loads(header["__metadata__"]["streams"]), strict=True)
-        if size != 8 + length + sum(lengths) * 11 * 4:
+        told = json.loads(header.pop("__metadata__")["streams"])
+        if size != 8 + length + max(tensor["data_offsets"][1] for tensor in header.values()):
             raise ValueError(f"{size} bytes")
-        imu_W, position_W, facing_W = (
-            np.asarray(
-                np.memmap(
-                    file,
-                    dtype="<f4",
-                    mode="r",
-                    offset=8 + length + header[name]["data_offsets"][0],
-                    shape=tuple(header[name]["shape"]),
-                )
-            )
-            for name in ("imu_W", "position_W", "facing_W")
-        )
+        whole = {name: _mapped(file, 8 + length, tensor) for name, tensor in header.items()}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.warning("%s: not whole, built anew: %s", file, error)
         return None
-    ends = np.cumsum([0, *lengths]).tolist()
-    return [
-        WorldStream(name, imu_W[start:stop], position_W[start:stop], facing_W[start:stop])
-        for name, (start, stop) in zip(names, pairwise(ends), strict=True)
-    ]
+    names = list(_TABLES["poses" if told[0]["kind"] == "poses" else "legs"])
+    first = dict.fromkeys(names, 0)
+    streams = []
+    for one in told:
+        rows = dict(zip(names, one["rows"], strict=True))
+        tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
+        first = {name: first[name] + rows[name] for name in names}
+        streams.append(_stream(one["name"], one["kind"], tables))
+    return streams
+
+
+def _mapped(file: Path, begin: int, tensor: Mapping[str, Any]) -> NDArray[Any]:
+    offset, shape = begin + tensor["data_offsets"][0], tuple(tensor["shape"])
+    dtype = {"F32": "<f4", "F64": "<f8"}[tensor["dtype"]]
+    return np.asarray(np.memmap(file, dtype=dtype, mode="r", offset=offset, shape=shape))

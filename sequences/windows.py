@@ -67,6 +67,11 @@ class WorldStream:
     def __len__(self) -> int:
         return len(self.imu_W)
 
+    def part(self, start: int, stop: int) -> WorldStream:
+        """Samples from start to before stop, none where there are none."""
+        part = slice(start, max(stop, start))
+        return WorldStream(self.name, self.imu_W[part], self.position_W[part], self.facing_W[part])
+
 
 @dataclass(frozen=True, eq=False)
 class LevelledImu:

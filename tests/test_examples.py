@@ -1,23 +1,41 @@
 """Every example runs and returns what it says."""
 
 import importlib.util
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
+import pytest
 
-FOLDER = Path(__file__).resolve().parents[1] / "examples"
+from stario.network import load_model
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "examples"
 
 
 def load(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"examples_{name}", FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def test_every_example_is_tested_here():
-    tested = {"run_recording", "compare_tracks", "streaming", "train_own", "cluster", "replay_live"}
+    tested = {
+        "run_recording",
+        "compare_tracks",
+        "streaming",
+        "train_own",
+        "cluster",
+        "replay_live",
+        "fine_tune",
+        "streaming_onnx",
+        "ros2_node",
+    }
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
 
 
@@ -47,6 +65,13 @@ def test_train_own_leaves_weights_that_predict(tmp_path):
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
+def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
+    model = load("fine_tune").main(tmp_path)
+    assert model.card.calibration == load_model("default").card.calibration
+    mean, _ = model.predict(np.zeros((1, 6, 200)))
+    assert np.isfinite(mean).all()
+
+
 def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken_one(tmp_path):
     scores, skipped, workers = load("cluster").main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
@@ -59,7 +84,6 @@ def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken
 
 def test_replay_live_ends_where_a_run_on_the_recording_it_left_does():
     from stario.fusion import Navigator
-    from stario.network import load_model
     from stario.sequences import read_recording
 
     taken, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
@@ -67,3 +91,82 @@ def test_replay_live_ends_where_a_run_on_the_recording_it_left_does():
     assert taken == len(recording) == 1200
     track = Navigator(load_model("default")).run(recording)
     np.testing.assert_allclose(track.trajectory.position_W[-1], end, atol=1e-4)
+
+
+def test_streaming_onnx_never_imports_torch_and_gives_torchs_track(tmp_path):
+    pytest.importorskip("onnxscript", reason="pip install 'stario[onnx]'")
+    pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
+    from stario.network.runtime.export import export_onnx
+
+    model, path = load_model("default"), tmp_path / "default.onnx"
+    export_onnx(model, path)
+    code = f"import json, runpy; m = runpy.run_path({str(FOLDER / 'streaming_onnx.py')!r})\n"
+    code += f"from pathlib import Path; print(json.dumps(m['main'](Path({str(path)!r}), 10.0)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    assert not told["torch_imported"]
+    states = load("streaming").main(seconds=10.0)
+    assert told["states"] == len(states)
+    np.testing.assert_allclose(told["p_W"], states[-1].p_W, atol=1e-3)
+
+
+def check_odometry(outputs, largest_step=1.5):
+    """REP 105: odom is continuous and stamped in order; covariances are some."""
+    position = np.array([o.odom_base.p for o in outputs])
+    stamps = np.array([o.stamp_ns for o in outputs])
+    assert (np.diff(stamps) > 0).all()
+    assert np.isfinite(position).all()
+    assert np.linalg.norm(np.diff(position, axis=0), axis=1).max() < largest_step
+    for o in outputs[::20]:
+        np.testing.assert_allclose(np.linalg.norm(o.odom_base.R.as_quat()), 1.0)
+        for covariance in (o.pose_covariance, o.twist_covariance):
+            assert (np.linalg.eigvalsh(0.5 * (covariance + covariance.T)) > -1e-9).all()
+
+
+def fix_at(stamp_ns, xyz, sigma):
+    at = SimpleNamespace(x=xyz[0], y=xyz[1], z=xyz[2])
+    pose = SimpleNamespace(
+        pose=SimpleNamespace(position=at), covariance=(sigma**2 * np.eye(6)).ravel().tolist()
+    )
+    stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return SimpleNamespace(header=SimpleNamespace(stamp=stamp), pose=pose)
+
+
+def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
+    from stario.fusion import Navigator
+
+    example = load("ros2_node")
+    check_odometry(example.main(seconds=6.0))
+    bridge = example.OdometryBridge(Navigator(load_model("default")))
+    outputs = []
+    for message in example.demonstration_messages(8.0):
+        found = bridge.imu(message)
+        if found is None:
+            continue
+        outputs.append(found)
+        if len(outputs) in (20, 60):
+            seen = np.array([100.0, 50.0, 0.0]) + 2.0 * found.odom_base.p[[1, 0, 2]]
+            bridge.fix(fix_at(found.stamp_ns, seen, 0.05))
+    check_odometry(outputs)  # although the map was moved by a hundred metres, then turned
+    assert np.linalg.norm(outputs[-1].map_odom.p) > 50.0
+    state = bridge._navigator.state
+    in_map = outputs[-1].map_odom @ outputs[-1].odom_base
+    np.testing.assert_allclose(in_map.p, state.p_W, atol=1e-6)
+    np.testing.assert_allclose(in_map.R.as_matrix(), state.R_WB, atol=1e-6)
+    up = outputs[-1].map_odom.R.apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-9)
+
+
+BAGS = sorted(Path(os.environ.get("STARIO_DATA", ROOT.parent / "shared" / "data")).glob(
+    "raw/rosbag/*.bag"
+))  # fmt: skip
+
+
+@pytest.mark.skipif(not BAGS, reason="the data folder holds no recorded bags")
+@pytest.mark.parametrize("bag", BAGS, ids=lambda path: path.stem)
+def test_ros2_node_runs_on_recorded_bags(bag):
+    pytest.importorskip("rosbags", reason="pip install 'stario[bags]'")
+    outputs = load("ros2_node").main(bag)
+    assert len(outputs) > 20
+    # The razor's accelerometer is saturated by shaking: no track can be told from it.
+    check_odometry(outputs, np.inf if "razor" in bag.stem else 1.5)

@@ -1,21 +1,24 @@
 """What is installed is what is in the tree."""
 
+import ast
 import importlib
 import subprocess
 import sys
 import tomllib
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("fusion", "network", "sequences")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def test_every_package_of_the_tree_is_listed():
     found = {
         "stario." + ".".join(p.parent.relative_to(ROOT).parts)
-        for folder in ("fusion", "network", "sequences")
+        for folder in FOLDERS
         for p in (ROOT / folder).rglob("__init__.py")
     }
     assert found == set(PROJECT["tool"]["setuptools"]["packages"])
@@ -34,7 +37,7 @@ def test_the_readme_of_sequences_names_every_public_name():
 
 
 def test_every_folder_with_modules_is_a_package():
-    for folder in ("fusion", "network", "sequences"):
+    for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*.py"):
             assert (path.parent / "__init__.py").exists(), path
 
@@ -53,6 +56,27 @@ def test_sequences_import_neither_network_nor_fusion_and_network_not_fusion():
         for path in (ROOT / folder).rglob("*.py"):
             text = path.read_text()
             assert not any(f"from {name}" in text or f"import {name}" in text for name in names)
+
+
+def _modules_imported(path: Path) -> set[str]:
+    """Modules of stario that a file imports when it runs, also inside functions."""
+    tree, found = ast.parse(path.read_text()), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            node.body = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stario."):
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+    return found
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
+    names = {
+        ".".join(("stario", *path.relative_to(ROOT).with_suffix("").parts)): path for path in files
+    }
+    graph = {name: _modules_imported(path) & names.keys() for name, path in names.items()}
+    TopologicalSorter(graph).prepare()
 
 
 def test_help_imports_nothing_heavy():

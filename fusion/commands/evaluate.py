@@ -151,12 +151,12 @@ def _networks(
     as_json: bool,
 ) -> list[Skipped]:
     """The table of networks; returns the recordings that could not be used."""
+    from stario.fusion.evaluation.figures import write_table
     from stario.fusion.evaluation.results import make_folder
     from stario.fusion.evaluation.tables import (
         compare_networks,
         table_dict,
         table_text,
-        write_table,
     )
     from stario.network.model import load_model, weights_named
     from stario.sequences.metrics import check_convention

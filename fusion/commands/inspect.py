@@ -17,6 +17,8 @@ from stario.fusion.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.familiarity import Familiarity
+    from stario.network.model import DisplacementModel
     from stario.sequences.sequence import ImuSequence
 
 
@@ -24,13 +26,18 @@ if TYPE_CHECKING:
 def inspect(
     path: Annotated[Path, typer.Argument(help="A recording, or a folder or list of some.")],
     reading: Reading,
+    model: Annotated[
+        str, typer.Option("--model", help="Weights whose training the motion is compared with.")
+    ] = "default",
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Look recordings over: timing, noise, units, signs, magnetometer, and how truth fits."""
+    """Look recordings over: timing, noise, units, signs, magnetometer, truth, kind of motion."""
     from stario.fusion.evaluation.many import distinct_name
+    from stario.network.model import load_model
     from stario.sequences.batch import Skipped, each
 
+    network = load_model(model)
     files, skipped = reading.recordings([path])
     names: set[str] = set()
 
@@ -38,7 +45,7 @@ def inspect(
         sequence = reading.read(file)
         name = distinct_name(sequence.name, names)
         folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-        return _inspect(sequence, folder, told=not as_json)
+        return _inspect(sequence, folder, network, told=not as_json)
 
     records: list[dict[str, object]] = []
     for outcome in each(inspected, files, jobs=1):
@@ -51,7 +58,9 @@ def inspect(
     leave_with_skipped(skipped)
 
 
-def _inspect(sequence: ImuSequence, folder: Path, told: bool) -> dict[str, object]:
+def _inspect(
+    sequence: ImuSequence, folder: Path, network: DisplacementModel, told: bool
+) -> dict[str, object]:
     from stario.fusion.evaluation.results import make_folder
     from stario.sequences.files import write_json
     from stario.sequences.inspection import inspect_recording
@@ -67,8 +76,21 @@ def _inspect(sequence: ImuSequence, folder: Path, told: bool) -> dict[str, objec
         gaps=[(start, start + length) for start, length in found.timing.gaps],
     )
     save_figure(figure, folder / "inspection.png")
-    write_json(folder / "inspection.json", found.as_dict())
+    motion = _motion(sequence, network)
+    record = found.as_dict() | {"motion": motion and motion.as_dict()}
+    write_json(folder / "inspection.json", record)
     if told:
-        typer.echo("\n".join(found.lines()))
+        typer.echo("\n".join([*found.lines(), *(motion.lines() if motion else [])]))
         typer.echo(f"figure: {folder / 'inspection.png'}")
-    return found.as_dict()
+    return record
+
+
+def _motion(sequence: ImuSequence, network: DisplacementModel) -> Familiarity | None:
+    """How the recording moves; None where it cannot be told, of which the problems say why."""
+    from stario.fusion.evaluation.familiarity import familiarity
+    from stario.sequences.errors import InputError
+
+    try:
+        return familiarity(network, sequence)
+    except InputError:
+        return None

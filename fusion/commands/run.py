@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,6 +39,9 @@ def run(
     backend: Annotated[str, typer.Option(help="What fuses: ekf, or graph.")] = "ekf",
     out: OutOption = None,
     report: ReportOption = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Open in the 3-D viewer rerun; the file stays in --out.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
@@ -49,6 +53,8 @@ def run(
 
     if report:
         optional_package("plotly", "report")
+    if view:
+        optional_package("rerun", "view")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings([path])
@@ -60,7 +66,8 @@ def run(
         sequence = reading.read(file)
         name = distinct_name(sequence.name, names)
         folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-        return _run(navigator, sequence, known, folder, report, told=not as_json)
+        shown = Shown(report, view, figures=not as_json)
+        return _run(navigator, sequence, known, folder, shown)
 
     records: list[dict[str, object]] = []
     for outcome in each(fused, files, jobs=1):
@@ -73,13 +80,21 @@ def run(
     leave_with_skipped(skipped)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What a run shows: a report, the viewer, figures on stdout."""
+
+    report: bool
+    view: bool
+    figures: bool
+
+
 def _run(
     navigator: Navigator,
     sequence: ImuSequence,
     fixes: Sequence[Fix],
     folder: Path,
-    report: bool,
-    told: bool,
+    shown: Shown,
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
     import numpy as np
@@ -100,18 +115,23 @@ def _run(
     written = write_run(
         folder, sequence.name, track, truth, aligned, metrics, words, navigator.config, backend
     )
-    if report:
+    if shown.report:
         from stario.fusion.report.page import write_report
 
         path, config, name = folder / "report.html", navigator.config, str(backend)
         figures = {name: metrics}
         written.append(write_report(path, sequence, {name: track}, config, figures, alignment))
+    if shown.view:
+        from stario.fusion.report.view import open_view, write_view
+
+        written.append(write_view(folder / "track.rrd", sequence, track, aligned))
+        open_view(written[-1])
     record: dict[str, object] = {
         "recording": sequence.name,
         backend: metrics,
         "folder": str(folder),
     }
-    if not told:
+    if not shown.figures:
         return record
     way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))

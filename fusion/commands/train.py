@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +22,7 @@ from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
+    from stario.network.training.data import Recorded
     from stario.sequences.batch import Skipped
     from stario.sequences.windows import Attitude, WorldStream
 
@@ -47,7 +47,21 @@ def train(
         typer.Option(help="Recordings that choose and calibrate; else the last fifth of each."),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="Folder of the development recordings: split and walks.")
+        Path | None,
+        typer.Option(
+            help="Folder of the development recordings: learn from all that the package lists but "
+            "the test recordings, choose and calibrate by those of its list `holdout`."
+        ),
+    ] = None,
+    few: Annotated[
+        bool,
+        typer.Option(
+            "--few", help="With --data: the eight recordings of the paper's comparison alone."
+        ),
+    ] = False,
+    leave_out: Annotated[
+        str | None,
+        typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
     ] = None,
     captured: Annotated[
         Path | None, typer.Option(help="Captured trajectories (npz) to drive a simulated IMU.")
@@ -81,7 +95,8 @@ def train(
 ) -> None:
     """Train a network on recordings with truth and on simulated walks; resumes by itself.
 
-    The same recipe for every network. In several processes, on GPUs or CPUs:
+    Truth may be poses, positions or waypoints: fine-tune the default weights on walks of your own
+    by --start-from default. The same recipe for every network. In several processes:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
     from stario.fusion.evaluation.results import make_folder
@@ -97,26 +112,28 @@ def train(
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
-        reading, paths or [], validation or [], data, streams_of
+        reading, paths or [], validation or [], _lists(data, leave_out, few), streams_of
     )
-    walks = captured or (data / "walks/oxiod_vicon.npz" if data else None)
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
     if recorded_only:
-        walks, generated = None, 0
+        captured, generated = None, 0
     material = gather(
         recorded + held_out if last_stage else recorded,
-        _captured(walks, recipe, folder) if walks else [],
+        _captured(captured, recipe, folder) if captured else [],
         _generated(generated, recipe.seed, recipe.attitude, folder),
+        recipe.shares,
     )
-    if recorded and not held_out:
+    kept = gather(held_out, [], [])
+    if recorded and not (kept.streams or kept.legs):
         raise InputError(
             "recordings",
             "none whose last fifth has an unbroken stretch of 2 s",
             "some to choose and calibrate by",
             "name them: --validation",
         )
-    held_out = held_out or _generated(10, recipe.seed + 1, recipe.attitude, folder)
+    # Sigma needs windows with full truth; where nobody has any, those of generated walks.
+    windows = kept.streams or _generated(10, recipe.seed + 1, recipe.attitude, folder)
     if leads():
         for words in material.words:
             typer.echo(words, err=True)
@@ -125,7 +142,7 @@ def train(
             recipe,
             material.streams,
             material.weights,
-            held_out,
+            windows,
             out,
             on_step=lambda step, error: progress(step / recipe.steps),
             on_epoch=lambda report: typer.echo(
@@ -135,7 +152,9 @@ def train(
             ),
             trained_on=material.words,
             start_from=load_model(start_from) if start_from else None,
-            keep_calibration=last_stage,
+            keep_calibration=last_stage or (start_from is not None and not kept.streams),
+            legs=material.legs,
+            validation_legs=kept.legs,
         )
     if leads():
         typer.echo(str(path))
@@ -156,47 +175,66 @@ def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
+def _lists(data: Path | None, group: str | None, few: bool) -> tuple[list[Path], list[Path]]:
+    """Recordings to learn from and to be kept, of the lists in the package."""
+    from stario.network.training.splits import listed, split_paths
+    from stario.sequences.splits import leave_out
+
+    if data is None:
+        if group is not None:
+            raise InputError("--leave-out", "no --data", "the folder of the development recordings")
+        return [], []
+    if few:
+        return split_paths(data, "training"), split_paths(data, "validation")
+    everything = listed("all", data)
+    if group is not None:
+        outside, inside = leave_out(everything, group)
+    else:
+        inside = listed("holdout", data)
+        kept = {one.path for one in inside}
+        outside = [one for one in everything if one.path not in kept]
+    return [one.path for one in outside], [one.path for one in inside]
+
+
 def _recorded(
     reading: Reading,
     paths: list[Path],
     validation: list[Path],
-    data: Path | None,
-    streams_of: Callable[[list[Path]], tuple[list[list[WorldStream]], list[Skipped]]],
-) -> tuple[list[WorldStream], list[WorldStream], list[Skipped]]:
-    """Streams to learn from, streams held out, and what could not be used, named at once."""
+    lists: tuple[list[Path], list[Path]],
+    streams_of: Callable[[list[Path]], tuple[list[Recorded], list[Skipped]]],
+) -> tuple[list[Recorded], list[Recorded], list[Skipped]]:
+    """Recordings to learn from, those held out, and what could not be used, named at once."""
     from stario.network.training.data import split_off
-    from stario.network.training.splits import split_paths
 
     files, missing = reading.recordings(paths)
     held_files, held_missing = reading.recordings(validation)
-    if data is not None:
-        files += split_paths(data, "training")
-        held_files += split_paths(data, "validation")
+    files, held_files = files + lists[0], held_files + lists[1]
     recordings, failed = streams_of(files)
     held_out, held_failed = streams_of(held_files)
     skipped = missing + failed + held_missing + held_failed
     if skipped and not (recordings and (held_out or not validation)):
         leave_with_skipped(skipped)
     if held_files or not files:
-        return list(chain(*recordings)), list(chain(*held_out)), skipped
+        return recordings, held_out, skipped
     return *split_off(recordings), skipped
 
 
 def _streams_of(
     reading: Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
-) -> tuple[list[list[WorldStream]], list[Skipped]]:
+) -> tuple[list[Recorded], list[Skipped]]:
+    from stario.network.training.data import Recorded
     from stario.sequences.batch import Skipped
     from stario.sequences.stream_cache import recorded
 
-    recordings: list[list[WorldStream]] = []
+    recordings: list[Recorded] = []
     skipped: list[Skipped] = []
     with progress_bar("read", len(files)) as progress:
         outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-        for done, outcome in enumerate(outcomes, 1):
+        for done, (path, outcome) in enumerate(zip(files, outcomes, strict=True), 1):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
             else:
-                recordings.append(outcome)
+                recordings.append(Recorded(path, outcome))
             progress(done / len(files))
     return recordings, skipped
 

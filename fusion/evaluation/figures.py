@@ -5,12 +5,17 @@ Drawn as those of `stario.sequences.plots`, without pyplot.
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample
+from stario.fusion.evaluation.tables import PROTOCOLS, Entry, NetworkTable, Sample, table_dict
+from stario.sequences.files import atomic_write, write_json
 from stario.sequences.sequence import FloatArray
 
 if TYPE_CHECKING:
@@ -24,6 +29,25 @@ _COLOURS = (
 )  # fmt: skip
 _STYLES = ("-", "--", ":")
 _AGAINST = "R-ResNet"
+
+
+def write_table(folder: Path, table: NetworkTable) -> list[Path]:
+    """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
+    from stario.sequences.plots import save_figure
+
+    text = io.StringIO()
+    names = list(Entry.__dataclass_fields__)
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(entry) for entry in table.entries)
+    with atomic_write(folder / "networks.csv") as file:
+        file.write(text.getvalue())
+    write_json(folder / "networks.json", table_dict(table))
+    written = [folder / "networks.csv", folder / "networks.json"]
+    for name, figure in figures(table).items():
+        save_figure(figure, folder / name)
+        written.append(folder / name)
+    return written
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:

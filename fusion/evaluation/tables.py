@@ -7,8 +7,6 @@ Several weights of one network, trained with different seeds, say, are averaged,
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -24,7 +22,6 @@ from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.batch import Skipped, each
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_write, write_json
 from stario.sequences.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -206,26 +203,6 @@ def table_dict(table: NetworkTable) -> dict[str, object]:
         "entries": [asdict(entry) for entry in table.entries],
         "conventions": _words(table),
     }
-
-
-def write_table(folder: Path, table: NetworkTable) -> list[Path]:
-    """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
-    from stario.fusion.evaluation.figures import figures
-    from stario.sequences.plots import save_figure
-
-    text = io.StringIO()
-    names = list(Entry.__dataclass_fields__)
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(entry) for entry in table.entries)
-    with atomic_write(folder / "networks.csv") as file:
-        file.write(text.getvalue())
-    write_json(folder / "networks.json", table_dict(table))
-    written = [folder / "networks.csv", folder / "networks.json"]
-    for name, figure in figures(table).items():
-        save_figure(figure, folder / name)
-        written.append(folder / name)
-    return written
 
 
 def _words(table: NetworkTable) -> dict[str, str]:

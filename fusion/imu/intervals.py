@@ -79,6 +79,10 @@ GAPS_LISTED = 100
 """How many gaps are kept one by one: an endless stream may have any number."""
 
 
+UNFAMILIAR_SHARE = 0.3
+"""From this share of unfamiliar windows on health says so; of training windows 0.05 are."""
+
+
 @dataclass
 class SampleCounts:
     """What became of the samples.
@@ -95,6 +99,8 @@ class SampleCounts:
         gap_count: stretches without samples that were not bridged.
         longest_gap: of them [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
+        windows: that the network was asked about.
+        unfamiliar: of these outside what its weights were trained on.
     """
 
     used: int = 0
@@ -108,6 +114,8 @@ class SampleCounts:
     gap_count: int = 0
     longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
+    windows: int = 0
+    unfamiliar: int = 0
 
     def add_gap(self, start: float, length: float) -> None:
         """Count a stretch without samples [s]."""
@@ -124,4 +132,14 @@ class SampleCounts:
             gap_count=self.gap_count,
             longest_gap=self.longest_gap,
             gaps=list(self.gaps),
+            notes=self._notes(),
         )
+
+    def _notes(self) -> list[str]:
+        if self.unfamiliar <= UNFAMILIAR_SHARE * self.windows:
+            return []
+        share = self.unfamiliar / self.windows
+        return [
+            f"{share:.0%} of the windows move as little that the weights were trained on: "
+            "the network's sigma is widened there"
+        ]

@@ -68,6 +68,11 @@ class StatefulInference:
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
+    def unfamiliar(self, windows: NDArray[np.float32]) -> int:
+        """How many windows (B, 6, 200) lie outside what the model's weights were trained on."""
+        known = getattr(getattr(self._model, "card", None), "known_motion", None)
+        return 0 if known is None else int((known.strangeness(windows) > 1.0).sum())
+
     @property
     def memory(self) -> Any:
         """What the network remembers, as arrays and numbers; None without memory.

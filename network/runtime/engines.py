@@ -6,15 +6,15 @@ state that a window left, and gives the one that the next window takes up.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.inference import inference_form
 from stario.sequences.errors import InputError
+
+if TYPE_CHECKING:  # ONNX Runtime alone must do without PyTorch
+    from stario.network.displacement import DisplacementNetwork
 
 Float32Array = NDArray[np.float32]
 
@@ -54,6 +54,8 @@ class TorchEngine:
     """
 
     def __init__(self, network: DisplacementNetwork) -> None:
+        from stario.network.runtime.inference import inference_form
+
         self._training_form = network.eval()
         self._network = inference_form(network)
 
@@ -73,6 +75,8 @@ class TorchEngine:
 
     def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
         """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        import torch
+
         tensor = torch.from_numpy(windows)
         with torch.inference_mode():
             if state is not None:

@@ -156,7 +156,8 @@ def _model(name: str) -> DisplacementModel:
 
 def _graph_engine(model: DisplacementModel, cache: Path) -> Engine:
     """The exported graph, from the cache where the code that makes it is still the same."""
-    from stario.network.runtime.export import export_onnx, load_onnx
+    from stario.network.runtime.export import export_onnx
+    from stario.network.runtime.onnx_file import load_onnx
 
     sources = b"".join(
         path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py"))

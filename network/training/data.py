@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
+from stario.sequences.errors import ConfigError
+from stario.sequences.legs import LegStream
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.stream_cache import cached
-from stario.sequences.windows import Attitude, WorldStream, world_streams
+from stario.sequences.stream_cache import Stream, cached
+from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
+
+KIND_SHARES = (0.6, 0.28, 0.12)
+"""Of the windows: recordings, simulated along captured walks, simulated along generated walks."""
 
 _SHORTEST = 400
 """Samples of the shortest stretch that is kept, 2 s."""
@@ -25,46 +31,87 @@ _SMOOTH = 0.3
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """A recording's streams."""
+
+    path: Path
+    streams: Sequence[Stream]
+
+
+@dataclass(frozen=True)
 class Material:
     """Streams with how often each is drawn, per second of it.
 
     Attributes:
-        streams: stretches to learn from.
+        streams: stretches with full truth to learn from.
         weights: relative frequency of each.
+        legs: stretches of weak truth.
         words: what they are, for the card.
     """
 
     streams: list[WorldStream]
     weights: list[float]
+    legs: list[LegStream]
     words: list[str]
 
 
 def gather(
-    recorded: Sequence[WorldStream],
+    recorded: Sequence[Recorded],
     captured: Sequence[WorldStream],
     generated: Sequence[WorldStream],
-    shares: tuple[float, float, float] = (0.6, 0.28, 0.12),
+    shares: Mapping[str, float] = MappingProxyType({}),
 ) -> Material:
-    """Mix three kinds of streams so that each kind makes up its share of the windows."""
+    """Mix recordings and simulated walks so that each source makes up its share of the windows.
+
+    Args:
+        recorded: streams of each recording.
+        captured: simulated along captured walks.
+        generated: simulated along generated walks.
+        shares: of the sources among the recordings' windows, by a part of their path; recordings
+            that none names make up what is left of 1.
+
+    Raises:
+        ConfigError: nothing is left for them.
+    """
     streams: list[WorldStream] = []
     weights: list[float] = []
+    sources = [(f"recorded, {name}", KIND_SHARES[0] * share, members)
+               for name, share, members in _sources(recorded, shares)]  # fmt: skip
+    sources.append(("simulated along captured walks", KIND_SHARES[1], list(captured)))
+    sources.append(("simulated along generated walks", KIND_SHARES[2], list(generated)))
     words = []
-    kinds = zip(
-        ("recorded", "simulated along captured walks", "simulated along generated walks"),
-        (recorded, captured, generated),
-        shares,
-        strict=True,
-    )
-    for kind, members, share in kinds:
+    for name, share, members in sources:
         if not members:
             continue
-        seconds = sum(len(s) for s in members) / 200.0
-        lively = [_liveliness(s) if kind == "recorded" else 1.0 for s in members]
-        whole = sum(v * len(s) for v, s in zip(lively, members, strict=True)) / 200.0
+        lively = [_liveliness(s) if name.startswith("recorded") else 1.0 for s in members]
+        whole = sum(v * len(s) for v, s in zip(lively, members, strict=True)) / WINDOW_RATE
         streams += members
         weights += [share * v / whole for v in lively]
-        words.append(f"{kind}: {seconds / 60:.0f} min")
-    return Material(streams, weights, words)
+        words.append(f"{name}: {_minutes(members):.0f} min")
+    legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
+    for kind in dict.fromkeys(stream.kind for stream in legs):
+        words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
+    return Material(streams, weights, legs, words)
+
+
+def _sources(
+    recorded: Sequence[Recorded], shares: Mapping[str, float]
+) -> list[tuple[str, float, list[WorldStream]]]:
+    """Name, share and streams of each source among the recordings with full truth."""
+    members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
+    for one in recorded:
+        source = next((name for name in shares if name in str(one.path)), "")
+        members[source] += [s for s in one.streams if isinstance(s, WorldStream)]
+    left = 1.0 - sum(shares.values())
+    if members[""] and left <= 0.0:
+        raise ConfigError(
+            "shares", "1 or more in all", "less than 1", f"{members[''][0].name} is of no source"
+        )
+    return [(name or "others", shares.get(name, left), found) for name, found in members.items()]
+
+
+def _minutes(streams: Sequence[Stream]) -> float:
+    return sum(len(stream) for stream in streams) / WINDOW_RATE / 60.0
 
 
 def _liveliness(stream: WorldStream) -> float:
@@ -73,26 +120,23 @@ def _liveliness(stream: WorldStream) -> float:
     return float(np.sqrt(np.square(linear).sum(axis=1).mean()))
 
 
-def split_off(
-    recordings: Sequence[Sequence[WorldStream]],
-) -> tuple[list[WorldStream], list[WorldStream]]:
-    """Streams of each recording without its last fifth, and that; scraps below 2 s are lost."""
-    first: list[WorldStream] = []
-    last: list[WorldStream] = []
-    for streams in recordings:
-        left = round(0.8 * sum(len(stream) for stream in streams))
-        for stream in streams:
-            first.append(_cut(stream, 0, left))
-            last.append(_cut(stream, max(left, 0), len(stream)))
+def split_off(recordings: Sequence[Recorded]) -> tuple[list[Recorded], list[Recorded]]:
+    """Recordings without their last fifth, and that; scraps too short to learn from are lost."""
+    first, last = [], []
+    for one in recordings:
+        left = round(0.8 * sum(len(stream) for stream in one.streams))
+        before, after = [], []
+        for stream in one.streams:
+            before.append(stream.part(0, left))
+            after.append(stream.part(max(left, 0), len(stream)))
             left -= len(stream)
-    return [s for s in first if len(s) >= _SHORTEST], [s for s in last if len(s) >= _SHORTEST]
+        first.append(Recorded(one.path, [s for s in before if _is_long(s)]))
+        last.append(Recorded(one.path, [s for s in after if _is_long(s)]))
+    return first, last
 
 
-def _cut(stream: WorldStream, start: int, stop: int) -> WorldStream:
-    part = slice(start, max(stop, start))
-    return WorldStream(
-        stream.name, stream.imu_W[part], stream.position_W[part], stream.facing_W[part]
-    )
+def _is_long(stream: Stream) -> bool:
+    return len(stream) >= _SHORTEST and (isinstance(stream, WorldStream) or len(stream.start) > 1)
 
 
 def simulated_streams(
@@ -114,7 +158,7 @@ def simulated_streams(
         for x in depends_on
     ]
     key = {"kind": kind, "values": values, "module": Path(__file__).read_text(encoding="utf-8")}
-    return cached(key, build, folder)
+    return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
 
 
 def captured_streams(

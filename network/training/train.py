@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from stario.network.architectures import architecture, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
+from stario.network.known_motion import KnownMotion, known_motion
 from stario.network.model import DisplacementModel, save_model
 from stario.network.training.augment import WindowSampler, reach_of
 from stario.network.training.calibrate import calibrate
@@ -28,9 +29,10 @@ from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers, workers
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegSampler, LegStream, leg_loss, leg_samplers
+from stario.network.training.weak_truth import LegSampler, leg_loss, leg_samplers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
+from stario.sequences.legs import LegStream
 from stario.sequences.windows import WorldStream
 
 log = logging.getLogger(__name__)
@@ -58,6 +60,7 @@ def train(
     start_from: DisplacementModel | None = None,
     keep_calibration: bool = False,
     legs: Sequence[LegStream] = (),
+    validation_legs: Sequence[LegStream] = (),
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
@@ -74,6 +77,7 @@ def train(
         keep_calibration: keep that model's calibration, for a last stage that learns from the
             validation recordings as well: their errors then say nothing any more.
         legs: stretches of weak truth, positions or waypoints, to learn from besides.
+        validation_legs: some that choose the weights besides.
 
     Returns:
         Path of the model's weights.
@@ -88,21 +92,21 @@ def train(
         raise InputError("streams", "none", "stretches of at least 2 s with truth")
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
-        material = _material([streams, validation, legs], weights, start_from)
+        material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = _Run(config, sampler, leg_samplers(config, legs, sampler), material, folder, these)
         if start_from is not None:
             run.start_from(start_from)
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
-        held_out = ValidationSet(validation, run.device)
+        held_out = ValidationSet(validation, run.device, validation_legs, config)
         while run.step < config.steps and run.epochs_since_best() < config.patience:
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)
             if these.leads:
                 on_epoch(report)
         calibration = start_from.card.calibration if start_from and keep_calibration else None
-        return run.finish(held_out, list(trained_on), calibration)
+        return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 
 class _Run:
@@ -300,7 +304,11 @@ class _Run:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
 
     def finish(
-        self, held_out: ValidationSet, trained_on: list[str], kept: Calibration | None
+        self,
+        held_out: ValidationSet,
+        trained_on: list[str],
+        kept: Calibration | None,
+        known: KnownMotion,
     ) -> Path:
         """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
         path = self.folder / "model.safetensors"
@@ -313,6 +321,7 @@ class _Run:
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
             figures={"validation_mse_m2": held_out.errors(self.averaged)},
+            known_motion=known,
         )
         save_model(path, self.averaged, card)
         return path

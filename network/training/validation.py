@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
+from stario.network.training.config import TrainingConfig
+from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss
 from stario.sequences.errors import InputError
+from stario.sequences.legs import LegStream
 from stario.sequences.rotations import about_z
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
@@ -23,21 +27,39 @@ from stario.sequences.windows import (
 VALIDATION_STRIDE = 20
 """Samples from the start of a window to the next one's."""
 
+_DENSE_SAMPLES = 200 * 60 * 15
+"""Of so many samples or less every window at that stride is asked."""
+
+_STRETCHES = 48
+"""Of each kind of weak truth."""
+
 
 class ValidationSet:
     """Windows kept from training, cut anew each time: all at once would fill the memory.
 
     Args:
-        streams: of recordings kept from training.
+        streams: of recordings kept from training, with full truth.
         device: of the networks that are asked.
+        legs: of recordings kept from training, with weak truth.
+        config: says how stretches of them are drawn.
 
     Raises:
         InputError: no stream is longer than a second.
     """
 
-    def __init__(self, streams: Sequence[WorldStream], device: torch.device) -> None:
+    def __init__(
+        self,
+        streams: Sequence[WorldStream],
+        device: torch.device,
+        legs: Sequence[LegStream] = (),
+        config: TrainingConfig | None = None,
+    ) -> None:
         self.streams, self.device = streams, device
-        counts = [len(window_starts(stream, VALIDATION_STRIDE)) for stream in streams]
+        self.legs = _drawn_once(legs, config or TrainingConfig())
+        # Hours of them are cut sparsely: what matters is the kinds of motion.
+        length = sum(len(stream) for stream in streams)
+        self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
+        counts = [len(window_starts(stream, self.stride)) for stream in streams]
         if not sum(counts):
             raise InputError("validation", "no window", "stretches longer than a second")
         self.names = np.repeat([stream.name for stream in streams], counts)
@@ -48,8 +70,8 @@ class ValidationSet:
         network.eval()
         errors, log_sigmas = [], []
         for stream in self.streams:
-            answer = _Answers(network)
-            starts = window_starts(stream, VALIDATION_STRIDE)
+            answer = _Answers(network, self.stride)
+            starts = window_starts(stream, self.stride)
             for first in range(0, len(starts), answer.batch):
                 windows, target = windows_at(stream, starts[first : first + answer.batch])
                 heading = headings_at(stream.facing_W, starts[first : first + answer.batch])
@@ -61,18 +83,44 @@ class ValidationSet:
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
 
     def errors(self, network: DisplacementNetwork) -> dict[str, float]:
-        """Mean squared error by recording [m^2]."""
+        """Mean squared error by recording [m^2], and of legs by their kind [m^2/s]."""
         squared = (self.residuals(network)[0] ** 2).sum(axis=1)
-        return {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
+        found = {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
+        return found | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
+
+    @torch.inference_mode()
+    def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
+        batch = batch.to(self.device)
+        mean, log_sigma = network(batch.windows.flatten(0, 1))
+        shape = batch.windows.shape[:2]
+        return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
+
+
+def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
+    """The same stretches for every epoch, as the device gives them."""
+    found = {}
+    plain = replace(
+        config.augmentation, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
+        gyro_noise=0.0, accel_noise=0.0,
+    )  # fmt: skip
+    for kind, seconds in (
+        ("waypoints", config.waypoint_seconds),
+        ("positions", config.track_seconds),
+    ):
+        members = [s for s in legs if s.kind == kind and len(s) > seconds * WINDOW_SAMPLES]
+        if members:
+            generator = torch.Generator().manual_seed(0)
+            found[kind] = LegSampler(members, seconds, plain, generator).batch(_STRETCHES)
+    return found
 
 
 class _Answers:
     """A network's answers to the windows of one stream, in order of time."""
 
-    def __init__(self, network: DisplacementNetwork) -> None:
+    def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
         # Windows that begin within one second belong to series of their own, as in use.
-        self.batch = WINDOW_SAMPLES // VALIDATION_STRIDE if network.remembers else 256
+        self.batch = max(1, WINDOW_SAMPLES // stride) if network.remembers else 256
         self._state = network.first_state(self.batch) if network.remembers else None
 
     def __call__(self, windows: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2
 """What a header looks like."""
 
 TRUTH_HEADER = "px [m],py [m],pz [m],qx,qy,qz,qw"
-"""What may follow it."""
+"""What may follow it: poses, or positions without attitude (px and py at least)."""
 
 MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
 """What may stand among them."""
@@ -115,8 +115,10 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
     if not set(POSITION) & set(columns):  # an attitude alone is no track
         ignored += [columns.pop(name).title for name in QUAT if name in columns]
     truth = [name for name in TRUTH if name in columns]
-    if truth:
+    if set(QUAT) & set(columns):
         missing += [name for name in TRUTH if name not in columns]
+    elif truth:
+        missing += [name for name in POSITION[:2] if name not in columns]
     if set(MAGNETIC) & set(columns):
         missing += [name for name in MAGNETIC if name not in columns]
     if missing:

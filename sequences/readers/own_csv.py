@@ -11,6 +11,8 @@ separated by commas, semicolons or tabs as the rows below it; comments (`#`) may
   blank or nan where it was not sampled.
 - truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may leave
   truth blank (slower truth), or gyroscope and accelerometer (truth at times of its own).
+- or `px,py` or `px,py,pz` alone: waypoints that were passed (two seconds apart or more), or a
+  track of positions, as of satellites.
 
 A sample written as `nan` is kept as such; other columns are ignored.
 """
@@ -38,6 +40,7 @@ from stario.sequences.readers.columns import (
     IMU,
     MAGNETIC,
     MAGNETIC_HEADER,
+    POSITION,
     TRUTH,
     TRUTH_HEADER,
     Column,
@@ -53,12 +56,16 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     Magnetometer,
+    PositionTrack,
     Trajectory,
 )
 from stario.sequences.time_order import advancing
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
+
+_WAYPOINTS_APART = 2.0
+"""Positions that lie so far apart in the median are waypoints [s]."""
 
 _HEAD_LINES = 200
 """Among which the header must stand for a file to be recognised."""
@@ -93,7 +100,8 @@ def read_own_csv(path: Path) -> ImuSequence:
         time=rows.time[is_imu],
         gyro=gyro[is_imu],
         accel=accel[is_imu],
-        truth=_truth(path, rows) if "px" in table else None,
+        truth=_truth(path, rows) if "qx" in table else None,
+        positions=_positions(path, rows) if "px" in table and "qx" not in table else None,
         magnetometer=_magnetometer(path, header, rows) if "mx" in table else None,
         converted=frozenset(sensor for sensor in factors if (factors[sensor] != 1.0).any()),
     )
@@ -171,8 +179,9 @@ def is_own_csv(path: Path) -> bool:
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     """Write a recording so that `read_own_csv` returns the same numbers, whole or not at all.
 
-    The magnetometer's samples and truth's valid poses go to the IMU's rows where their times are
-    the same and to rows of their own elsewhere; truth's velocity and covariance have no column.
+    The magnetometer's samples and truth's valid poses or positions go to the IMU's rows where
+    their times are the same and to rows of their own elsewhere; truth's velocity and covariance
+    have no column.
     Reading counts time from the first IMU sample.
 
     Raises:
@@ -183,6 +192,10 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     if field is not None:
         header += f",{MAGNETIC_HEADER}"
         rows.add(field.time, field.field)
+    if truth is None and sequence.positions is not None:
+        known = sequence.positions
+        header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
+        rows.add(known.time[known.valid], known.position_W[known.valid])
     if truth is not None:
         header += f",{TRUTH_HEADER}"
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])
@@ -319,6 +332,20 @@ def _per_second(path: Path, column: Column, time: FloatArray) -> int:
         with suppress(ReadError):
             return time_unit(path, time)
     return unit_factor(path, column, TIME_UNITS)
+
+
+def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
+    """The positions of the rows that hold one; None if fewer than two do."""
+    names = [name for name in POSITION if name in rows.table]
+    known = np.stack([rows.table[name] for name in names], axis=1)
+    kept = np.flatnonzero(np.isfinite(known).all(axis=1) & np.isfinite(rows.time))
+    kept = kept[advancing(rows.time[kept])]
+    if len(kept) < 2:
+        _log.warning("%s: %d rows hold a position, which makes no track", path, len(kept))
+        return None
+    time = rows.time[kept]
+    apart = float(np.median(np.diff(time))) >= _WAYPOINTS_APART
+    return PositionTrack(time, known[kept], "waypoints" if apart else "positions")
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:

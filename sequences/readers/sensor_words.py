@@ -28,6 +28,9 @@ _BEGINNINGS: tuple[tuple[str, Sensor], ...] = (
     ("omega", "gyro"),
     ("mag", "mag"),
     ("acc", "accel"),
+    ("aceler", "accel"),
+    ("beschleunig", "accel"),
+    ("giro", "gyro"),
     ("quat", "attitude"),
     ("orient", "attitude"),
     ("attitude", "attitude"),
@@ -50,6 +53,7 @@ _NOT_SAMPLES = {
     *("meta", "metadata", "down", "step", "steps", "estimated"),
 }
 _TIME = {"t", "time", "times", "timestamp", "timestamps", "seconds", "elapsed", "millis", "nanos"}
+_TIME |= {"zeit", "tiempo", "temps", "tempo"}
 _NO_TIME = {"date", "zone", "timezone", "txt", "gps", "location", "utc", "format"}
 _UNIT_WORDS = {
     **dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), "ns"),

@@ -27,11 +27,14 @@ def read_lines(path: Path) -> list[str]:
         ReadError: the file is missing, empty or not text.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        content = path.read_bytes()
     except FileNotFoundError:
         raise ReadError(path, "file", "nothing there", "a readable file") from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise ReadError(path, "file", type(error).__name__, "UTF-8 text") from None
+    except OSError as error:
+        raise ReadError(path, "file", type(error).__name__, "a readable file") from None
+    if b"\0" in content:
+        raise ReadError(path, "file", "bytes that are no text", "UTF-8 text")
+    lines = _decoded(content).splitlines()
     if not any(line.strip() for line in lines):
         raise ReadError(path, "file", "no line", "rows of numbers", "is the download complete?")
     return lines
@@ -57,6 +60,14 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
     return kept[:count]
 
 
+def _decoded(content: bytes) -> str:
+    """Text in UTF-8 or, as old apps write their unit signs, in Latin-1."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
 def head_lines(path: Path) -> list[str]:
     """Every line at the beginning of a text file, the last of them perhaps cut; never raises."""
     try:
@@ -66,8 +77,9 @@ def head_lines(path: Path) -> list[str]:
         return []
     if b"\0" in head:
         return []
-    # The head may end within a character: what is replaced there is never looked at.
-    return head.decode("utf-8-sig", errors="replace").splitlines()
+    # The head may end within a character, which the last line is cut by anyway.
+    end = max(head.rfind(b"\n"), 0)
+    return _decoded(head[:end]).splitlines() + _decoded(head[end:].lstrip(b"\r\n")).splitlines()
 
 
 def magic(path: Path, count: int = 16) -> bytes:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.figures import write_table
 from stario.fusion.evaluation.tables import (
     METRICS,
     PROTOCOLS,
     compare_networks,
     table_dict,
     table_text,
-    write_table,
 )
 from stario.network.model import weights_named
 from stario.sequences.errors import InputError, WeightsError

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from stario.network.architectures import ARCHITECTURES, build_network
-from stario.network.model import DisplacementNetwork
+from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.benchmark import network_speed
 from stario.network.runtime.inference import inference_form
 from stario.network.stario import StarIO

@@ -1,11 +1,20 @@
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stario.network.training.data import gather, generated_streams, simulated_streams, split_off
+from stario.network.training.data import (
+    KIND_SHARES,
+    Recorded,
+    gather,
+    generated_streams,
+    simulated_streams,
+    split_off,
+)
+from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream
 
@@ -17,25 +26,45 @@ def stream(name: str, samples: int) -> WorldStream:
 
 
 def test_the_last_fifth_of_each_recording_is_held_out() -> None:
-    recordings = [[stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], []]
-    first, last = split_off(recordings)
+    recordings = of([stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], [])
+    first, last = (list(chain(*(r.streams for r in part))) for part in split_off(recordings))
     assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
     assert [(s.name, len(s)) for s in last] == [("a", 2000), ("b", 1000)]
     assert last[0].imu_W[0, 0] == 2000  # where the first part ends
 
 
 def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
-    first, last = split_off([[stream("a", 1500)]])
-    assert [len(s) for s in first] == [1200]
-    assert last == []
+    first, last = split_off(of([stream("a", 1500)]))
+    assert [len(s) for s in first[0].streams] == [1200]
+    assert not last[0].streams
 
 
 def test_kinds_of_streams_make_up_their_shares() -> None:
-    kinds = ([stream("a", 3000), stream("a", 1000)], [stream("b", 500)], [])
-    material = gather(*kinds, shares=(0.6, 0.3, 0.1))
+    recorded = of([stream("a", 3000), stream("a", 1000)])
+    material = gather(recorded, [stream("b", 500)], [])
     drawn = np.array([len(s) for s in material.streams]) * material.weights
-    np.testing.assert_allclose(drawn[2] / drawn[:2].sum(), 0.5)
+    np.testing.assert_allclose(drawn[2] / drawn[:2].sum(), KIND_SHARES[1] / KIND_SHARES[0])
     assert material.words[0].startswith("recorded")
+
+
+def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> None:
+    recorded = [
+        Recorded(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
+        Recorded(Path("a/short.h5:y"), [moving("y", 1.0)]),
+        Recorded(Path("other.csv"), [moving("z", 1.0)]),
+    ]
+    material = gather(recorded, [], [], {"long.h5": 0.5, "short.h5": 0.3})
+    drawn = {name: 0.0 for name in "xyz"}
+    for one, weight in zip(material.streams, material.weights, strict=True):
+        drawn[one.name] += weight * len(one)
+    assert drawn["y"] / drawn["x"] == pytest.approx(0.6)
+    assert drawn["z"] / drawn["x"] == pytest.approx(0.4)
+    with pytest.raises(ConfigError, match="shares"):
+        gather(recorded, [], [], {"long.h5": 0.5, "short.h5": 0.5})
+
+
+def of(*recordings: list[WorldStream]) -> list[Recorded]:
+    return [Recorded(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 
 
 def test_simulated_streams_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
@@ -59,7 +88,7 @@ def test_simulated_streams_are_made_once_for_what_they_depend_on(tmp_path: Path)
 
 def test_lively_recordings_are_drawn_more_often() -> None:
     calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = gather([calm, lively], [], [])
+    material = gather(of([calm], [lively]), [], [])
     assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
     assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 

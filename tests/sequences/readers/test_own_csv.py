@@ -15,6 +15,7 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     Magnetometer,
+    PositionTrack,
     Trajectory,
 )
 from stario.sequences.simulation.imu import simulate_imu
@@ -310,3 +311,23 @@ def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path)
     assert np.array_equal(with_units(read).gyro, read.gyro)
     plain = read_own_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better
     assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))
+
+
+@pytest.mark.parametrize(
+    ("every", "columns", "kind"), [(4.0, 2, "waypoints"), (0.5, 3, "positions")]
+)
+def test_positions_alone_are_kept_as_such(
+    tmp_path: Path, walk: ImuSequence, every: float, columns: int, kind: str
+) -> None:
+    time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
+    assert walk.truth is not None
+    position = walk.truth.at(time).position_W[:, :columns]
+    known = PositionTrack(time, position, kind)  # type: ignore[arg-type]
+    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
+    found = read_recording(tmp_path / "walk.csv")
+    assert found.truth is None
+    assert found.positions is not None
+    assert found.positions.kind == kind
+    np.testing.assert_allclose(found.positions.time, time - walk.time[0], atol=1e-9)
+    np.testing.assert_array_equal(found.positions.position_W, position)
+    np.testing.assert_array_equal(found.accel, walk.accel)

@@ -1,0 +1,55 @@
+"""Fine-tune the default weights on walks of your own that have waypoints and no other truth.
+
+The command does the same: put `t,gx,gy,gz,ax,ay,az,px,py` into a CSV, the last two where you passed
+a known point (or had a satellite fix) and blank elsewhere, and run
+
+    stario train my_walks/ --start-from default --out runs/mine
+
+    python examples/fine_tune.py
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stario.network import DisplacementModel, TrainingConfig, load_model, train
+from stario.sequences import (
+    ImuSequence,
+    PositionTrack,
+    generate_walk,
+    leg_streams,
+    simulate_imu,
+    world_streams,
+)
+
+
+def walk_with_waypoints(seed: int) -> ImuSequence:
+    """A recording that knows its position every four seconds, and nothing of its attitude."""
+    walk = generate_walk(seed, 40.0)
+    time = np.arange(1.0, 39.0, 4.0)
+    waypoints = PositionTrack(time, walk.at(time).position_W[:, :2], "waypoints")
+    return replace(simulate_imu(walk, 100.0, seed=seed), truth=None, positions=waypoints)
+
+
+def main(folder: Path, epochs: int = 1) -> DisplacementModel:
+    """A few steps on three walks; simulated ones with full truth keep what was learned before."""
+    legs = [stream for seed in range(3) for stream in leg_streams(walk_with_waypoints(seed))]
+    full = [world_streams(simulate_imu(generate_walk(seed, 30.0), seed=seed)) for seed in (7, 8)]
+    config = TrainingConfig(
+        epochs=epochs, epoch_windows=64, batch=32, rate=2e-4, likelihood_from=0.0,
+        waypoint_stretches=2, waypoint_seconds=12,
+    )  # fmt: skip
+    weights = train(
+        config, full[0], [1.0] * len(full[0]), full[1], folder,
+        start_from=load_model("default"), keep_calibration=True, legs=legs,
+    )  # fmt: skip
+    return load_model(weights)
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as temporary:
+        print(main(Path(temporary)).card.figures)

@@ -1,0 +1,245 @@
+"""A ROS 2 node around StarIO, a skeleton to start from: ROS is needed only to run as a node.
+
+    subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
+                           mounting does, the device is levelled by gravity)
+                fix        geometry_msgs/PoseWithCovarianceStamped, a position in `map`, if there is
+    publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
+                tf         map -> odom -> base_link (REP 105)
+
+`odom` is continuous: it drifts, but a fix does not make it jump, so that controllers may use it.
+What fixes correct goes into map -> odom. Metres, radians, quaternions x y z w (REP 103).
+`base_link` is the IMU's frame here; where it is not, publish its static transform and name the
+IMU's frame instead.
+
+With ROS 2 sourced `python examples/ros2_node.py --node` spins the node. Without, the same code
+runs on a bag (`pip install 'stario[bags]'`) or, with no argument, on the bundled demonstration:
+
+    python examples/ros2_node.py [BAG]
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion import Navigator, NavState, demonstration
+from stario.network import load_model
+from stario.sequences.rotations import about_z, yaw_of
+
+GYRO_NOISE = 0.01
+"""Standard deviation of one rate sample [rad/s], for the twist's covariance."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Takes points of the child frame to the parent: x -> R x + p."""
+
+    R: Rotation
+    p: np.ndarray
+
+    def __matmul__(self, other: Transform) -> Transform:
+        return Transform(self.R * other.R, self.R.apply(other.p) + self.p)
+
+    def inverse(self) -> Transform:
+        """From parent to child."""
+        return Transform(self.R.inv(), -self.R.inv().apply(self.p))
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """What is published at a time: the fields of nav_msgs/Odometry and of both transforms.
+
+    Attributes:
+        stamp_ns: of the state [ns].
+        odom_base: pose of base_link in odom.
+        map_odom: of odom in map, changed by fixes alone.
+        pose_covariance: (6, 6) of x, y, z and the rotations about odom's axes.
+        linear, angular: twist in base_link [m/s], [rad/s].
+        twist_covariance: (6, 6) of both.
+    """
+
+    stamp_ns: int
+    odom_base: Transform
+    map_odom: Transform
+    pose_covariance: np.ndarray
+    linear: np.ndarray
+    angular: np.ndarray
+    twist_covariance: np.ndarray
+
+
+class OdometryBridge:
+    """From messages' numbers to odometry, without ROS.
+
+    Args:
+        navigator: whose stream this is.
+    """
+
+    def __init__(self, navigator: Navigator) -> None:
+        self._navigator = navigator
+        self._map_odom = Transform(Rotation.identity(), np.zeros(3))
+        self._first_ns: int | None = None
+
+    def imu(self, message: Any) -> Odometry | None:
+        """A sensor_msgs/Imu; odometry when it completed an update."""
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        if self._first_ns is None:
+            self._first_ns = stamp_ns  # nanoseconds since 1970 are more than a float holds
+        rate, force = message.angular_velocity, message.linear_acceleration
+        gyro = (rate.x, rate.y, rate.z)
+        time = (stamp_ns - self._first_ns) / 1e9
+        state = self._navigator.push(time, gyro, (force.x, force.y, force.z))
+        return None if state is None else self._odometry(state, np.array(gyro))
+
+    def fix(self, message: Any) -> None:
+        """A geometry_msgs/PoseWithCovarianceStamped in map, for its position."""
+        before = self._navigator.state
+        if before is None or self._first_ns is None:
+            return
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        at = message.pose.pose.position
+        covariance = np.reshape(message.pose.covariance, (6, 6))[:3, :3]
+        time = (stamp_ns - self._first_ns) / 1e9
+        self._navigator.update_position(time, [at.x, at.y, at.z], covariance)
+        after = self._navigator.state
+        # base_link stays where it was in odom; roll and pitch are no fix's business (REP 105).
+        turn = about_z(float(yaw_of(_pose(after).R * _pose(before).R.inv())[0]))
+        moved = Transform(turn, after.p_W - turn.apply(before.p_W))
+        self._map_odom = moved @ self._map_odom
+
+    def _odometry(self, state: NavState, gyro: np.ndarray) -> Odometry:
+        R_WB, P = Rotation.from_matrix(state.R_WB), state.covariance
+        to_odom = self._map_odom.R.inv().as_matrix()
+        pose = np.zeros((6, 6))
+        pose[:3, :3], pose[3:, 3:] = P[6:9, 6:9], P[:3, :3]
+        pose[:3, 3:], pose[3:, :3] = P[6:9, :3], P[:3, 6:9]
+        twist = np.zeros((6, 6))
+        twist[:3, :3] = state.R_WB.T @ P[3:6, 3:6] @ state.R_WB
+        twist[3:, 3:] = P[9:12, 9:12] + GYRO_NOISE**2 * np.eye(3)
+        turn = np.kron(np.eye(2), to_odom)
+        return Odometry(
+            stamp_ns=(self._first_ns or 0) + round(state.time * 1e9),
+            odom_base=self._map_odom.inverse() @ _pose(state),
+            map_odom=self._map_odom,
+            pose_covariance=turn @ pose @ turn.T,
+            linear=R_WB.inv().apply(state.v_W),
+            angular=gyro - state.b_g,
+            twist_covariance=twist,
+        )
+
+
+def _pose(state: NavState) -> Transform:
+    return Transform(Rotation.from_matrix(state.R_WB), state.p_W)
+
+
+def bag_messages(path: Path) -> Iterator[Any]:
+    """The Imu messages of a ROS 1 or 2 bag, read without ROS."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        connections = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/Imu"]
+        for connection, _, raw in reader.messages(connections[:1]):
+            yield reader.deserialize(raw, connection.msgtype)
+
+
+def demonstration_messages(seconds: float) -> Iterator[Any]:
+    """The bundled demonstration as Imu messages."""
+    recording = demonstration()
+    for time, gyro, accel in zip(recording.time, recording.gyro, recording.accel, strict=True):
+        if time > seconds:
+            return
+        sec, nanosec = divmod(1_700_000_000 * 10**9 + round(time * 1e9), 10**9)
+        vectors = [SimpleNamespace(x=v[0], y=v[1], z=v[2]) for v in (gyro, accel)]
+        stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
+        yield SimpleNamespace(
+            header=SimpleNamespace(stamp=stamp),
+            angular_velocity=vectors[0],
+            linear_acceleration=vectors[1],
+        )
+
+
+def main(path: Path | None = None, seconds: float = 20.0) -> list[Odometry]:
+    """Odometry of a bag, or of the demonstration's first seconds."""
+    bridge = OdometryBridge(Navigator(load_model("default")))
+    messages = demonstration_messages(seconds) if path is None else bag_messages(path)
+    return [odometry for message in messages if (odometry := bridge.imu(message)) is not None]
+
+
+def spin() -> None:
+    """Run as a ROS 2 node until it is shut down."""
+    import rclpy
+    from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+    from nav_msgs.msg import Odometry as OdometryMessage
+    from rclpy.node import Node
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import Imu
+    from tf2_ros import TransformBroadcaster
+
+    class StarIONode(Node):
+        def __init__(self) -> None:
+            super().__init__("stario")
+            model = self.declare_parameter("model", "default").value
+            self.bridge = OdometryBridge(Navigator(load_model(model)))
+            self.odometry = self.create_publisher(OdometryMessage, "odometry", 10)
+            self.transforms = TransformBroadcaster(self)
+            self.create_subscription(Imu, "imu/data", self.on_imu, qos_profile_sensor_data)
+            self.create_subscription(PoseWithCovarianceStamped, "fix", self.bridge.fix, 10)
+
+        def on_imu(self, message: Imu) -> None:
+            found = self.bridge.imu(message)
+            if found is None:
+                return
+            told = OdometryMessage()
+            stamp = rclpy.time.Time(nanoseconds=found.stamp_ns).to_msg()
+            told.header.stamp, told.header.frame_id = stamp, "odom"
+            told.child_frame_id = "base_link"
+            place(found.odom_base, told.pose.pose.position, told.pose.pose.orientation)
+            told.pose.covariance = found.pose_covariance.ravel().tolist()
+            told.twist.covariance = found.twist_covariance.ravel().tolist()
+            for vector, values in (
+                (told.twist.twist.linear, found.linear),
+                (told.twist.twist.angular, found.angular),
+            ):
+                vector.x, vector.y, vector.z = values.tolist()
+            self.odometry.publish(told)
+            for parent, child, where in (
+                ("map", "odom", found.map_odom),
+                ("odom", "base_link", found.odom_base),
+            ):
+                sent = TransformStamped()
+                sent.header.stamp, sent.header.frame_id = stamp, parent
+                sent.child_frame_id = child
+                place(where, sent.transform.translation, sent.transform.rotation)
+                self.transforms.sendTransform(sent)
+
+    def place(where: Transform, position: Any, orientation: Any) -> None:
+        position.x, position.y, position.z = where.p.tolist()
+        orientation.x, orientation.y, orientation.z, orientation.w = where.R.as_quat().tolist()
+
+    rclpy.init()
+    node = StarIONode()
+    try:
+        rclpy.spin(node)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--node"]:
+        spin()
+    else:
+        outputs = main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+        for found in outputs[::20]:
+            sigma = np.sqrt(np.diag(found.pose_covariance)[:3])
+            seconds = (found.stamp_ns - outputs[0].stamp_ns) / 1e9
+            print(
+                f"{seconds:6.1f} s  odom {found.odom_base.p.round(2)} m  sigma {sigma.round(2)} m"
+            )

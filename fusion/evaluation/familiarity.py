@@ -1,0 +1,94 @@
+"""Whether a recording moves as what a model's weights were trained on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.imu.intervals import UNFAMILIAR_SHARE
+from stario.network.known_motion import FEATURES, features, step_rates
+from stario.network.model import DisplacementModel
+from stario.sequences.levelled_stream import levelled_streams
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.windows import WINDOW_SECONDS, turned_windows
+
+_WORDS = {
+    "acceleration": ("acceleration", "m/s^2 rms"),
+    "turning": ("rate of turn", "rad/s rms"),
+    "fast": ("share of power above 10 Hz", ""),
+    "middle": ("share of power from 3 to 10 Hz", ""),
+    "vertical": ("share of power along the vertical", ""),
+    "step_rate": ("step rate", "Hz"),
+    "speed": ("speed by the network", "m/s"),
+}
+
+
+@dataclass(frozen=True)
+class Familiarity:
+    """A recording against what weights know.
+
+    Attributes:
+        outside: share of its windows that lie outside; None where the card does not say what is
+            known.
+        medians: of each of the features, of step rate and speed.
+        ranges: 1st and 99th percentile of the training's.
+    """
+
+    outside: float | None
+    medians: dict[str, float]
+    ranges: dict[str, tuple[float, float]]
+
+    @property
+    def strange(self) -> bool:
+        """Whether so much of the recording lies outside that the track deserves less trust."""
+        return self.outside is not None and self.outside > UNFAMILIAR_SHARE
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values."""
+        return {"outside": self.outside, "medians": self.medians, "known": self.ranges}
+
+    def lines(self) -> list[str]:
+        """The findings for a person."""
+        told = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
+                         self.medians.items())  # fmt: skip
+        lines = [f"motion: {told}"]
+        if self.outside is None:
+            return [*lines, "  the weights' card does not say what motion they know"]
+        share = f"{self.outside:.0%} of the windows lie outside what the weights know"
+        if not self.strange:
+            return [*lines, f"  {share}"]
+        beyond = [
+            f"{_WORDS[name][0]} {value:.2f} (known {low:.2f} to {high:.2f})"
+            for name, value in self.medians.items()
+            if name in self.ranges
+            for low, high in (self.ranges[name],)
+            if not low <= value <= high
+        ]
+        reason = ": " + ", ".join(beyond) if beyond else ", each within its range: the mix is new"
+        return [*lines, f"! {share}{reason}; the network's sigma is widened there"]
+
+
+def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
+    """Compare a recording's windows with those that a model's weights were trained on.
+
+    Raises:
+        InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
+    """
+    streams = levelled_streams(sequence)
+    if not streams or not any(stream.window_count for stream in streams):
+        return Familiarity(None, {}, {})
+    windows = np.concatenate([stream.windows()[::2] for stream in streams])
+    headings = np.concatenate([stream.headings[::2] for stream in streams])
+    displacement_H = model.predict(turned_windows(windows, -headings))[0]
+    speeds = np.linalg.norm(displacement_H[:, :2], axis=1) / WINDOW_SECONDS
+    found = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
+    rates = np.concatenate([step_rates(stream.imu_N) for stream in streams])
+    if len(rates):
+        found["step_rate"] = float(np.median(rates))
+    found["speed"] = float(np.median(speeds))
+    known = model.card.known_motion
+    if known is None:
+        return Familiarity(None, found, {})
+    outside = float(np.mean(known.strangeness(windows) > 1.0))
+    return Familiarity(outside, found, dict(known.ranges))

@@ -1,0 +1,160 @@
+"""A run for the viewer rerun: track, attitude, covariance and sensors over time.
+
+The content goes to a file, which the viewer opens; it can be opened again, or sent to somebody.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stario.fusion.state import Track
+from stario.sequences.errors import InputError
+from stario.sequences.readers.checked import optional_package
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+_TIME = "time"
+_AXIS_LENGTH = 0.4
+_SIGMAS = 3.0
+_BLUE, _BLACK = (0, 114, 178), (0, 0, 0)
+_AXIS_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115))
+
+
+def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Trajectory) -> Path:
+    """Write a run as rerun's file.
+
+    Args:
+        path: ends in .rrd; its folder must exist.
+        sequence: the recording, for the sensors and the truth.
+        track: for biases and covariance.
+        trajectory: the track's poses as they are drawn, aligned with the truth where there is one.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: rerun is not installed, or the file cannot be written.
+    """
+    rr = optional_package("rerun", "view")
+    stream = rr.RecordingStream("stario", recording_id=None)
+    try:
+        stream.save(path)
+    except (OSError, RuntimeError) as error:
+        raise InputError("view", f"{path}: {error}", "a place that can be written to") from error
+    start = float(sequence.time[np.isfinite(sequence.time)][0])
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    _log_path(rr, stream, "world/track", trajectory, _BLUE)
+    if sequence.truth is not None:
+        _log_path(rr, stream, "world/truth", sequence.truth, _BLACK)
+    _log_device(rr, stream, trajectory, start)
+    _log_sensors(rr, stream, sequence, start)
+    _log_estimates(rr, stream, track, start)
+    stream.disconnect()
+    return path
+
+
+def open_view(path: Path) -> None:
+    """Open a file in the viewer, which goes on by itself.
+
+    Raises:
+        InputError: it cannot be started.
+    """
+    command = [sys.executable, "-m", "rerun", str(path)]
+    try:
+        subprocess.Popen(
+            command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+    except OSError as error:
+        raise InputError("view", str(error), "rerun's viewer") from error
+
+
+def _log_path(
+    rr: Any, stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
+) -> None:
+    """All of it at once, broken where poses are not valid."""
+    known = trajectory.valid
+    cuts = np.flatnonzero(np.diff(known.astype(int))) + 1
+    parts = np.split(trajectory.position_W, cuts)
+    strips = [p for p, ok in zip(parts, np.split(known, cuts), strict=True) if ok.all() and len(p)]
+    stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
+
+
+def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
+    """The device's axes where it is, and the ellipsoid of its position."""
+    index = _times(rr, trajectory.time[trajectory.valid] - start)
+    position = trajectory.position_W[trajectory.valid]
+    columns = rr.Transform3D.columns(
+        translation=position, quaternion=trajectory.quat_xyzw[trajectory.valid]
+    )
+    stream.send_columns("world/device", index, columns)
+    axes = rr.Arrows3D(vectors=_AXIS_LENGTH * np.eye(3), colors=_AXIS_COLOURS)
+    stream.log("world/device", axes, static=True)
+    covariance = trajectory.position_covariance_W
+    if covariance is None:
+        return
+    from scipy.spatial.transform import Rotation
+
+    values, vectors = np.linalg.eigh(covariance[trajectory.valid])
+    vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, no mirror
+    count = np.ones(len(position), dtype=int)
+    columns = rr.Ellipsoids3D.columns(
+        centers=position,
+        half_sizes=_SIGMAS * np.sqrt(np.maximum(values, 0.0)),
+        quaternions=Rotation.from_matrix(vectors).as_quat(),
+    )
+    stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
+
+
+def _log_sensors(rr: Any, stream: Any, sequence: ImuSequence, start: float) -> None:
+    known = np.isfinite(sequence.time)
+    index = _times(rr, sequence.time[known] - start)
+    for name, values in (
+        ("gyroscope [rad/s]", sequence.gyro),
+        ("specific force [m/s^2]", sequence.accel),
+    ):
+        _log_lines(rr, stream, ("sensors", name), index, values[known], "xyz")
+
+
+def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
+    index = _times(rr, track.time - start)
+    lines: list[tuple[str, FloatArray | None, Sequence[str]]] = [
+        ("gyroscope bias [rad/s]", track.b_g, "xyz"),
+        ("accelerometer bias [m/s^2]", track.b_a, "xyz"),
+    ]
+    if track.trajectory.velocity_W is not None:
+        speed = np.linalg.norm(track.trajectory.velocity_W, axis=1)[:, None]
+        lines.append(("speed [m/s]", speed, ["speed"]))
+    if track.covariance is not None:
+        sigma = np.sqrt(track.covariance[:, range(15), range(15)])
+        lines.append(("sigma of position [m]", sigma[:, 6:9], "xyz"))
+        lines.append(("sigma of yaw [rad]", sigma[:, 2:3], ["yaw"]))
+    for name, values, labels in lines:
+        if values is not None:
+            _log_lines(rr, stream, ("estimate", name), index, values, labels)
+    innovations = track.innovations
+    if innovations is not None and len(innovations.time):
+        at, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
+        _log_lines(rr, stream, ("estimate", "NIS [1]"), at, nis, ["NIS"])
+
+
+def _log_lines(
+    rr: Any,
+    stream: Any,
+    path: Sequence[str],
+    index: list[Any],
+    values: FloatArray,
+    labels: Sequence[str],
+) -> None:
+    name = rr.new_entity_path(list(path))
+    stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
+    colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
+    stream.log(name, rr.SeriesLines(colors=colours, names=list(labels)), static=True)
+
+
+def _times(rr: Any, seconds: FloatArray) -> list[Any]:
+    return [rr.TimeColumn(_TIME, duration=seconds)]

@@ -1,0 +1,197 @@
+"""What motion weights know: how far a window is from all that they were trained on.
+
+A window is described by five numbers that do not change with its yaw; those of the training windows
+are summed up by their k-means centres (Lloyd 1982), which travel on the card. A window further from
+every centre than 95 % of the training windows lies outside what the weights know: there a network
+errs more than it says. Single numbers within their training range say little: of people, phones
+and places that weights had not met, 84 to 99 % of the windows lay outside by the centres, with
+twice the mean NIS, but only 2 to 22 % by the ranges.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.sequences.legs import LegStream
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
+
+FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
+"""Root mean square of linear acceleration [m/s^2] and rate [rad/s]; shares [1] of the
+acceleration's power above 10 Hz, between 3 and 10 Hz, and along the vertical."""
+
+STEP_SECONDS = 5.0
+"""Length of the stretches whose step rate is told [s]."""
+
+_CENTRES = 200
+_MOST_WINDOWS = 20_000
+_AT_ONCE = 256
+_WALKING = 0.3
+_PERCENTILE = 95.0
+
+OUTSIDE_VARIANCE = 2.0
+"""Factor on the variance well outside: the mean NIS there was 5 to 7 against 2 to 3 inside."""
+
+
+@dataclass(frozen=True)
+class KnownMotion:
+    """Training windows summed up.
+
+    Attributes:
+        centres: of the described windows, each five numbers as of `described`.
+        limit: distance to the nearest centre that 95 % of the training windows keep within.
+        ranges: 1st and 99th percentile of each of `FEATURES`, of "step_rate" [Hz] and of "speed"
+            [m/s], for words.
+    """
+
+    centres: tuple[tuple[float, ...], ...]
+    limit: float
+    ranges: dict[str, tuple[float, float]]
+
+    def strangeness(self, windows: NDArray[np.float32]) -> FloatArray:
+        """Distance of windows (B, 6, 200) to what is known (B,), 1 at the limit."""
+        described_windows = described(features(windows))
+        centres = np.array(self.centres)
+        distances = np.linalg.norm(described_windows[:, None] - centres, axis=2)
+        return np.asarray(distances.min(axis=1) / self.limit)
+
+    def variance_factor(self, windows: NDArray[np.float32]) -> FloatArray:
+        """Factors (B,) on the variance of a network's answers: 1 inside, rising outside."""
+        return np.asarray(np.clip(2.0 * self.strangeness(windows) - 1.0, 1.0, OUTSIDE_VARIANCE))
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for the card; a centre is a line of numbers."""
+        lines = [" ".join(f"{x:g}" for x in row) for row in self.centres]
+        return {"limit": self.limit, "ranges": self.ranges, "centres": lines}
+
+
+def known_from(content: dict[str, Any]) -> KnownMotion:
+    """What `as_dict` gave.
+
+    Raises:
+        ValueError, TypeError, KeyError: it is something else.
+    """
+    centres = tuple(tuple(float(x) for x in line.split()) for line in content["centres"])
+    limit = float(content["limit"])
+    ranges = {str(k): (float(low), float(high)) for k, (low, high) in content["ranges"].items()}
+    if not centres or any(len(row) != len(FEATURES) for row in centres) or not limit > 0.0:
+        raise ValueError(f"known_motion: {len(centres)} centres, limit {limit}")
+    return KnownMotion(centres, limit, ranges)
+
+
+def features(windows: NDArray[np.float32]) -> FloatArray:
+    """`FEATURES` of windows (B, 6, 200) in a gravity-aligned frame, (B, 5)."""
+    gyro, accel = windows[:, :3].astype(np.float64), windows[:, 3:].astype(np.float64)
+    accel[:, 2] -= STANDARD_GRAVITY
+    varying = accel - accel.mean(axis=2, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(varying * np.hanning(WINDOW_SAMPLES), axis=2)) ** 2
+    power = spectrum.sum(axis=1)
+    frequency = np.arange(power.shape[1]) / WINDOW_SECONDS
+    whole = np.maximum(power.sum(axis=1), 1e-12)
+    return np.stack(
+        [
+            np.sqrt((accel**2).sum(axis=1).mean(axis=1)),
+            np.sqrt((gyro**2).sum(axis=1).mean(axis=1)),
+            power[:, frequency > 10.0].sum(axis=1) / whole,
+            power[:, (frequency > 3.0) & (frequency <= 10.0)].sum(axis=1) / whole,
+            spectrum[:, 2].sum(axis=1) / whole,
+        ],
+        axis=1,
+    )
+
+
+def described(values: FloatArray) -> FloatArray:
+    """Features (B, 5) brought to scales on which equal distances mean equally much (B, 5).
+
+    Sizes count by their ratio, above the sensors' noise.
+    """
+    acceleration, turning, fast, middle, vertical = values.T
+    return np.stack(
+        [
+            np.log(acceleration + 0.05),
+            np.log(turning + 0.02),
+            np.log(fast + 0.003),
+            3.0 * middle,
+            3.0 * vertical,
+        ],
+        axis=1,
+    )
+
+
+def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
+    """Step rate [Hz] of each stretch of 5 s that is walked, (K,).
+
+    The strongest frequency of the vertical acceleration between 1.2 and 3.2 Hz: a walker's and a
+    runner's cadence, above the swing of an arm or a leg.
+
+    Args:
+        imu_N: (N, 6) at 200 Hz in a gravity-aligned frame.
+    """
+    samples = round(STEP_SECONDS * WINDOW_RATE)
+    count = len(imu_N) // samples
+    vertical = imu_N[: count * samples, 5].astype(np.float64).reshape(count, samples)
+    vertical = vertical[vertical.std(axis=1) > _WALKING]
+    varying = (vertical - vertical.mean(axis=1, keepdims=True)) * np.hanning(samples)
+    padded = 8 * samples
+    power = np.abs(np.fft.rfft(varying, n=padded, axis=1)) ** 2
+    frequency = np.arange(power.shape[1]) * WINDOW_RATE / padded
+    walked = (frequency > 1.2) & (frequency < 3.2)
+    return np.asarray(frequency[walked][np.argmax(power[:, walked], axis=1)])
+
+
+def known_motion(
+    streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
+) -> KnownMotion:
+    """What weights know that were trained on these streams.
+
+    Args:
+        streams: with full truth; at least a window in all.
+        legs: with weak truth.
+        seed: of the choice of windows and of the first centres.
+    """
+    imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
+    stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
+    values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
+    told = {
+        "step_rate": np.concatenate([step_rates(imu) for imu in imus]),
+        "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
+    }
+    centres, limit = _centres(described(values), seed)
+    columns = dict(zip(FEATURES, values.T, strict=True)) | told
+    return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
+
+
+def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
+    """Windows (B, 6, 200) every `stride` samples, few at a time."""
+    starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
+    for first in range(0, len(starts), _AT_ONCE):
+        rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
+        yield imu[rows].transpose(0, 2, 1)
+
+
+def _speeds(stream: WorldStream, stride: int) -> FloatArray:
+    """Horizontal speeds over the windows (B,) [m/s]."""
+    moved = stream.position_W[WINDOW_SAMPLES::stride] - stream.position_W[:-WINDOW_SAMPLES:stride]
+    return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
+
+
+def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...], float]:
+    from scipy.cluster.vq import kmeans2, vq
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a centre that no window is nearest to
+        found, _ = kmeans2(known, min(_CENTRES, len(known)), minit="points", seed=seed)
+    rounded = np.round(found, 3)
+    limit = max(float(np.percentile(vq(known, rounded)[1], _PERCENTILE)), 1e-3)
+    return tuple(tuple(row) for row in rounded.tolist()), limit
+
+
+def _range(values: FloatArray) -> tuple[float, float]:
+    low, high = np.percentile(values, [1.0, 99.0])
+    return round(float(low), 4), round(float(high), 4)

@@ -1,0 +1,64 @@
+"""Models that ONNX Runtime computes, from files of `export_onnx`; PyTorch is not imported."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+from stario.network.card import Card, parse_card
+from stario.network.runtime.engines import OnnxEngine
+from stario.sequences.errors import InputError, WeightsError
+
+CARD_KEY = "stario_card"
+"""Of the metadata that holds the card as JSON."""
+
+
+def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
+    """The engine and the card of an exported file.
+
+    Args:
+        path: written by `export_onnx`.
+
+    Raises:
+        InputError: the extra `onnx` is not installed.
+        WeightsError: the file is missing, cut short, or no file of `export_onnx`.
+    """
+    runtime = onnx_packages("onnxruntime")
+    if not path.is_file():
+        raise WeightsError(path, "file", "nothing there", "an exported model")
+    options = runtime.SessionOptions()
+    # As many threads as PyTorch takes: those that the environment grants, else all (0).
+    granted = os.environ.get("OMP_NUM_THREADS", "")
+    options.intra_op_num_threads = int(granted) if granted.isdecimal() else 0
+    options.log_severity_level = 3
+    try:
+        session = runtime.InferenceSession(
+            path.read_bytes(), options, providers=["CPUExecutionProvider"]
+        )
+    # ONNX Runtime's errors have no common base of their own.
+    except Exception as error:
+        found = str(error).splitlines()[0]
+        raise WeightsError(path, "graph", found, "a whole ONNX file") from error
+    metadata = session.get_modelmeta().custom_metadata_map
+    if CARD_KEY not in metadata:
+        raise WeightsError(path, CARD_KEY, "no such metadata", "a file of `stario export`")
+    return OnnxEngine(session), parse_card(metadata[CARD_KEY], path)
+
+
+def onnx_packages(*names: str) -> Any:
+    """The last of some packages of the extra `onnx`.
+
+    Raises:
+        InputError: one is not installed.
+    """
+    module = None
+    for name in names:
+        try:
+            module = importlib.import_module(name)
+        except ImportError as error:
+            raise InputError(
+                name, "not installed", "the extra `onnx`", "pip install 'stario[onnx]'"
+            ) from error
+    return module

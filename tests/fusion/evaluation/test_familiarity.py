@@ -1,0 +1,75 @@
+"""Health and `inspect` say when a recording moves as nothing that the weights were trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator
+from stario.fusion.evaluation.familiarity import familiarity
+from stario.network.known_motion import KnownMotion, known_motion
+from stario.network.model import DisplacementModel, load_model
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.windows import world_streams
+
+
+def simulated(seconds: float = 30.0, sensor: int = 9) -> ImuSequence:
+    """The first part of always the same walk; another sensor where asked."""
+    style = WalkStyle(carry="handheld", preferred_speed=1.2)
+    walk = simulate_imu(generate_walk(2, 60.0, style=style), 200.0, PHONE_IMU, sensor)
+    return walk.slice(0.0, seconds)
+
+
+@pytest.fixture(scope="module")
+def model() -> DisplacementModel:
+    known = known_motion([s for sensor in range(3) for s in world_streams(simulated(60.0, sensor))])
+    return knowing(known)
+
+
+def knowing(known: KnownMotion) -> DisplacementModel:
+    plain = load_model("default")
+    return DisplacementModel(plain._engine, replace(plain.card, known_motion=known))
+
+
+def shaken(sequence: ImuSequence) -> ImuSequence:
+    """The same walk on a machine that trembles at 30 Hz."""
+    tremble = 4.0 * np.sin(2.0 * np.pi * 30.0 * sequence.time)
+    return replace(sequence, accel=sequence.accel + tremble[:, None])
+
+
+def test_a_walk_as_in_training_is_familiar_and_a_trembling_one_is_not(
+    model: DisplacementModel,
+) -> None:
+    walk = simulated()
+    usual = familiarity(model, walk)
+    assert usual.outside is not None
+    assert usual.outside < 0.3
+    assert not usual.strange
+    strange = familiarity(model, shaken(walk))
+    assert strange.outside == pytest.approx(1.0, abs=0.05)
+    assert strange.strange
+    [line] = [line for line in strange.lines() if line.startswith("!")]
+    assert "share of power above 10 Hz" in line
+    assert strange.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
+
+
+def test_health_says_so_in_batch_and_stream(model: DisplacementModel) -> None:
+    strange = shaken(simulated(12.0))
+    whole = Navigator(model).run(strange).health
+    assert whole is not None
+    [note] = [note for note in whole.notes if "windows" in note]
+    assert "sigma is widened" in note
+    navigator = Navigator(model)
+    for row in zip(strange.time, strange.gyro, strange.accel, strict=True):
+        navigator.push(*row)
+    assert note in navigator.health.notes
+    resumed = Navigator(model)
+    resumed.restore(navigator.snapshot())
+    assert note in resumed.health.notes
+    usual = Navigator(model).run(simulated(12.0)).health
+    assert usual is not None
+    assert not [note for note in usual.notes if "windows" in note]

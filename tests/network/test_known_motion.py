@@ -1,0 +1,112 @@
+"""What motion weights know: familiar gait lies inside, another gait or sensor outside."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.network.card import Card, dump_card, parse_card
+from stario.network.known_motion import (
+    OUTSIDE_VARIANCE,
+    KnownMotion,
+    features,
+    known_from,
+    known_motion,
+    step_rates,
+)
+from stario.network.model import DisplacementModel, load_model
+from stario.sequences.errors import WeightsError
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.windows import WINDOW_RATE, WorldStream
+
+
+def walked(seed: int, rate: float = 1.8, size: float = 1.0, seconds: float = 40.0) -> WorldStream:
+    """A device that bobs at a step rate [Hz] by `size` [m/s^2], with a little of all the rest."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 1.0 / WINDOW_RATE)
+    imu = 0.1 * rng.standard_normal((len(time), 6))
+    imu[:, 5] += STANDARD_GRAVITY + size * np.sin(2.0 * np.pi * rate * time)
+    imu[:, 3] += 0.4 * size * np.sin(np.pi * rate * time + 1.0)
+    imu[:, 2] += 0.5 * np.sin(0.4 * time)
+    position = np.stack([1.2 * time, 0.0 * time, 0.0 * time], axis=1)
+    facing = np.tile(np.array([1.0, 0.0], np.float32), (len(time), 1))
+    return WorldStream("walk", imu.astype(np.float32), position.astype(np.float32), facing)
+
+
+def windows(stream: WorldStream) -> np.ndarray:
+    count = len(stream) // 200
+    return stream.imu_W[: 200 * count].reshape(count, 200, 6).transpose(0, 2, 1)
+
+
+@pytest.fixture(scope="module")
+def known() -> KnownMotion:
+    return known_motion([walked(seed, rate=1.6 + 0.1 * seed) for seed in range(5)])
+
+
+def test_of_familiar_motion_about_one_window_in_twenty_lies_outside(known: KnownMotion) -> None:
+    strangeness = known.strangeness(windows(walked(99, rate=1.8)))
+    assert np.mean(strangeness > 1.0) < 0.25
+    assert known.variance_factor(windows(walked(99))).mean() < 1.2
+
+
+@pytest.mark.parametrize("other", [{"size": 4.0}, {"size": 0.1}, {"rate": 5.0}])
+def test_another_gait_lies_outside_and_widens_the_variance(
+    known: KnownMotion, other: dict[str, float]
+) -> None:
+    strange = windows(walked(1, **other))
+    assert np.mean(known.strangeness(strange) > 1.0) > 0.9
+    factors = known.variance_factor(strange)
+    assert factors.mean() > 0.75 * OUTSIDE_VARIANCE
+    assert factors.max() <= OUTSIDE_VARIANCE
+
+
+def test_what_is_known_does_not_depend_on_the_windows_yaw(known: KnownMotion) -> None:
+    ours = windows(walked(3, size=1.5))
+    yaw = 1.1
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    turned = np.concatenate([turn @ ours[:, :3], turn @ ours[:, 3:]], axis=1)
+    np.testing.assert_allclose(features(turned), features(ours), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(known.strangeness(turned), known.strangeness(ours), rtol=1e-3)
+
+
+@pytest.mark.parametrize("rate", [1.5, 2.3])
+def test_the_step_rate_is_the_bobbing_s(rate: float) -> None:
+    np.testing.assert_allclose(step_rates(walked(0, rate=rate).imu_W), rate, atol=0.06)
+    assert len(step_rates(walked(0, size=0.0).imu_W)) == 0
+
+
+def test_ranges_tell_speed_and_step_rate(known: KnownMotion) -> None:
+    assert known.ranges["speed"] == pytest.approx((1.2, 1.2), abs=0.01)
+    low, high = known.ranges["step_rate"]
+    assert low == pytest.approx(1.6, abs=0.1)
+    assert high == pytest.approx(2.0, abs=0.1)
+
+
+def test_it_travels_on_the_card(known: KnownMotion) -> None:
+    card = Card("R-ResNet", sha256="0", known_motion=known)
+    assert parse_card(dump_card(card), Path("a.json")).known_motion == known
+    assert parse_card(dump_card(replace(card, known_motion=None)), Path("a.json")) == replace(
+        card, known_motion=None
+    )
+    content = json.loads(dump_card(card))
+    content["known_motion"]["centres"][0] = "1 2"
+    with pytest.raises(WeightsError, match="known_motion"):
+        parse_card(json.dumps(content), Path("a.json"))
+    with pytest.raises(KeyError):
+        known_from({})
+
+
+def test_a_model_says_less_of_motion_that_it_does_not_know(known: KnownMotion) -> None:
+    plain = load_model("default")
+    plain = DisplacementModel(plain._engine, replace(plain.card, known_motion=None))
+    aware = DisplacementModel(plain._engine, replace(plain.card, known_motion=known))
+    strange = windows(walked(1, size=4.0))
+    mean, covariance = plain.predict(strange)
+    same, wider = aware.predict(strange)
+    np.testing.assert_array_equal(mean, same)
+    factors = known.variance_factor(strange)
+    np.testing.assert_allclose(wider, factors[:, None, None] * covariance)

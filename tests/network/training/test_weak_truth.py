@@ -1,0 +1,181 @@
+"""The leg loss: what it does not see (yaw), what it sees (length), and what it weighs how."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from stario.network.training.augment import Augmentation
+from stario.network.training.config import TrainingConfig
+from stario.network.training.train import train
+from stario.network.training.weak_truth import (
+    LegBatch,
+    LegSampler,
+    ends_covariance,
+    leg_loss,
+    leg_residuals,
+)
+from stario.sequences.errors import InputError
+from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.windows import world_streams
+
+PLAIN = Augmentation(
+    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
+    accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
+)  # fmt: skip
+SECONDS = 12
+WALK = simulate_imu(generate_walk(3, 60.0), 100.0, PERFECT_IMU, 0, name="walk")
+
+
+def truth_of(walk: ImuSequence) -> Trajectory:
+    assert walk.truth is not None
+    return walk.truth
+
+
+def known(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
+    """The walk with positions in place of poses, on a map that is turned."""
+    time = np.arange(1.0, 58.0, every)
+    position = truth_of(WALK).at(time).position_W
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = position @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    columns = 2 if kind == "waypoints" else 3
+    track = PositionTrack(time, turned[:, :columns], kind)  # type: ignore[arg-type]
+    return replace(WALK, truth=None, positions=track)
+
+
+def batch_of(recording: ImuSequence, augmentation: Augmentation = PLAIN) -> LegBatch:
+    [stream] = leg_streams(recording)
+    generator = torch.Generator().manual_seed(0)
+    return LegSampler([stream], SECONDS, augmentation, generator).batch(16)
+
+
+class Truth:
+    """The true displacements of stretches, found by their windows, as the network would answer."""
+
+    def __init__(self, recording: ImuSequence) -> None:
+        [self.stream] = leg_streams(recording)
+        [self.world] = world_streams(WALK, attitude="true")
+
+    def __call__(self, batch: LegBatch) -> torch.Tensor:
+        """(S, K, 3) in the frame that each window is shown in."""
+        found = []
+        for windows, R_NH in zip(batch.windows, batch.R_NH, strict=True):
+            begin = self._begin(windows[0].numpy())
+            position = truth_of(WALK).at(begin + np.arange(SECONDS + 1.0)).position_W
+            moved = np.diff(position, axis=0) @ self._R_NW(begin).T
+            R_HN = R_NH.transpose(1, 2).double().numpy()
+            found.append((R_HN @ moved[:, :, None])[:, :, 0])
+        return torch.tensor(np.stack(found), dtype=torch.float32)
+
+    def _begin(self, window: FloatArray) -> float:
+        """The vertical force tells where a window begins, whichever way it is turned."""
+        found = np.flatnonzero(np.abs(self.stream.imu_N[:-200, 5] - window[5, 0]) < 1e-4)
+        off = [np.abs(self.stream.imu_N[k : k + 200, 5] - window[5]).max() for k in found]
+        return float(found[np.argmin(off)]) / 200.0
+
+    def _R_NW(self, begin: float) -> FloatArray:
+        """Yaw between the levelled frame and the world, from one of the gyroscope's vectors."""
+        k = round(begin * 200)
+        part = slice(k, k + 2000)
+        a, b = (x[part, 3] + 1j * x[part, 4] for x in (self.world.imu_W, self.stream.imu_N))
+        turn = np.angle(np.vdot(a, b))
+        c, s = np.cos(turn), np.sin(turn)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(("kind", "every"), [("positions", 0.1), ("waypoints", 4.0)])
+def test_true_displacements_leave_no_residual_on_a_turned_map(kind: str, every: float) -> None:
+    recording = known(kind, every, yaw=2.0)
+    for augmentation in (PLAIN, replace(PLAIN, yaw=0.5, any_yaw=0.3)):
+        batch = batch_of(recording, augmentation)
+        assert int(batch.known.sum(1).min()) >= 2
+        told_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+        residual = leg_residuals(told_N, batch)
+        # Ends within a window are reached as if its speed were even, which a start is not.
+        size = residual[..., :2].norm(dim=-1)[batch.known]
+        assert float(size.median()) < 0.1
+        assert float(size.max()) < 0.6
+        longest = float(batch.displacement[..., :2].norm(dim=-1).max())
+        assert longest > 2.0
+
+
+def test_a_third_too_short_is_seen_and_a_turn_of_all_is_not() -> None:
+    recording = known("positions", 0.1)
+    batch = batch_of(recording)
+    told_H = Truth(recording)(batch)
+    told_N = (batch.R_NH @ told_H[..., None])[..., 0]
+    whole = leg_residuals(told_N, batch)[..., :2].norm(dim=-1).mean()
+    short = leg_residuals(0.67 * told_N, batch)[..., :2].norm(dim=-1).mean()
+    c, s = np.cos(1.0), np.sin(1.0)
+    R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    turned = leg_residuals(told_N @ R.T, batch)[..., :2].norm(dim=-1).mean()
+    assert float(short) > 5.0 * float(whole)
+    assert float(turned) == pytest.approx(float(whole), rel=1e-3)
+
+
+def test_the_gradient_points_to_longer_displacements_and_not_to_a_turn() -> None:
+    recording = known("positions", 0.1)
+    batch = batch_of(recording)
+    factor = torch.tensor(0.67, requires_grad=True)
+    told = factor * Truth(recording)(batch)
+    loss, plain = leg_loss(told, torch.zeros_like(told), batch)
+    loss.backward()
+    assert float(plain) > 0.0
+    assert factor.grad is not None
+    assert float(factor.grad) < 0.0
+
+
+def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
+    start, stop = np.array([0.0, 4.0, 9.0]), np.array([4.0, 8.0, 13.0])
+    C = ends_covariance(start, stop, np.full((3, 2), 0.5))
+    np.testing.assert_allclose(np.diag(C), 0.5)
+    assert C[0, 1] == pytest.approx(-0.25)  # they share the end at 4 s
+    assert C[1, 2] == 0.0  # 8 and 9 s are two ends
+    rng = np.random.default_rng(0)
+    ends = 0.5 * rng.normal(size=(100_000, 5))
+    legs = np.stack([ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 1], ends[:, 4] - ends[:, 3]])
+    np.testing.assert_allclose(np.cov(legs), C, atol=0.01)
+
+
+def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
+    recording = known("positions", 0.1)
+    assert recording.positions is not None
+    time, position = recording.positions.time, recording.positions.position_W.copy()
+    position[time > 30.0] += [5.0, 0.0, 0.0]
+    jumped = replace(recording, positions=PositionTrack(time, position, "positions"))
+    [whole], [cut] = leg_streams(recording), leg_streams(jumped)
+    assert len(whole.start) - len(cut.start) == 1
+    assert not ((cut.start < 30.0) & (cut.stop > 30.1)).any()
+    ride = replace(recording, positions=PositionTrack(time, 9.0 * position, "positions"))
+    assert leg_streams(ride) == []
+
+
+def test_a_recording_without_positions_has_no_legs() -> None:
+    with pytest.raises(InputError, match="positions: found none"):
+        leg_streams(WALK)
+
+
+def test_a_network_learns_its_scale_from_positions_alone(tmp_path: Path) -> None:
+    """Windows with full truth say nothing moves; the legs say how far it went."""
+    [legs] = leg_streams(known("positions", 0.1))
+    assert isinstance(legs, LegStream)
+    streams = world_streams(WALK)
+    config = TrainingConfig(
+        architecture="DeepILS", epochs=2, epoch_windows=64, batch=16, rate=2e-3, warm_up=0.0,
+        likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
+    )  # fmt: skip
+    reports: list[dict[str, float]] = []
+    train(
+        config, streams, [1.0] * len(streams), streams, tmp_path,
+        on_epoch=lambda report: reports.append(report.validation_by_recording),
+        legs=[legs], validation_legs=[legs],
+    )  # fmt: skip
+    assert reports[-1]["positions"] < 0.9 * reports[0]["positions"]
+    assert (tmp_path / "checkpoint.safetensors").exists()
