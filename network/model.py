@@ -167,8 +167,9 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: "default" for the weights in the package, a safetensors file with its card
-            beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then computes.
+        name_or_path: of weights in the package ("default", or "walks-36min", those before them),
+            a safetensors file with its card beside it, or an ONNX file of `export_onnx`, which
+            ONNX Runtime then computes.
 
     Raises:
         WeightsError: the file or its card is missing, cut short, or they do not match.
@@ -179,9 +180,9 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
         from stario.network.runtime.onnx_file import load_onnx
 
         return DisplacementModel(*load_onnx(path))
-    if str(name_or_path) == "default":
-        folder = importlib.resources.files("stario.network.weights")
-        path = Path(str(folder.joinpath("default.safetensors")))
+    packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
+    if path.parent == Path() and not path.suffix and packaged.is_file():
+        path = packaged
     card = read_card(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.readers.own_csv import write_csv as write_csv
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
+    from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
     from stario.sequences.sequence import Magnetometer as Magnetometer
     from stario.sequences.sequence import PositionTrack as PositionTrack
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "ConfigError": "errors",
+    "DeviceAttitude": "sequence",
     "GOOD_IMU": "simulation.imu",
     "INDOOR_FIELD": "simulation.magnetometer",
     "ImuErrors": "simulation.imu",
@@ -88,6 +90,7 @@ __all__ = [
     "PHONE_IMU",
     "STANDARD_GRAVITY",
     "ConfigError",
+    "DeviceAttitude",
     "ImuErrors",
     "ImuNoise",
     "ImuSequence",

@@ -65,6 +65,9 @@ def _write(group: Any, sequence: ImuSequence) -> None:
     if sequence.magnetometer is not None:
         columns["mag/t"] = sequence.magnetometer.time
         columns["mag/field"] = sequence.magnetometer.field
+    if sequence.device_attitude is not None:
+        columns["attitude/t"] = sequence.device_attitude.time
+        columns["attitude/quat_xyzw"] = sequence.device_attitude.attitude_WB.as_quat()
     if sequence.truth is not None:
         columns |= _pose_columns(sequence.truth)
     if sequence.positions is not None:

@@ -7,9 +7,17 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Magnetometer
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    DeviceAttitude,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    Trajectory,
+)
 from stario.sequences.units import with_units
 
 log = logging.getLogger(__name__)
@@ -72,12 +80,16 @@ def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
     if axes == SAME_AXES:
         return sequence
     R = axes_matrix(axes)
-    field = sequence.magnetometer
+    field, own = sequence.magnetometer, sequence.device_attitude
+    turn = Rotation.from_matrix(R)
     return replace(
         sequence,
         gyro=sequence.gyro @ R.T,
         accel=sequence.accel @ R.T,
         magnetometer=None if field is None else Magnetometer(field.time, field.field @ R.T),
+        device_attitude=(
+            None if own is None else DeviceAttitude(own.time, own.attitude_WB * turn.inv())
+        ),
     )
 
 
@@ -117,10 +129,11 @@ def axes_named(R: FloatArray) -> str:
 
 
 def with_gravity(sequence: ImuSequence) -> ImuSequence:
-    """Specific force from linear acceleration: gravity put back by the recording's true attitude.
+    """Specific force from linear acceleration: gravity put back by the recording's attitude.
 
     f_B = a_B + R_WB^T (0, 0, g). Samples whose attitude is not known are dropped and their number
-    is logged. The track of a recording mended so rests on its truth's attitude.
+    is logged. The attitude is the truth's or, without one, the device's own: the track of a
+    recording mended so rests on it.
 
     Raises:
         InputError: there is no truth, or it gives no sample's attitude.
@@ -128,7 +141,7 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
     found = "removed"
     fix = "record the raw accelerometer, or give the attitude: truth with px,py,pz,qx,qy,qz,qw"
     expected = "an attitude that says where gravity was"
-    truth = sequence.truth
+    truth = _attitude_of(sequence)
     if truth is None or truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: gravity", f"{found} and no truth", expected, fix)
     times, index = np.unique(sequence.time, return_inverse=True)
@@ -154,3 +167,11 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
         gyro=sequence.gyro[kept],
         accel=sequence.accel[kept] + gravity_B,
     )
+
+
+def _attitude_of(sequence: ImuSequence) -> Trajectory | None:
+    """The true poses, or the device's own attitude as a track that stands still."""
+    own = sequence.device_attitude
+    if sequence.truth is not None or own is None:
+        return sequence.truth
+    return Trajectory(own.time, np.zeros((len(own), 3)), own.attitude_WB)

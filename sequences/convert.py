@@ -172,5 +172,7 @@ def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
         )
     if sequence.magnetometer is not None and layout == "euroc":
         lost.append("the magnetometer has no file in the EuRoC layout: write a .csv or .h5")
+    if sequence.device_attitude is not None:
+        lost.append("the device's own attitude has no column: write an .h5")
     for words in lost:
         log.warning("%s: %s", sequence.name, words)

@@ -88,6 +88,7 @@ class Inspection:
         fit: between truth and gyroscope, None where they cannot be compared.
         problems: what is wrong, one line each, with what mends it.
         truth: what is known of the true track, in words.
+        device_attitude: how many attitudes the device's own fusion has logged.
         magnetic: the magnetometer's, None without one or where there is too little of it.
     """
 
@@ -101,6 +102,7 @@ class Inspection:
     problems: tuple[str, ...]
     truth: str = "none"
     magnetic: MagneticFindings | None = None
+    device_attitude: int = 0
 
     def as_dict(self) -> dict[str, object]:
         """The findings as plain values, units in the names."""
@@ -145,6 +147,7 @@ class Inspection:
                 "jumps": fit.jumps,
                 "axes": fit.axes(),
             },
+            "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
             "problems": list(self.problems),
@@ -158,6 +161,7 @@ class Inspection:
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
             *(self.magnetic.lines() if self.magnetic else []),
+            *([f"device's own attitude: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
             *(f"! {problem}" for problem in self.problems or ()),
             *([] if self.problems else ["units, signs and axes: nothing wrong was found"]),
@@ -203,7 +207,7 @@ class Inspection:
         lines = [
             f"truth: covers {100 * coverage.share:.1f} % of the samples, "
             f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
-            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of way"
+            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
         ]
         if fit is not None:
             lines.append(
@@ -254,6 +258,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         fit=fit,
         problems=tuple(problems),
         truth=sequence.truth_words(),
+        device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
     )
 

@@ -240,6 +240,37 @@ class Magnetometer:
 
 
 @dataclass(frozen=True, eq=False)
+class DeviceAttitude:
+    """The attitude that the device's own fusion gave, in a world of its own with z up.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        attitude_WB: M rotations taking body B to that world.
+
+    Raises:
+        InputError: the lengths differ or time does not increase.
+    """
+
+    time: FloatArray
+    attitude_WB: Rotation
+
+    def __post_init__(self) -> None:
+        time = _checked_time("device attitude's time", self.time)
+        if len(self.attitude_WB) != len(time):
+            found = f"{len(self.attitude_WB)} rotations"
+            raise InputError("device attitude", found, f"{len(time)} as time")
+        object.__setattr__(self, "time", time)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> DeviceAttitude | None:
+        """The attitudes with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        return DeviceAttitude(self.time[keep], self.attitude_WB[keep]) if keep.any() else None
+
+
+@dataclass(frozen=True, eq=False)
 class ImuSequence:
     """One recording of an inertial measurement unit, in body axes B.
 
@@ -257,6 +288,7 @@ class ImuSequence:
         magnetometer: the field measured beside the IMU, or None.
         positions: known positions where there is no pose (`truth`): a track or waypoints, or None.
         attributes: what else is known of the recording (person, device, place, carry, ...).
+        device_attitude: what the device's own fusion said of its attitude, or None.
 
     Raises:
         InputError: the arrays' shapes do not agree or there is no sample.
@@ -271,6 +303,7 @@ class ImuSequence:
     magnetometer: Magnetometer | None = None
     positions: PositionTrack | None = None
     attributes: Mapping[str, str | float] = field(default_factory=dict)
+    device_attitude: DeviceAttitude | None = None
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
@@ -318,7 +351,7 @@ class ImuSequence:
     def slice(self, start: float, stop: float) -> ImuSequence:
         """The samples with start <= time <= stop [s], truth cut likewise."""
         keep = (self.time >= start) & (self.time <= stop)
-        field, positions = self.magnetometer, self.positions
+        field, positions, own = self.magnetometer, self.positions, self.device_attitude
         return replace(
             self,
             time=self.time[keep],
@@ -327,6 +360,7 @@ class ImuSequence:
             truth=None if self.truth is None else self.truth.slice(start, stop),
             magnetometer=None if field is None else field.slice(start, stop),
             positions=None if positions is None else positions.slice(start, stop),
+            device_attitude=None if own is None else own.slice(start, stop),
         )
 
 
@@ -346,7 +380,7 @@ def too_slow(truth: Trajectory) -> str:
 def second_ticks(time: FloatArray) -> FloatArray:
     """Every second (M,) from the first of increasing times (N,) to before the last [s].
 
-    Those within a gap are left out: the way between is straight, and a clock that jumps by decades
+    Those within a gap are left out: the path between is straight, and a clock that jumps by decades
     must not cost memory.
     """
     seconds = np.floor(time - time[0])

@@ -53,6 +53,12 @@ def train(
             "the test recordings, choose and calibrate by those of its list `holdout`."
         ),
     ] = None,
+    few: Annotated[
+        bool,
+        typer.Option(
+            "--few", help="With --data: the eight recordings of the paper's comparison alone."
+        ),
+    ] = False,
     leave_out: Annotated[
         str | None,
         typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
@@ -106,7 +112,7 @@ def train(
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
-        reading, paths or [], validation or [], _lists(data, leave_out), streams_of
+        reading, paths or [], validation or [], _lists(data, leave_out, few), streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
@@ -169,15 +175,17 @@ def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
-def _lists(data: Path | None, group: str | None) -> tuple[list[Path], list[Path]]:
+def _lists(data: Path | None, group: str | None, few: bool) -> tuple[list[Path], list[Path]]:
     """Recordings to learn from and to be kept, of the lists in the package."""
-    from stario.network.training.splits import listed
+    from stario.network.training.splits import listed, split_paths
     from stario.sequences.splits import leave_out
 
     if data is None:
         if group is not None:
             raise InputError("--leave-out", "no --data", "the folder of the development recordings")
         return [], []
+    if few:
+        return split_paths(data, "training"), split_paths(data, "validation")
     everything = listed("all", data)
     if group is not None:
         outside, inside = leave_out(everything, group)

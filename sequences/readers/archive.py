@@ -20,6 +20,7 @@ from stario.sequences.readers.checked import checked, optional_package, rotation
 from stario.sequences.readers.text import magic
 from stario.sequences.sequence import (
     BoolArray,
+    DeviceAttitude,
     FloatArray,
     ImuSequence,
     Magnetometer,
@@ -165,6 +166,7 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         converted=frozenset({"gyro", "accel"}),
         magnetometer=_magnetometer(path, group),
         positions=positions,
+        device_attitude=_device_attitude(path, group),
         attributes={key: _plain(value) for key, value in group.attrs.items()},
     )
 
@@ -175,6 +177,15 @@ def _magnetometer(path: Path, group: Any) -> Magnetometer | None:
     time, field = _column(path, group, "mag/t"), _column(path, group, "mag/field")
     keep = advancing(time)
     return Magnetometer(time[keep], field[keep])
+
+
+def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
+    if "attitude" not in group:
+        return None
+    time = _column(path, group, "attitude/t")
+    quat = _column(path, group, "attitude/quat_xyzw")
+    keep = advancing(time)
+    return DeviceAttitude(time[keep], rotations(path, "attitude/quat_xyzw", quat[keep], "xyzw"))
 
 
 def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:

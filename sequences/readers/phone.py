@@ -24,11 +24,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import on_one_clock
 from stario.sequences.readers.own_csv import is_own_csv
+from stario.sequences.readers.phone_attitude import logged_attitude
 from stario.sequences.readers.phone_files import SUFFIXES, PhoneFiles, phone_recordings
 from stario.sequences.readers.phone_sign import accel_sign, is_in_g
 from stario.sequences.readers.poses import pose_files, with_pose
@@ -40,8 +42,14 @@ from stario.sequences.readers.sensor_table import (
     sensor_table,
 )
 from stario.sequences.readers.sensor_words import Sensor, is_sensor_word, words_of
-from stario.sequences.readers.text import head_lines, seconds
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Magnetometer
+from stario.sequences.readers.text import IntArray, head_lines, seconds
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    DeviceAttitude,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -132,7 +140,8 @@ def assembled(
         ReadError: a file is malformed or the sensors have no stretch in common.
     """
     gyro = _read(files.tables["gyro"][0], "gyro")
-    accel, converted = _force(files, gyro, g_unnamed)
+    attitude = logged_attitude(files, gyro)
+    accel, converted = _force(files, gyro, attitude, g_unnamed)
     stamps, rate, force = on_one_clock(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
@@ -145,6 +154,7 @@ def assembled(
         accel=force,
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0]),
+        device_attitude=_device_attitude(attitude, stamps[0]),
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -189,7 +199,12 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
     return read_samples(table, sensor, axes)
 
 
-def _force(files: PhoneFiles, gyro: Samples, g_unnamed: bool) -> tuple[Samples, set[str]]:
+def _force(
+    files: PhoneFiles,
+    gyro: Samples,
+    attitude: tuple[IntArray, Rotation] | None,
+    g_unnamed: bool,
+) -> tuple[Samples, set[str]]:
     """Specific force, and whether its unit or sign were converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity = _gravity(files)
@@ -206,7 +221,7 @@ def _force(files: PhoneFiles, gyro: Samples, g_unnamed: bool) -> tuple[Samples, 
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: gravity added from its own file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
-    sign = accel_sign(files, accel, told=not g_unnamed)
+    sign = accel_sign(files, accel, attitude, told=not g_unnamed)
     in_g = not accel.unit and is_in_g(accel.values) and (sign < 0 or g_unnamed)
     if sign < 0 or in_g:
         converted |= {"accel"}
@@ -228,6 +243,12 @@ def _has_gravity(accel: Samples, or_g: bool) -> bool:
 def _gravity(files: PhoneFiles) -> Samples | None:
     table = files.first("gravity")
     return None if table is None else _read(table, "gravity")
+
+
+def _device_attitude(
+    attitude: tuple[IntArray, Rotation] | None, start_ns: np.int64
+) -> DeviceAttitude | None:
+    return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
 
 
 def _magnetometer(files: PhoneFiles, start_ns: np.int64) -> Magnetometer | None:

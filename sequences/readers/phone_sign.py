@@ -2,8 +2,7 @@
 
 The sign does not show in the accelerometer and the gyroscope: a world upside down moves alike. It
 is known by the system that an app names, or by the phone's own attitude where that was logged:
-specific force points up. Apps differ in the order of a quaternion and in whether it takes the body
-to the world or back, so all are tried, and the one that fits best decides.
+specific force points up.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import ReadError
 from stario.sequences.readers.phone_files import PhoneFiles
-from stario.sequences.readers.sensor_table import Samples, read_quaternion
-from stario.sequences.readers.text import IntArray, head_lines
-from stario.sequences.rotations import NORM_TOLERANCE
+from stario.sequences.readers.sensor_table import Samples
+from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)
@@ -30,9 +27,6 @@ _STEADY = 0.4
 _SURE = 0.7
 """Mean cosine between an attitude's vertical and the force from which it decides."""
 
-_ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
-"""Where x, y, z and w stand in rows without a header."""
-
 
 def is_in_g(values: FloatArray) -> bool:
     """Whether an accelerometer's samples (N, 3) are about one long: gravity in g."""
@@ -41,16 +35,22 @@ def is_in_g(values: FloatArray) -> bool:
     return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
 
 
-def accel_sign(files: PhoneFiles, accel: Samples, told: bool = True) -> float:
+def accel_sign(
+    files: PhoneFiles,
+    accel: Samples,
+    attitude: tuple[IntArray, Rotation] | None,
+    told: bool = True,
+) -> float:
     """1.0, or -1.0 where the accelerometer has Apple's sign.
 
     Args:
         files: the recording's.
         accel: its accelerometer's samples.
+        attitude: the phone's own, as `logged_attitude` returns it.
         told: say what cannot be known.
     """
     folder = files.gyro.parent
-    sign = _by_attitude(files, accel)
+    sign = _by_attitude(attitude, accel)
     if sign is None:
         sign = _by_system(folder)
     if sign is None and accel.unit == "g" and _has_core_motion(files):
@@ -89,44 +89,18 @@ def _has_core_motion(files: PhoneFiles) -> bool:
     return any(title.startswith("motion") for title in titles)
 
 
-def _by_attitude(files: PhoneFiles, accel: Samples) -> float | None:
-    """By the phone's own attitude, where it is one to be used."""
-    table = files.first("attitude")
-    if table is None or not table.quaternion:
+def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> float | None:
+    """By the phone's own attitude: the mean cosine between its vertical and the force."""
+    if attitude is None:
         return None
-    try:
-        stamps, quaternion = read_quaternion(table)
-    except ReadError:
-        return None
-    unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
-    if unit.sum() < 2:
-        return None
-    stamps, quaternion = stamps[unit], quaternion[unit]
-    orders = _ORDERS[:1] if table.quaternion[0].title else _ORDERS
-    fits = [
-        _agreement(stamps, rotation, accel)
-        for order in orders
-        for rotation in _both_ways(Rotation.from_quat(quaternion[:, order]))
-    ]
-    best = max(fits, key=abs)
-    return float(np.sign(best)) if abs(best) > _SURE else None
-
-
-def _both_ways(attitude: Rotation) -> tuple[Rotation, Rotation]:
-    return attitude, attitude.inv()
-
-
-def _agreement(stamps_ns: IntArray, attitude_WB: Rotation, accel: Samples) -> float:
-    """Mean cosine between the vertical in B and the force over the common stretch."""
-    origin = stamps_ns.min()
-    order = np.argsort(stamps_ns, kind="stable")
-    clock = stamps_ns[order] - origin
-    inside = (accel.stamps_ns >= origin) & (accel.stamps_ns <= stamps_ns.max())
+    stamps_ns, attitude_WB = attitude
+    inside = (accel.stamps_ns >= stamps_ns[0]) & (accel.stamps_ns <= stamps_ns[-1])
     if inside.sum() < 2:
-        return 0.0
-    up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)[order]
-    time = accel.stamps_ns[inside] - origin
+        return None
+    up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+    time, clock = (seconds(ns, stamps_ns[0]) for ns in (accel.stamps_ns[inside], stamps_ns))
     seen = np.stack([np.interp(time, clock, up_B[:, k]) for k in range(3)], axis=1)
     force = accel.values[inside]
     sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
-    return float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))
+    cosine = float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))
+    return float(np.sign(cosine)) if abs(cosine) > _SURE else None

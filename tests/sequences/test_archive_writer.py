@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
+    DeviceAttitude,
     ImuSequence,
     InputError,
     Magnetometer,
@@ -43,6 +45,7 @@ def walk() -> ImuSequence:
         magnetometer=Magnetometer(time + 1e-3, rng.normal(0.0, 40.0, (len(time), 3))),
         positions=PositionTrack(np.array([0.5, 3.0]), taps, "waypoints"),
         attributes={"person": "ann", "minutes": 0.1},
+        device_attitude=DeviceAttitude(time, Rotation.random(len(time), random_state=2)),
     )
 
 
@@ -63,6 +66,10 @@ def assert_equal(found: ImuSequence, given: ImuSequence) -> None:
         for name in columns if here is not None else ():
             np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
     assert dict(found.attributes) == dict(given.attributes)
+    if given.device_attitude is not None:
+        assert found.device_attitude is not None
+        off = found.device_attitude.attitude_WB.inv() * given.device_attitude.attitude_WB
+        assert off.magnitude().max() < 1e-15
 
 
 def test_everything_comes_back(walk: ImuSequence, tmp_path: Path) -> None:
@@ -72,7 +79,7 @@ def test_everything_comes_back(walk: ImuSequence, tmp_path: Path) -> None:
         truth=None,
         positions=PositionTrack(walk.time, walk.accel, "positions", walk.time > 1.0),
     )
-    bare = replace(walk, truth=None, positions=None, magnetometer=None, attributes={})
+    bare = replace(tracked, positions=None, magnetometer=None, attributes={}, device_attitude=None)
     given = [walk, tracked, bare]
     names = write_archive(path, given)
     assert names == ["hall-walk", "hall-walk-2", "hall-walk-3"]

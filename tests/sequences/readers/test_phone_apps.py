@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from stario.sequences import (
     find_recordings,
     read_recording,
 )
+from stario.sequences.conventions import with_axes, with_gravity
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -275,6 +277,25 @@ def test_a_linear_acceleration_of_about_one_is_not_gravity_in_g(
     np.testing.assert_allclose(read.accel, gravity(walk) + steady, atol=1e-8)
 
 
+@pytest.mark.parametrize("app", [sensor_logger_attitude, senslogs_ios])
+def test_the_phones_own_attitude_comes_along(
+    app: Callable[[Path, ImuSequence], None], walk: ImuSequence, tmp_path: Path
+) -> None:
+    """In either order of the quaternion and written either way, by the gyroscope."""
+    app(tmp_path / "s", walk)
+    read = read_recording(tmp_path / "s")
+    assert read.device_attitude is not None
+    np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
+    away = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
+    assert away.max() < 1e-6
+    back = replace(read, accel=read.accel - gravity(walk))
+    np.testing.assert_allclose(with_gravity(back).accel, walk.accel, atol=0.02)
+    turned = with_axes(read, "y,-x,z").device_attitude
+    assert turned is not None
+    up = turned.attitude_WB.apply(with_axes(read, "y,-x,z").accel)
+    np.testing.assert_allclose(up, pose(walk).attitude_WB.apply(walk.accel), atol=1e-5)
+
+
 @pytest.mark.parametrize("inner", ["", "walk/"])
 @pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
 def test_a_zip_is_the_folder_in_it(app: str, inner: str, walk: ImuSequence, tmp_path: Path) -> None:
@@ -406,6 +427,8 @@ def test_the_apps_own_files_hold_gravity_and_what_is_known_of_truth(name: str) -
     assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
     assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0
     assert KINDS[name] in read.truth_words()
+    logged = ("shopping_mall_eight", "pyojinkim_android", "senslogs_tyrex")
+    assert (read.device_attitude is not None) == any(part in name for part in logged)
     if read.truth is not None:
         known = read.truth.at(read.time[::10])
         up = known.attitude_WB.apply(read.accel[::10])[known.valid].mean(axis=0)
