@@ -261,8 +261,8 @@ APPS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         sensor_logger, sensor_logger_ios, sensor_logger_attitude, phyphox, senslogs_ios,
-        senslogs_android, sensor_log, raw_g_iphone, two_clocks, prefixed, androsensor, physics_toolbox, trace,
-        get_sensor_data,
+        senslogs_android, sensor_log, raw_g_iphone, two_clocks, prefixed, androsensor,
+        physics_toolbox, trace, get_sensor_data,
     )
 }  # fmt: skip
 
@@ -405,7 +405,8 @@ def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
     for read in (read_recording, find_recordings):
         with pytest.raises(ReadError, match=told):
             read(tmp_path / "s")
-    header = "ACCELEROMETER X (m/s²);ACCELEROMETER Y (m/s²);ACCELEROMETER Z (m/s²);Time since start in ms "
+    header = ";".join(f"ACCELEROMETER {axis} (m/s²)" for axis in "XYZ")
+    header += ";Time since start in ms "
     save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), joint=";")
     with pytest.raises(ReadError, match="accel alone"):
         read_recording(tmp_path / "a.csv")
