@@ -207,7 +207,7 @@ class Inspection:
         lines = [
             f"truth: covers {100 * coverage.share:.1f} % of the samples, "
             f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
-            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of way"
+            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
         ]
         if fit is not None:
             lines.append(

@@ -380,7 +380,7 @@ def too_slow(truth: Trajectory) -> str:
 def second_ticks(time: FloatArray) -> FloatArray:
     """Every second (M,) from the first of increasing times (N,) to before the last [s].
 
-    Those within a gap are left out: the way between is straight, and a clock that jumps by decades
+    Those within a gap are left out: the path between is straight, and a clock that jumps by decades
     must not cost memory.
     """
     seconds = np.floor(time - time[0])

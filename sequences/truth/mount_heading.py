@@ -2,7 +2,7 @@
 
 On a trolley a device turns about the vertical alone, and rotation vectors along one axis leave the
 mount's turn about that axis open. The accelerometer closes it: what it feels sideways must be the
-second derivative of the captured way. With the second difference over h, which is the mean of the
+second derivative of the captured path. With the second difference over h, which is the mean of the
 acceleration under a triangle,
 
     (p(t + h) - 2 p(t) + p(t - h)) / h^2  =  mean of  R_WB (f - b_a) + g + R_WB ([w']x + [w]x^2) s
