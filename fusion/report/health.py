@@ -57,12 +57,20 @@ def findings(health: Health) -> list[Finding]:
         *_updates(health),
         *_fixes(health),
         *_direction(health),
-        *(Finding("note", note[:1].upper() + note[1:]) for note in health.notes),
+        *map(_noted, health.notes),
     ]
-    if not any(finding.level == "warning" for finding in found):
+    if not health.notes and not any(finding.level == "warning" for finding in found):
         found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
     order: dict[str, int] = {"warning": 0, "good": 1, "note": 2}
     return sorted(found, key=lambda finding: order[finding.level])
+
+
+def _noted(note: str) -> Finding:
+    text = f"{note[:1].upper()}{note[1:]}."
+    if "weights were trained on" not in note:
+        return Finding("note", text)
+    advice = "Fine-tune the weights on recordings of this kind: `stario train --start-from`."
+    return Finding("warning", text, advice)
 
 
 def _samples(health: Health) -> list[Finding]:

@@ -96,6 +96,14 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path):
 def test_health_in_words_says_what_to_do():
     good = findings(Health(samples={"used": 1000}, updates=100, mean_nis=3.0))
     assert [finding.level for finding in good] == ["good"]
+    noted = findings(
+        Health(
+            mean_nis=3.0,
+            notes=["60% of the windows move as little that the weights were trained on"],
+        )
+    )
+    assert [finding.level for finding in noted] == ["warning"]
+    assert "stario train" in noted[0].advice
     bad = findings(
         Health(
             samples={"used": 900, "out_of_order": 100},

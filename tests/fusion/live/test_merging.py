@@ -1,12 +1,17 @@
 """Sensors with their own clocks become samples at the gyroscope's times, however they arrive."""
 
+import csv
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stario.fusion.live.merging import LONGEST_WAIT, Join, Merger
-from stario.fusion.live.payload import Reading
+from stario.fusion.live.payload import GYRO, TOTAL, Reading
+from stario.sequences import read_recording
 
 SECOND = 10**9
 
@@ -104,3 +109,29 @@ def test_what_a_device_does_not_send_is_named():
     merger.add(linear("totalacceleration", 100, 0, seconds=30.0))
     assert merger.missing == "gyroscope"
     assert len(merger._waiting) < 600
+
+
+SENSOR_LOGGER = (
+    Path(os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
+    / "raw/sensor_logger/university_loop"
+)
+
+
+@pytest.mark.skipif(
+    not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
+)
+def test_a_real_walk_that_is_pushed_is_the_one_read_from_its_files():
+    rows = []
+    for file, name in (("Gyroscope", GYRO), ("TotalAcceleration", TOTAL)):
+        with (SENSOR_LOGGER / f"{file}.csv").open() as table:
+            for row in csv.DictReader(table):
+                rows.append(Reading(name, int(row["time"]), tuple(float(row[k]) for k in "xyz")))
+    rows = phone(rows)
+    merger = Merger()
+    samples = [s for k in range(0, len(rows), 100) for s in merger.add(rows[k : k + 100])]
+    recording = read_recording(SENSOR_LOGGER)
+    assert len(samples) == len(recording)
+    np.testing.assert_array_equal([s[1] for s in samples], recording.gyro)
+    np.testing.assert_allclose([s[2] for s in samples], recording.accel, atol=1e-9)
+    time = np.array([s[0] - samples[0][0] for s in samples]) / 1e9
+    np.testing.assert_allclose(time, recording.time - recording.time[0], atol=1e-6)
