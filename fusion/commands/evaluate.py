@@ -50,7 +50,8 @@ def evaluate(
     against: Annotated[
         str | None,
         typer.Option(
-            help="With --by: weights to compare with, by paired ratios with 95 % intervals. "
+            help="With --by: weights to compare with, or pdr (steps without a network), by paired "
+            "ratios with 95 % intervals. "
             "{group} in the name of weights is each recording's group: leave one group out."
         ),
     ] = None,

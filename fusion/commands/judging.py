@@ -11,6 +11,7 @@ import typer
 from stario.fusion.commands.common import Reading, print_json, progress_bar
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
     from stario.network.model import DisplacementModel
     from stario.sequences.batch import Skipped
     from stario.sequences.splits import Listed
@@ -69,13 +70,16 @@ _GROUP = "{group}"
 
 
 @cache
-def _loaded(name: str) -> DisplacementModel:
+def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
+    from stario.fusion.evaluation.pedestrian import NAME, PedestrianDeadReckoning
     from stario.network.model import load_model
 
+    if name == NAME:
+        return PedestrianDeadReckoning()
     return load_model(name)
 
 
-def _for_group(name: str, group: str) -> DisplacementModel:
+def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
     """Weights by name; `{group}` in it is the group, blanks as underscores."""
     return _loaded(name.replace(_GROUP, group.replace(" ", "_")))
 

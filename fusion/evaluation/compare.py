@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.pedestrian import pedestrian_track
 from stario.fusion.evaluation.tracks import (
     inertial_track,
     network_track,
@@ -26,7 +27,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 log = logging.getLogger(__name__)
 
-TRACKS = ("inertial", "network", "network_true_attitude", "ekf", "graph")
+TRACKS = ("inertial", "pdr", "network", "network_true_attitude", "ekf", "graph")
 
 DEMONSTRATION_SEED = 2**31 + 2026
 """Of the bundled demonstration; training draws its seeds below 2^31, so it never saw this walk."""
@@ -129,6 +130,10 @@ def compare(
         "inertial": inertial_track(preprocessed, config),
         "network": network_track(preprocessed),
     }
+    try:
+        tracks["pdr"] = pedestrian_track(sequence)
+    except InputError as error:
+        log.warning("no pedestrian dead reckoning: %s", error)
     if sequence.truth is not None:
         try:
             tracks["network_true_attitude"] = network_track_true_attitude(model, sequence, config)

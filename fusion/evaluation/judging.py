@@ -20,7 +20,7 @@ from stario.fusion.evaluation.displacement_error import (
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.network_alone import answers
+from stario.fusion.evaluation.network_alone import Answering, answers
 from stario.fusion.evaluation.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
 from stario.sequences.batch import Skipped
@@ -81,7 +81,7 @@ def check_by(name: str) -> By:
 
 def judge(
     recordings: Iterable[Prepared | Skipped],
-    models: Mapping[str, Callable[[str], Predictor]],
+    models: Mapping[str, Callable[[str], Predictor | Answering]],
     groups: Mapping[Path, str],
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[Judged], list[Skipped]]:

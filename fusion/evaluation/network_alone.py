@@ -7,6 +7,7 @@ between two ticks is the mean of the windows that cover it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -45,13 +46,24 @@ class Answers:
         return np.concatenate([[0.0], np.cumsum(total / count)])
 
 
-def answers(model: Predictor, prepared: Prepared) -> list[Answers]:
+@runtime_checkable
+class Answering(Protocol):
+    """What answers on a whole recording by itself, without a network."""
+
+    def answers(self, prepared: Prepared) -> list[Answers]:
+        """Answers on every piece, in the frame N."""
+        ...
+
+
+def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
     """A network's answers on every piece of a recording, in the frame N.
 
     Args:
         model: may remember; its memory begins anew at every piece.
         prepared: the recording.
     """
+    if isinstance(model, Answering):
+        return model.answers(prepared)
     network = StatefulInference(model, UPDATES)
     found = []
     for piece in prepared.pieces:

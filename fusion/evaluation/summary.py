@@ -12,6 +12,7 @@ from stario.fusion.evaluation.compare import METRIC_WORDS, TRACKS, Comparison, M
 from stario.sequences.sequence import FloatArray
 
 _COLUMNS = (
+    ("pdr", "ate_m", "steps (PDR)"),
     ("network_true_attitude", "ate_m", "network, true attitude"),
     ("network", "ate_m", "network, own attitude"),
     ("ekf", "ate_m", "EKF"),

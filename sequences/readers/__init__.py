@@ -26,6 +26,7 @@ from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv, write_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
 from stario.sequences.readers.phone import is_phone, is_wide, read_phone, read_wide
+from stario.sequences.readers.phone_files import lone_sensors
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.ridi import is_ridi, read_ridi
 from stario.sequences.readers.rnin import is_rnin, read_rnin
@@ -159,8 +160,8 @@ def find_recordings(
         return _with_attributes([path], where)
     found = sorted(_below(path))
     if not found:
-        if poses := pose_files(path):
-            raise _poses_alone(path, poses[0])
+        if pose_files(path) or lone_sensors(path):
+            raise _unknown(path)
         raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
     return _with_attributes(found, where)
 
@@ -255,6 +256,9 @@ def _unknown(path: Path) -> ReadError:
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
+    elif lone := lone_sensors(path):
+        expected = "a gyroscope and an accelerometer"
+        return ReadError(path, "sensors", f"{' and '.join(lone)} alone", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
         return _poses_alone(path, poses[0])
     elif path.is_dir():

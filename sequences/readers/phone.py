@@ -124,7 +124,7 @@ def assembled(
     files: PhoneFiles,
     poses: list[Path],
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
-    g_unnamed: bool = False,
+    core_motion: bool = False,
 ) -> ImuSequence:
     """The recording of a set of files.
 
@@ -134,14 +134,14 @@ def assembled(
         files: by sensor.
         poses: files of poses beside them.
         orders: as for `with_pose`.
-        g_unnamed: whether numbers about one long are known to be g.
+        core_motion: whether an iPhone wrote them: numbers in g have Apple's sign.
 
     Raises:
         ReadError: a file is malformed or the sensors have no stretch in common.
     """
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
-    accel, converted = _force(files, gyro, attitude, g_unnamed)
+    accel, converted = _force(files, gyro, attitude, core_motion)
     stamps, rate, force = on_one_clock(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
@@ -203,7 +203,7 @@ def _force(
     files: PhoneFiles,
     gyro: Samples,
     attitude: tuple[IntArray, Rotation] | None,
-    g_unnamed: bool,
+    core_motion: bool,
 ) -> tuple[Samples, set[str]]:
     """Specific force, and whether its unit or sign were converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
@@ -221,9 +221,10 @@ def _force(
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: gravity added from its own file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
-    sign = accel_sign(files, accel, attitude, told=not g_unnamed)
-    in_g = not accel.unit and is_in_g(accel.values) and (sign < 0 or g_unnamed)
-    if sign < 0 or in_g:
+    in_g = not accel.unit and is_in_g(accel.values)
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude)
+    in_g &= sign < 0
+    if sign < 0:
         converted |= {"accel"}
     factor = sign * (STANDARD_GRAVITY if in_g else 1.0)
     return replace(accel, values=factor * accel.values), converted

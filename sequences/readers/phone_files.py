@@ -59,6 +59,18 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     return [lone] if _is_whole(lone) else []
 
 
+def lone_sensors(path: Path) -> list[Sensor]:
+    """The sensors of a folder or a wide file that lacks a gyroscope or an accelerometer."""
+    tables: list[tuple[Sensor | None, SensorTable | None]]
+    if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
+        tables = [(sensor_of(words_of(file.stem)), sensor_table(file)) for file in files]
+        return list(dict.fromkeys(s for s, table in tables if s is not None and table is not None))
+    table = sensor_table(path) if _may_hold(path) else None
+    sensors: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
+    return [sensor for sensor in sensors if table is not None and sensor in table.axes]
+
+
 def _may_hold(file: Path) -> bool:
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
 

@@ -39,7 +39,6 @@ def accel_sign(
     files: PhoneFiles,
     accel: Samples,
     attitude: tuple[IntArray, Rotation] | None,
-    told: bool = True,
 ) -> float:
     """1.0, or -1.0 where the accelerometer has Apple's sign.
 
@@ -47,7 +46,6 @@ def accel_sign(
         files: the recording's.
         accel: its accelerometer's samples.
         attitude: the phone's own, as `logged_attitude` returns it.
-        told: say what cannot be known.
     """
     folder = files.gyro.parent
     sign = _by_attitude(attitude, accel)
@@ -55,7 +53,7 @@ def accel_sign(
         sign = _by_system(folder)
     if sign is None and accel.unit == "g" and _has_core_motion(files):
         sign = -1.0
-    if told and sign is None and is_in_g(accel.values) and not accel.unit:
+    if sign is None and is_in_g(accel.values) and not accel.unit:
         _log.warning(
             "%s: an accelerometer in g: if an iPhone wrote it, pass "
             "`--accel-unit g --accel-sign apple`", folder,

@@ -84,8 +84,8 @@ def sensor_of(words: Iterable[str]) -> Sensor | None:
     told = {sensor for word in words if (sensor := _sensor(word)) is not None}
     if "linear" in told:  # linear acceleration, user acceleration
         return "linear" if told <= {"linear", "accel"} else None
-    if told == {"attitude"} and "rate" in words:  # rotation rate
-        return "gyro"
+    if told == {"gyro", "attitude"} or (told == {"attitude"} and "rate" in words):
+        return "gyro"  # gyro rotation, rotation rate
     return next(iter(told)) if len(told) == 1 else None
 
 

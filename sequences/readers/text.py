@@ -16,7 +16,7 @@ from stario.sequences.sequence import FloatArray
 
 IntArray = NDArray[np.int64]
 
-_HEAD_BYTES = 8192
+_HEAD_BYTES = 32768
 _LARGE_BYTES = 2_000_000
 
 

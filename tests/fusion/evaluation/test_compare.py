@@ -78,6 +78,7 @@ def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> 
         assert set(entry) == {"duration_s", "path_m", "tracks"}
         assert set(entry["tracks"]) == {
             "inertial",
+            "pdr",
             "network",
             "network_true_attitude",
             "ekf",
@@ -101,13 +102,13 @@ def test_figures_are_null_where_nobody_can_know_them(folder: Path, walk: ImuSequ
     assert blind["tracks"]["ekf"]["nis"] == content[walk.name]["tracks"]["ekf"]["nis"]
     seen = content[walk.name]["tracks"]
     assert all(v is not None for v in seen["ekf"].values())
-    for name in ("inertial", "network", "network_true_attitude"):
+    for name in ("inertial", "pdr", "network", "network_true_attitude"):
         unknown = {k for k, v in seen[name].items() if v is None}
         assert unknown == {"nees", "nis"}
 
 
 def test_truth_changes_no_track(compared: Comparison, blind: Comparison) -> None:
-    for name in ("inertial", "network", "ekf"):
+    for name in ("inertial", "pdr", "network", "ekf"):
         ours, theirs = compared.tracks[name].trajectory, blind.tracks[name].trajectory
         np.testing.assert_array_equal(ours.position_W, theirs.position_W)
 
@@ -186,7 +187,7 @@ def test_truth_too_scarce_for_a_window_costs_one_track_only(
 ) -> None:
     scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
     result = compare(model, scarce, CONFIG)
-    assert set(result.tracks) == {"inertial", "network", "ekf", "graph"}
+    assert set(result.tracks) == {"inertial", "pdr", "network", "ekf", "graph"}
     assert "no track with true attitude" in caplog.text
 
 

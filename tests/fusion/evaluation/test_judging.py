@@ -15,6 +15,7 @@ from stario.fusion.evaluation.displacement_error import RecordingErrors, recordi
 from stario.fusion.evaluation.judging import Judged, judge, rows_of
 from stario.fusion.evaluation.judging_table import Judgement, judgement_text, write_judgement
 from stario.fusion.evaluation.network_alone import answers
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.fusion.evaluation.prepared import Prepared, prepare, prepared_recordings
 from stario.sequences.batch import Skipped
 from stario.sequences.errors import InputError
@@ -62,7 +63,7 @@ class Stub:
         return self.displacement_N[first : self.given], covariance
 
 
-def errors_of(recording: ImuSequence, stub: Stub) -> RecordingErrors:
+def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
     prepared = prepare(recording, Path("walk"))
     return recording_errors(prepared, answers(stub, prepared))
 
@@ -170,6 +171,11 @@ def test_the_interval_of_a_ratio_grows_as_groups_differ() -> None:
     assert spread.ratio == pytest.approx(0.793, abs=0.01)
     assert spread.low < 0.72 < 0.9 < spread.high
     assert paired_ratio({"set": {"g": []}}) is None
+
+
+def test_steps_are_judged_like_a_network(walk: ImuSequence) -> None:
+    found = errors_of(walk, PedestrianDeadReckoning())
+    assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
 def judged_pair(walk: ImuSequence) -> list[Judged]:

@@ -199,6 +199,38 @@ def physics_toolbox(folder: Path, walk: ImuSequence) -> None:
     save(folder / "toolbox.csv", header, walk.time, *columns)
 
 
+def sensor_log(folder: Path, walk: ImuSequence) -> None:
+    """An iPhone app's wide file: g, Apple's sign, texts among the columns."""
+    header = (
+        "loggingTime(txt),loggingSample(N),identifierForVendor(txt),"
+        "accelerometerTimestamp_sinceReboot(s),accelerometerAccelerationX(G),"
+        "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),gyroTimestamp_sinceReboot(s),"
+        "gyroRotationX(rad/s),gyroRotationY(rad/s),gyroRotationZ(rad/s),magnetometerX(µT),"
+        "magnetometerY(µT),magnetometerZ(µT),motionYaw(rad),motionUserAccelerationX(G),"
+        "motionUserAccelerationY(G),motionUserAccelerationZ(G),motionRotationRateX(rad/s),"
+        "motionRotationRateY(rad/s),motionRotationRateZ(rad/s),motionQuaternionX(R),"
+        "motionQuaternionY(R),motionQuaternionZ(R),motionQuaternionW(R),label(N)"
+    )
+    n, t = len(walk), 55_687.0 + walk.time
+    linear = -(walk.accel - gravity(walk)) / STANDARD_GRAVITY
+    save(
+        folder / "my_iOS_device.csv", header, ["2020-01-01 10:00:00.123 +0100"] * n, np.arange(n),
+        ["A-B"] * n, t, -walk.accel / STANDARD_GRAVITY, t, walk.gyro, field(walk), np.zeros(n),
+        linear, walk.gyro + 0.001, pose(walk).quat_xyzw, np.zeros(n, dtype=int),
+    )  # fmt: skip
+
+
+def raw_g_iphone(folder: Path, walk: ImuSequence) -> None:
+    """ADVIO's layout, in g."""
+    for name, values in (("accelerometer", -walk.accel / STANDARD_GRAVITY), ("gyro", walk.gyro),
+                         ("magnetometer", field(walk))):  # fmt: skip
+        save(folder / f"advio-01/iphone/{name}.csv", "", walk.time, values)
+    poses = np.hstack(
+        [Y_UP.apply(pose(walk).position_W), (Y_UP * pose(walk).attitude_WB).as_quat()]
+    )
+    save(folder / "advio-01/ground-truth/pose.csv", "", walk.time, poses[:, [0, 1, 2, 6, 3, 4, 5]])
+
+
 def trace(folder: Path, walk: ImuSequence) -> None:
     """Lines by type, two of them without a break between, with taps."""
     lines = ["#\tstartTime:1560828400000"]
@@ -229,8 +261,8 @@ APPS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         sensor_logger, sensor_logger_ios, sensor_logger_attitude, phyphox, senslogs_ios,
-        senslogs_android, two_clocks, prefixed, androsensor, physics_toolbox, trace,
-        get_sensor_data,
+        senslogs_android, sensor_log, raw_g_iphone, two_clocks, prefixed, androsensor,
+        physics_toolbox, trace, get_sensor_data,
     )
 }  # fmt: skip
 
@@ -364,6 +396,20 @@ def test_poses_alone_are_told_as_such(walk: ImuSequence, tmp_path: Path) -> None
             ReadError, match=r"poses alone, ARCore_sensor_pose\.txt, expected a gyr"
         ):
             read(tmp_path / "s")
+
+
+def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
+    save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
+    save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
+    told = "accel and mag alone, expected a gyroscope and an accelerometer"
+    for read in (read_recording, find_recordings):
+        with pytest.raises(ReadError, match=told):
+            read(tmp_path / "s")
+    header = ";".join(f"ACCELEROMETER {axis} (m/s²)" for axis in "XYZ")
+    header += ";Time since start in ms "
+    save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), joint=";")
+    with pytest.raises(ReadError, match="accel alone"):
+        read_recording(tmp_path / "a.csv")
 
 
 def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_put_right(

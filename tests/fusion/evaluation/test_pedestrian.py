@@ -1,0 +1,97 @@
+"""Pedestrian dead reckoning: number, length and direction of known steps."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.fusion.evaluation.pedestrian import (
+    WEINBERG_CONSTANT,
+    pedestrian_path,
+    pedestrian_track,
+    steps_of,
+)
+from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream
+from stario.sequences.metrics import evaluate_track
+from stario.sequences.readers import read_recording
+from stario.sequences.rotations import about_z
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.windows import WINDOW_RATE
+
+RIDI = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives/ridi.h5"
+RATE, SIZE = 1.8, 2.0
+
+
+def walked(course: np.ndarray, mount: float = 0.0) -> LevelledStream:
+    """Steps at 1.8 Hz of 4 m/s^2 from crest to trough along a course (N,) [rad] at 200 Hz.
+
+    The acceleration along the course lags a quarter of a step, as a walker's does.
+
+    Args:
+        course: walked.
+        mount: of the device against it [rad].
+    """
+    time = np.arange(len(course)) / WINDOW_RATE
+    phase = 2.0 * np.pi * RATE * time
+    imu = np.zeros((len(course), 6), np.float32)
+    imu[:, 3] = -np.sin(phase) * np.cos(course)
+    imu[:, 4] = -np.sin(phase) * np.sin(course)
+    imu[:, 5] = STANDARD_GRAVITY + SIZE * np.cos(phase)
+    heading = course + mount
+    facing = np.stack([np.cos(heading), np.sin(heading)], axis=1).astype(np.float32)
+    return LevelledStream(0.0, imu, facing, about_z(heading[::TICK_SAMPLES]).as_matrix())
+
+
+@pytest.mark.parametrize("course", [0.0, 2.0, -2.5])
+@pytest.mark.parametrize("mount", [0.0, 1.3, 3.0])
+def test_straight_steps_add_up(course: float, mount: float) -> None:
+    stream = walked(np.full(6000, course), mount)
+    steps = steps_of(stream)
+    assert len(steps.end) == pytest.approx(30.0 * RATE, abs=2)
+    np.testing.assert_allclose(
+        steps.lengths()[3:-3], WEINBERG_CONSTANT * (2.0 * SIZE) ** 0.25, rtol=0.02
+    )
+    end = pedestrian_path(stream)[-1]
+    assert np.angle(end * np.exp(-1j * course)) == pytest.approx(0.0, abs=0.03)
+    assert abs(end) == pytest.approx(steps.lengths().sum(), rel=0.01)
+
+
+def test_a_turn_is_followed_by_the_device_s_heading() -> None:
+    course = np.where(np.arange(8000) < 4000, 0.0, np.pi / 2.0)
+    path = pedestrian_path(walked(course, mount=-0.7))
+    for part, direction in ((path[:3800], 1.0), (path[4200:], 1j)):
+        moved = (part[-1] - part[0]) / direction
+        assert np.angle(moved) == pytest.approx(0.0, abs=0.1)
+        assert moved.real > 15.0
+
+
+def test_who_stands_does_not_move() -> None:
+    stream = walked(np.zeros(4000))
+    rng = np.random.default_rng(0)
+    still = 0.05 * rng.standard_normal(stream.imu_N.shape).astype(np.float32)
+    still[:, 5] += STANDARD_GRAVITY
+    assert np.abs(pedestrian_path(replace(stream, imu_N=still))).max() == 0.0
+
+
+@pytest.mark.skipif(not RIDI.exists(), reason=f"no recordings at {RIDI}")
+def test_of_a_real_walk_the_shape_and_the_length_come_out() -> None:
+    sequence = read_recording(Path(f"{RIDI}:hang_body_normal1"))
+    assert sequence.truth is not None
+    found = evaluate_track(pedestrian_track(sequence).trajectory, sequence.truth, alignment="yaw")
+    assert found.ate_m < 0.04 * found.path_m
+
+
+def test_a_gap_leaves_the_track_where_it_was() -> None:
+    time = np.arange(0.0, 20.0, 0.01)
+    time = time[(time < 8.0) | (time > 12.0)]
+    imu = np.zeros((len(time), 3))
+    phase = 2.0 * np.pi * RATE * time
+    accel = np.stack([-np.sin(phase), 0.0 * phase, STANDARD_GRAVITY + SIZE * np.cos(phase)], axis=1)
+    track = pedestrian_track(ImuSequence("gap", time, imu, accel)).trajectory
+    before, after = track.position_W[track.time < 8.0][-1], track.position_W[track.time > 12.0][0]
+    assert np.linalg.norm(after - before) < 1.0
+    assert np.linalg.norm(track.position_W[-1]) > 12.0
