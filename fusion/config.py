@@ -52,6 +52,7 @@ class FilterConfig:
         gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
         stillness_noise: factor on the white noise of a phone's IMU within which a second of samples
             counts as rest (`rest`); 0 never does.
+        magnetometer: whether a recording's or stream's magnetic field is used.
     """
 
     update_rate: int = 2
@@ -65,6 +66,7 @@ class FilterConfig:
     gap_gyro_noise: float = 0.3
     gap_accel_noise: float = 1.0
     stillness_noise: float = 2.0
+    magnetometer: bool = True
 
     def __post_init__(self) -> None:
         if self.update_rate not in UPDATE_RATES:
@@ -202,7 +204,7 @@ def _built(group: type, values: dict[str, Any], name: str) -> Any:
 
 def _check_type(name: str, value: object, default: object) -> None:
     wanted = (int, float) if isinstance(default, float) else type(default)
-    if not isinstance(value, wanted) or isinstance(value, bool):
+    if not isinstance(value, wanted) or isinstance(value, bool) != isinstance(default, bool):
         raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
@@ -96,6 +97,22 @@ class Navigator:
             self._check_gyro(interval)
             state = self._advance(interval)
         return state
+
+    def push_magnetometer(self, time: float, field: Vector) -> None:
+        """Take in a magnetic field of the stream, before the IMU's samples that follow it.
+
+        Its bearing tells the gyroscope's bias about the vertical; steel and magnets are judged by
+        size, dip and consistency (`filter.magnetic`). Fields that are not finite, repeated or late
+        are dropped and counted. Without fields nothing changes.
+
+        Args:
+            time: [s], on the IMU's clock.
+            field: (3,) magnetic flux density in B [uT].
+
+        Raises:
+            InputError: time is no number, or field does not hold three.
+        """
+        self._front_end.push_field(_seconds(time), np.array(_three("field", field)))
 
     def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
         """A position fix for the stream.

@@ -34,7 +34,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 6
+FORMAT, VERSION = "stario snapshot", 7
 
 
 @cache
@@ -48,6 +48,7 @@ def _classes() -> dict[str, type]:
         frame_transform,
         initial,
         innovations,
+        magnetic,
         map_frame,
         zero_velocity,
     )
@@ -63,6 +64,8 @@ def _classes() -> dict[str, type]:
         *(fixes.Fix, fixes.Accepted, fixes.FixQueue, initial.PriorPose),
         *(
             ekf_state.EkfState,
+            ekf_state.FieldState,
+            magnetic.MagneticReference,
             estimate.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,

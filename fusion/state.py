@@ -134,6 +134,7 @@ class Health:
         nis_expected: degrees of freedom of a measurement.
         fixes: absolute fixes applied (of these gated), and left out by reason.
         zero_velocity: updates at rest (one per state there) applied, and left out by reason.
+        bearings: of the magnetic field applied (of these gated), and left out by reason.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.
@@ -151,6 +152,7 @@ class Health:
     nis_expected: int = 3
     fixes: dict[str, int] = field(default_factory=dict)
     zero_velocity: dict[str, int] = field(default_factory=dict)
+    bearings: dict[str, int] = field(default_factory=dict)
     final_sigma: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -170,6 +172,8 @@ class Health:
             text.append(f"fixes {_counted(self.fixes)}")
         if self.zero_velocity:
             text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
+        if self.bearings:
+            text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}", *self.notes]
 

@@ -19,9 +19,10 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.error_state import CLONE, CORE
-from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
+    bearing_jacobian,
     displacement_jacobian,
     mean_velocity_jacobian,
     position_jacobian,
@@ -116,7 +117,7 @@ class StateCloningEkf(ErrorStateEngine):
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
         P = self._propagated(s.P, end.transition, end.noise)
-        self.state = EkfState(segment.stop, X, s.origin_W, s.b_g, s.b_a, P, s.clone_times)
+        self.state = replace(s, time=segment.stop, X=X, P=P)
 
     def clone(self) -> int:
         """Copy the current pose into a free slot and return the slot's number.
@@ -254,19 +255,43 @@ class StateCloningEkf(ErrorStateEngine):
         covariance = np.array([[sigma * sigma]])
         return self.update_linear(residual, yaw_jacobian(R), covariance, gate)
 
+    def update_bearing(
+        self, m_B: FloatArray, variance: float, gate: float | None = None
+    ) -> UpdateResult:
+        """Bearing of a magnetic field (3,) [uT] in B against the state's azimuth.
+
+        Args:
+            m_B: as measured; the state has a field (`magnetic.first_field`).
+            variance: of its bearing [rad^2].
+            gate: as for the others; outliers are inflated.
+        """
+        s = self.state
+        assert s.field is not None
+        m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
+        bearing = math.atan2(m_W[1], m_W[0])
+        off = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
+        blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
+        return self.update_linear(np.array([off]), blocks, np.array([[variance]]), gate)
+
     def _inject(self) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
         s, dx = self.state, self.x[:, 0]
         xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = dx[:9].reshape(3, 3)
-        xi[1:, ::2] = dx[CORE:].reshape(self.slots, 2, 3)
+        xi[1:, ::2] = dx[CORE : s.first_field].reshape(self.slots, 2, 3)
         X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        self.state = EkfState(s.time, X, s.origin_W, b_g, b_a, s.P, s.clone_times)
-        self.x = np.zeros((self.dim_x, 1))
+        field = None if s.field is None else _moved(s.field, dx[s.first_field :])
+        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, field=field)
+        self.x = np.zeros((len(dx), 1))
 
 
 def _with(
     times: tuple[float | None, ...], slot: int, time: float | None
 ) -> tuple[float | None, ...]:
     return (*times[:slot], time, *times[slot + 1 :])
+
+
+def _moved(field: FieldState, dx: FloatArray) -> FieldState:
+    azimuth, wander = field.azimuth + float(dx[0]), field.wander + float(dx[1])
+    return FieldState(azimuth, wander, field.hard_iron_B + dx[2:])

@@ -6,6 +6,7 @@ SE(3)); the covariance is that of their right-invariant error.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,21 @@ digits for centimetres."""
 
 
 @dataclass(frozen=True, eq=False)
+class FieldState:
+    """What is known of the magnetic field; its errors are the last five of the error state.
+
+    Attributes:
+        azimuth: of the horizontal field in W, counter-clockwise from x, its constant part [rad].
+        wander: its part that changes from place to place [rad].
+        hard_iron_B: (3,) the device's own field [uT].
+    """
+
+    azimuth: float
+    wander: float
+    hard_iron_B: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class EkfState:
     """The current pose and biases, the cloned poses, and their covariance.
 
@@ -39,6 +55,7 @@ class EkfState:
         b_a: (3,) accelerometer bias [m/s^2].
         P: (n, n) covariance of the error state; zero for an empty slot.
         clone_times: [s], None for an empty slot.
+        field: the magnetic field, None before the first was measured.
     """
 
     time: float
@@ -48,6 +65,7 @@ class EkfState:
     b_a: FloatArray
     P: FloatArray
     clone_times: tuple[float | None, ...]
+    field: FieldState | None = None
 
     @classmethod
     def initial(
@@ -92,6 +110,11 @@ class EkfState:
         [m] in W, biases [rad/s], [m/s^2].
         """
         return plain_covariance(self.P[:CORE, :CORE], self.X[0, :, 3:].T)
+
+    @property
+    def first_field(self) -> int:
+        """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
+        return CORE + CLONE * len(self.clone_times)
 
     def time_of_clone(self, slot: int) -> float:
         """When a clone was taken [s].
@@ -153,20 +176,29 @@ class EkfState:
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
         A[3:6, 3:6] = R
         P = A @ self.P @ A.T
-        return replace(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T))
+        field = self.field
+        if field is not None:
+            field = replace(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
+        return replace(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T), field=field)
 
-    def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
+    def with_yaw_inflated(
+        self, about_W: FloatArray, sigma: float, field_too: bool = True
+    ) -> EkfState:
         """The covariance inflated by a turn of all poses about a vertical.
 
         Args:
             about_W: (3,) a point of the vertical [m].
             sigma: of the turn [rad].
+            field_too: whether the magnetic field turns with them, as where the frame does; where
+                the device turned unseen it does not.
         """
         x, y, _ = about_W - self.origin_W
         N = np.zeros((len(self.P), 1))
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
+        if self.field is not None and field_too:
+            N[self.first_field, 0] = 1.0
         return replace(self, P=self.P + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:

@@ -162,7 +162,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
         """(I - K H) P (I - K H)^T + K R K^T: slower, but without differences of large numbers."""
-        A = np.eye(self.dim_x)
+        A = np.eye(len(self.P))
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H
         P = A @ self.P @ A.T + self.K @ self.R @ self.K.T

@@ -28,6 +28,7 @@ from stario.fusion.filter.innovations import (
     innovation_row,
     stacked,
 )
+from stario.fusion.filter.magnetic import MagneticReference, update_bearing
 from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
@@ -80,6 +81,7 @@ class Estimator:
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
+        self._magnetic = MagneticReference()
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -107,6 +109,7 @@ class Estimator:
         # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
+        self._update_bearing(interval)
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(interval, offered, taken, at_rest, accepted, segment)
@@ -174,7 +177,7 @@ class Estimator:
         self.ekf.propagate(segment)
         if interval.gap:
             sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
-            self.ekf.state = self.ekf.state.with_yaw_inflated(s.p_W, sigma)
+            self.ekf.state = self.ekf.state.with_yaw_inflated(s.p_W, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
         return segment
 
@@ -215,6 +218,12 @@ class Estimator:
             self._innovations.append(row)
         return (d_N, result.scale * covariance_N) if result.accepted else None
 
+    def _update_bearing(self, interval: ImuInterval) -> None:
+        if interval.field_B is None or not self._magnetic.due(interval.stop):
+            return
+        result, self._magnetic = update_bearing(self.ekf, self._magnetic, interval.field_B)
+        self._counts = self._counts.add_bearing(result)
+
     def _clone(self) -> None:
         if len(self._clones) == self.ekf.slots:
             slot, *later = self._clones
@@ -239,6 +248,7 @@ class Estimator:
             self._clones,
             self._map_frame.state,
             self._stillness.window,
+            self._magnetic,
             self._counts,
             self.in_gap,
             self.oldest,
@@ -249,8 +259,8 @@ class Estimator:
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._counts, self.in_gap, self.oldest = s.counts, s.in_gap, s.oldest
-        self._history = s.history
+        self._magnetic, self._counts = s.magnetic, s.counts
+        self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
 
     @property
     def time(self) -> float:

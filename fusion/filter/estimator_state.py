@@ -9,6 +9,7 @@ from typing import NamedTuple
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimate import Estimate
 from stario.fusion.filter.innovations import UpdateCounts
+from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.map_frame import MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
@@ -55,6 +56,7 @@ class EstimatorState:
         clones: slots of the clones, oldest first.
         map_frame: where the fixes' frame lies.
         stillness: the last second's sums (`StillnessDetector`).
+        magnetic: what the magnetic field usually is.
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
@@ -65,6 +67,7 @@ class EstimatorState:
     clones: tuple[int, ...]
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
+    magnetic: MagneticReference
     counts: UpdateCounts
     in_gap: bool
     oldest: Estimate | None

@@ -23,6 +23,7 @@ class UpdateCounts:
         refused: network measurements left out, by reason.
         fixes: applied (of these gated), and left out by reason.
         zero_velocity: likewise, of measurements at rest.
+        bearings: likewise, of the magnetic field's.
         nis_sum: of the network measurements that could be judged.
         nis_count: how many these are.
     """
@@ -32,6 +33,7 @@ class UpdateCounts:
     refused: Mapping[str, int] = field(default_factory=dict)
     fixes: Mapping[str, int] = field(default_factory=dict)
     zero_velocity: Mapping[str, int] = field(default_factory=dict)
+    bearings: Mapping[str, int] = field(default_factory=dict)
     nis_sum: float = 0.0
     nis_count: int = 0
 
@@ -60,6 +62,13 @@ class UpdateCounts:
         what = "applied" if result.accepted else result.reason
         return replace(self, zero_velocity=counted(self.zero_velocity, what))
 
+    def add_bearing(self, result: UpdateResult) -> UpdateCounts:
+        """One more bearing of the magnetic field."""
+        bearings = counted(self.bearings, "applied" if result.accepted else result.reason)
+        if result.accepted and result.scale > 1.0:
+            bearings = counted(bearings, "gated")
+        return replace(self, bearings=bearings)
+
     def health(self, counts: SampleCounts, state: NavState) -> Health:
         """The report: what became of the samples, of the updates, and the state's sigmas."""
         sigma = np.sqrt(np.diag(state.covariance))
@@ -79,6 +88,7 @@ class UpdateCounts:
             mean_nis=self.nis_sum / self.nis_count if self.nis_count else math.nan,
             fixes=dict(self.fixes),
             zero_velocity=dict(self.zero_velocity),
+            bearings=dict(self.bearings),
             final_sigma={name: float(np.max(values)) for name, values in groups.items()},
         )
 

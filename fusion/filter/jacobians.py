@@ -84,3 +84,22 @@ def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
     r20, r21 = float(R_WB[2, 0]), float(R_WB[2, 1])
     n = s * s + c * c
     return [(0, np.array([[(s * r21 - c * r20) / n, -(c * r21 + s * r20) / n, 1.0]]))]
+
+
+def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> list[Block]:
+    """Jacobian of the bearing's residual, measured minus azimuth.
+
+    The true bearing is that of (I + [theta]x) (m - R d_h): it moves by theta_z
+    - m_z (m_x theta_x + m_y theta_y) / n - (m_x R1 - m_y R0) d_h / n with n = m_x^2 + m_y^2, and
+    equals the true azimuth; turned with the azimuth, yaw leaves the residual as it is.
+
+    Args:
+        R_WB: (3, 3) attitude.
+        m_W: (3,) field in the estimated world, hard iron taken off [uT].
+        first_field: row of the azimuth's error.
+    """
+    x, y, z = m_W
+    n = x * x + y * y
+    by_theta = np.array([[z * x / n, z * y / n, -1.0]])
+    by_hard_iron = (x * R_WB[1] - y * R_WB[0]) / n
+    return [(0, by_theta), (first_field, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]

@@ -45,6 +45,12 @@ _TAIL = 4
 _ALONE = 20
 """Samples in a row that stand alone: then their times are not in seconds."""
 
+_FIELDS = 64
+"""Magnetic fields that are kept: more than come between two intervals."""
+
+_FIELD_SECONDS = 0.11
+"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
+
 _ABSURD = 1e5
 """No sensor reads this much in any unit used here; also catches infinities."""
 
@@ -76,6 +82,7 @@ class FrontEnd:
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
         self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
         self.counts = SampleCounts()
@@ -99,6 +106,22 @@ class FrontEnd:
         else:
             return self._accept(sample)
         return []
+
+    def push_field(self, time: float, field_B: FloatArray) -> None:
+        """Take in a magnetic field (3,) [uT] in B, before the samples that follow it."""
+        newest = self._fields[-1][0] if self._fields else -math.inf
+        if not self._config.filter.magnetometer:
+            return
+        if math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < _ABSURD:
+            self._fields.append((time, field_B))
+        else:
+            self.counts.field_dropped += 1
+
+    def _field_at(self, time: float) -> FloatArray | None:
+        """The newest one at a time; fields from ahead of it wait."""
+        return next(
+            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
+        )
 
     def finish(self) -> None:
         """Nothing follows: what still waits for others to confirm its time is dropped."""
@@ -234,7 +257,8 @@ class FrontEnd:
         self._flagged.append(flags.gyro or flags.accel)
         # _cut() has counted this interval already.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
-        interval = replace(_interval(table, attitude), update=update, flags=flags)
+        field_B = self._field_at(table[-1, 0])
+        interval = replace(_interval(table, attitude), update=update, flags=flags, field_B=field_B)
         self._window.append(self._block(interval))
         if not update or len(self._window) < self._blocks:
             return interval
@@ -266,7 +290,16 @@ def cut_recording(
     """Every interval of a recording, and the front end with its counts and start."""
     front_end = FrontEnd(config)
     intervals: list[ImuInterval] = []
+    fields = (
+        deque()
+        if sequence.magnetometer is None
+        else deque(
+            zip(sequence.magnetometer.time.tolist(), sequence.magnetometer.field, strict=True)
+        )
+    )
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
+        while fields and fields[0][0] <= sample[0]:
+            front_end.push_field(*fields.popleft())
         intervals += front_end.push(tuple(sample))
     front_end.finish()
     return intervals, front_end

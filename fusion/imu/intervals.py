@@ -40,6 +40,7 @@ class ImuInterval:
         window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
         heading: of the device in N, averaged over the window [rad].
+        field_B: (3,) magnetic field at its end [uT], None where none was measured.
     """
 
     time: FloatArray
@@ -52,6 +53,7 @@ class ImuInterval:
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
     heading: float = 0.0
+    field_B: FloatArray | None = None
     anew: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False
@@ -93,6 +95,7 @@ class SampleCounts:
         future: dropped for a time ahead of those that followed.
         spike: used, but replaced for standing off its neighbours.
         saturated: used, but at the sensor's limit.
+        field_dropped: magnetic fields dropped for a value or a time that is out of order.
         gap_count: stretches without samples that were not bridged.
         longest_gap: of them [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
@@ -107,6 +110,7 @@ class SampleCounts:
     future: int = 0
     spike: int = 0
     saturated: int = 0
+    field_dropped: int = 0
     gap_count: int = 0
     longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)

@@ -1,0 +1,140 @@
+"""The magnetic field's bearing as a measurement of what yaw does, never of what it is.
+
+README.md, "Magnetometer". Where the field points in the world is unknown, and indoors it wanders:
+
+    azimuth = c + g,   c constant and unknown at first, g Gauss-Markov over metres and seconds
+
+The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. Yaw and azimuth turn
+together unseen, so that yaw stays as unobservable as it was; its rate, the gyroscope's vertical
+bias, does not. A field whose size or dip is not the place's usual counts for less, and one that
+contradicts the rest is an outlier as any other.
+
+The field is slow and its errors alike for metres: two bearings a second are all there is to learn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stario.fusion.chi_square import chi2_quantile
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import EkfState, FieldState
+from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.lie import FloatArray
+
+PERIOD = 0.5
+"""Between two bearings [s]."""
+
+WANDER_SIGMA = 0.4
+"""Of g, the field's azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees."""
+
+WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
+"""Over which g is forgotten: the reach of a beam or a radiator, and of what else changes."""
+
+HARD_IRON_SIGMA = 10.0
+"""Of a phone's own field as its calibration leaves it, per axis [uT]."""
+
+BEARING_SIGMA = 0.3
+"""White noise of one bearing [rad]: steel within a step, late samples while the device turns."""
+
+_UNKNOWN = math.pi
+"""Standard deviation of c at first [rad]."""
+
+_GATE = 0.95
+"""Probability of the bearing's chi-square test: outliers are common, so they weigh down early."""
+
+_LEAST_HORIZONTAL = 4.0
+"""Horizontal field [uT] below which its bearing means nothing."""
+
+_USUAL_SIZE, _USUAL_DIP = 0.05, 0.05
+"""Deviations from the place's usual size (share) and dip [rad] that double the variance."""
+
+_MEMORY = 120
+"""Bearings that make the place's usual size and dip: a minute of them."""
+
+
+@dataclass(frozen=True)
+class MagneticReference:
+    """What the field usually is, and when it was last looked at.
+
+    Attributes:
+        time: of the last bearing [s].
+        count: of bearings so far.
+        size: usual size of the field [uT].
+        dip: usual angle below the horizontal [rad].
+    """
+
+    time: float = -math.inf
+    count: int = 0
+    size: float = 0.0
+    dip: float = 0.0
+
+    def due(self, time: float) -> bool:
+        """Whether a bearing may be taken in."""
+        return time - self.time > PERIOD - 1e-6
+
+    def seen(self, time: float, size: float, dip: float) -> MagneticReference:
+        """With one more bearing: means of what is clipped to near them, as robust as medians."""
+        count = self.count + 1
+        if count == 1:
+            return MagneticReference(time, 1, size, dip)
+        share = 1.0 / min(count, _MEMORY)
+        near = 2.0 * _USUAL_SIZE * self.size
+        size = self.size + share * min(max(size - self.size, -near), near)
+        dip = self.dip + share * min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
+        return MagneticReference(time, count, size, dip)
+
+
+def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
+    """The state with an azimuth that is as the first field (3,) [uT] points, and unknown."""
+    x, y, _ = s.R_WB @ m_B
+    variances = [_UNKNOWN**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
+    n = len(s.P)
+    P = np.zeros((n + len(variances),) * 2)
+    P[:n, :n], P[n:, n:] = s.P, np.diag(variances)
+    return replace(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
+
+
+def wandered(s: EkfState, seconds: float) -> EkfState:
+    """The state after the azimuth has wandered for a time [s] at the speed of now."""
+    assert s.field is not None  # there is one since `first_field`
+    metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
+    kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
+    P, g = s.P.copy(), s.first_field + 1
+    P[g] *= kept
+    P[:, g] *= kept
+    P[g, g] += (1.0 - kept**2) * WANDER_SIGMA**2
+    return replace(s, P=P, field=replace(s.field, wander=kept * s.field.wander))
+
+
+def update_bearing(
+    ekf: StateCloningEkf, reference: MagneticReference, m_B: FloatArray
+) -> tuple[UpdateResult, MagneticReference]:
+    """Take in the field (3,) [uT] in B at the filter's time.
+
+    Returns:
+        what became of it, and what the field usually is with it.
+    """
+    now = ekf.state.time
+    if ekf.state.field is None:
+        ekf.state = first_field(ekf.state, m_B)
+    elif math.isfinite(reference.time):
+        ekf.state = wandered(ekf.state, now - reference.time)
+    s = ekf.state
+    assert s.field is not None
+    m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
+    horizontal = math.hypot(m_W[0], m_W[1])
+    size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
+    if horizontal < _LEAST_HORIZONTAL:
+        return UpdateResult(math.nan, 1, False, reason="no horizontal field"), replace(
+            reference, time=now
+        )
+    reference = reference.seen(now, size, dip)
+    unusual = math.hypot(
+        (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
+    )
+    variance = BEARING_SIGMA**2 * (1.0 + unusual**2)
+    return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference
