@@ -224,6 +224,7 @@ def _streams_of(
 ) -> tuple[list[Recorded], list[Skipped]]:
     from stario.network.training.data import Recorded
     from stario.sequences.batch import Skipped
+    from stario.sequences.readers.archive import archive_attributes
     from stario.sequences.stream_cache import recorded
 
     recordings: list[Recorded] = []
@@ -234,7 +235,8 @@ def _streams_of(
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
             else:
-                recordings.append(Recorded(path, outcome))
+                licence = str(archive_attributes(path).get("licence", ""))
+                recordings.append(Recorded(path, outcome, licence))
             progress(done / len(files))
     return recordings, skipped
 

@@ -57,6 +57,7 @@ class LiveServer:
         config = uvicorn.Config(
             live_app(self.hub, self.token),
             log_level="warning",
+            lifespan="off",
             timeout_graceful_shutdown=1,
             limit_concurrency=200,
         )
@@ -96,10 +97,11 @@ class LiveServer:
 
     async def _run(self, started: Callable[[], None]) -> None:
         lines = asyncio.create_task(self._lines.serve(self._host, self._lines_port))
-        others = [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
-        web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
+        tasks = [lines]
         try:
             await self._lines.listening(lines)
+            tasks += [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
+            web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
             while not self._server.started and not web.done():
                 await asyncio.sleep(0.01)
             started()
@@ -108,10 +110,10 @@ class LiveServer:
             found = f"{self._lines_port}: {error.strerror or error}"
             raise InputError("lines-port", found, "a free port", "--lines-port N") from error
         finally:
-            self._server.should_exit = True
-            for task in (lines, *others, web):
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(lines, *others, web, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._socket.close()
             self.hub.close()
 
 

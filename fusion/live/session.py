@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.filter.map_frame import KNOWN_YAW
 from stario.fusion.fixes import position_fix
 from stario.fusion.live.merging import Merger
 from stario.fusion.live.payload import Batch
@@ -34,6 +35,9 @@ BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
 
 _HEALTH_SECONDS = 1.0
 
+_GAP_SECONDS = 0.5
+"""States come ten times a second; further apart, samples were missing."""
+
 
 @dataclass
 class Drawn:
@@ -43,19 +47,25 @@ class Drawn:
         points: thinned where there are many.
         revision: goes up whenever earlier points changed.
         origin: (3,) what is drawn as zero [m].
-        map_frame: of the states in `points`.
+        map_frame: of the newest states.
+        since: index of the first point that fixes still move: behind a gap in which the direction
+            was lost, what was before stays where it is.
     """
 
     points: list[Point] = field(default_factory=list)
     revision: int = 0
     origin: FloatArray = field(default_factory=lambda: np.zeros(3))
     map_frame: int = 0
+    since: int = 0
 
     def add(self, state: NavState) -> None:
-        """The newest state; one in a new map frame takes the earlier points along."""
+        """The newest state."""
+        behind_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
+        if behind_gap and state.covariance[2, 2] > KNOWN_YAW**2:
+            self.since = len(self.points)
         self.points.append(point_of(state))
         if len(self.points) > MOST_POINTS:
-            self.points = self.points[::2]
+            self.points, self.since = self.points[::2], self.since // 2
             self.revision += 1
 
     def move(self, before: NavState, after: NavState) -> None:
@@ -64,13 +74,13 @@ class Drawn:
         R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
         shift = after.p_W[:2] - R @ before.p_W[:2]
         rise = after.p_W[2] - before.p_W[2]
-        table = np.array(self.points).reshape(-1, 10)
+        table = np.array(self.points[self.since :]).reshape(-1, 10)
         table[:, 1:3] = table[:, 1:3] @ R.T + shift
         table[:, 3] += rise
         table[:, 5] = (table[:, 5] + math.degrees(turn) + 180.0) % 360.0 - 180.0
         P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
         table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
-        self.points = table.tolist()
+        self.points = self.points[: self.since] + table.tolist()
         self.revision += 1
         self.map_frame = after.map_frame
 

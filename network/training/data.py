@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from stario.sequences.errors import ConfigError
 from stario.sequences.legs import LegStream
+from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -32,10 +33,11 @@ _SMOOTH = 0.3
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording's streams."""
+    """A recording's streams, and the licence that its file names."""
 
     path: Path
     streams: Sequence[Stream]
+    licence: str = ""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,21 @@ def gather(
     legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
-    return Material(streams, weights, legs, words)
+    return Material(streams, weights, legs, words + _licences(recorded))
+
+
+def _licences(recorded: Sequence[Recorded]) -> list[str]:
+    """What each archive's licences are, and how much of it was learned from under them."""
+    known: dict[str, list[Recorded]] = {}
+    for one in recorded:
+        if one.licence:
+            file = split_name(one.path)[0].name
+            known.setdefault(f"{file}, licence {one.licence}", []).append(one)
+    return [
+        f"{words}: {len(members)} recordings, "
+        f"{sum(_minutes(one.streams) for one in members):.0f} min"
+        for words, members in known.items()
+    ]
 
 
 def _sources(
@@ -130,8 +146,8 @@ def split_off(recordings: Sequence[Recorded]) -> tuple[list[Recorded], list[Reco
             before.append(stream.part(0, left))
             after.append(stream.part(max(left, 0), len(stream)))
             left -= len(stream)
-        first.append(Recorded(one.path, [s for s in before if _is_long(s)]))
-        last.append(Recorded(one.path, [s for s in after if _is_long(s)]))
+        first.append(replace(one, streams=[s for s in before if _is_long(s)]))
+        last.append(replace(one, streams=[s for s in after if _is_long(s)]))
     return first, last
 
 

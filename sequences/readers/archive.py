@@ -99,6 +99,16 @@ def archive_members(path: Path, where: Where | None = None) -> list[Path]:
     return [Path(f"{path}:{name}") for name in chosen]
 
 
+def archive_attributes(path: Path) -> dict[str, str | float]:
+    """Attributes of the recording `file.h5:name`, its numbers unread; of other files none."""
+    file_path, name = split_name(path)
+    if name is None:
+        return {}
+    h5py = optional_package("h5py", "readers")
+    with _opened(h5py, file_path) as file:
+        return {key: _plain(value) for key, value in file[name].attrs.items()}
+
+
 def matches(name: str, attributes: Mapping[str, str | float], where: Where) -> bool:
     """Whether a recording's attributes (its name is one) are as asked for."""
     told = {"name": name, **attributes}

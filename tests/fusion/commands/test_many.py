@@ -174,7 +174,8 @@ def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_
     done = stario("train", recording, "--recorded-only", "--config", "tiny.json", "--out", "alone")
     assert done.code == 0, done.err
     trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
-    assert [words.split(":")[0] for words in trained_on] == ["recorded"]
+    assert len(trained_on) == 1
+    assert trained_on[0].startswith("recorded")
 
 
 def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:

@@ -379,8 +379,9 @@ def test_a_broken_file_is_named_in_one_line(
     assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
 
 
-def test_a_recording_cut_within_a_line_is_named(stario, recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "cut.csv").write_bytes(recording.read_bytes()[:50_020])
+def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: Path) -> None:
+    content = recording.read_bytes()
+    (tmp_path / "cut.csv").write_bytes(content[:50_020] + content[content.index(b"\n", 60_000) :])
     stario("run", "cut.csv").assert_one_line_error("cut.csv", "line ")
 
 

@@ -1,5 +1,6 @@
 """The server takes pushes, refuses what is malformed, and draws what `stario run` would find."""
 
+import errno
 import json
 
 import numpy as np
@@ -191,6 +192,38 @@ def test_a_thousand_malformed_pushes_leave_a_replay_as_it_is(client, hub, pushes
         undisturbed.push(*row)
     end = hub.sessions["phone"].drawn.points[-1][1:4]
     np.testing.assert_allclose(end, undisturbed.state.p_W, atol=1e-5)
+
+
+def test_a_full_disk_is_told_to_the_phone_and_harms_no_other(client, hub, pushes, monkeypatch):
+    for device in ("full", "phone"):
+        for body in pushes(device=device, seconds=2.0):
+            client.post("/data", content=body)
+
+    def no_room(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(hub.sessions["full"]._file, "append", no_room)
+    bodies = [pushes(device=device, seconds=4.0)[10] for device in ("full", "phone")]
+    full, phone = (client.post("/data", content=body) for body in bodies)
+    assert (full.status_code, "No space" in full.json()["error"]) == (507, True)
+    assert phone.json() == {"samples": 20}
+
+
+def test_behind_a_gap_fixes_leave_what_was_drawn_before(client, hub, pushes):
+    bodies = pushes()
+    for part in (bodies[:20], bodies[20:60]):
+        for body in part:
+            client.post("/data", content=body)
+        session = hub.sessions["phone"]
+        x, y = session.drawn.points[-1][1:3]
+        command(client, "phone", "fix", x=x, y=y, sigma=0.1)
+    before = list(session.drawn.points)
+    for body in pushes(offset_ns=10**18 + 30 * 10**9)[60:90]:  # half a minute is missing
+        client.post("/data", content=body)
+    assert session.drawn.points[-1][9] > 30.0  # degrees: the direction is lost
+    command(client, "phone", "fix", x=30.0, y=30.0, sigma=0.1)
+    assert session.drawn.points[: len(before)] == before
+    np.testing.assert_allclose(session.drawn.points[-1][1:3], [30.0, 30.0], atol=0.5)
 
 
 def test_too_large_too_many_and_elsewhere_are_refused(client, hub, pushes):

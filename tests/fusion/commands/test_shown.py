@@ -1,0 +1,76 @@
+"""`run --report`, `run --view`, `compare --report` and `live` as a user meets them."""
+
+from __future__ import annotations
+
+import builtins
+import socket
+
+import pytest
+
+
+def without(monkeypatch, *packages):
+    """Importing these fails, as where their extra is not installed."""
+    real = builtins.__import__
+
+    def missing(name, *arguments, **named):
+        if name.split(".")[0] in packages:
+            raise ImportError(name)
+        return real(name, *arguments, **named)
+
+    monkeypatch.setattr("importlib.import_module", lambda name: missing(name))
+    monkeypatch.setattr(builtins, "__import__", missing)
+
+
+def test_run_leaves_a_report_where_it_is_asked_for(stario, recording, tmp_path, undrawn):
+    assert stario("run", recording, "--out", "plain").code == 0
+    assert not (tmp_path / "plain/report.html").exists()
+    done = stario("run", recording, "--out", "told", "--report", "--backend", "graph")
+    assert done.code == 0
+    text = (tmp_path / "told/report.html").read_text()
+    assert "<h1>walk</h1>" in text
+    assert "factor graph" in text
+    assert "Against the truth" in text
+
+
+def test_compare_leaves_a_report_beside_the_tracks(stario, recording, tmp_path, undrawn):
+    assert stario("compare", recording, "--out", "told", "--report").code == 0
+    text = (tmp_path / "told/walk/report.html").read_text()
+    for label in ("inertial", "network", "EKF", "factor graph", "truth"):
+        assert f"</svg>{label}</button>" in text
+
+
+def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, undrawn, monkeypatch):
+    pytest.importorskip("rerun", reason="pip install 'stario[view]'")
+    opened = []
+    monkeypatch.setattr("stario.fusion.report.view.open_view", opened.append)
+    assert stario("run", recording, "--out", "seen", "--view").code == 0
+    assert [path.resolve() for path in opened] == [tmp_path / "seen/track.rrd"]
+    assert (tmp_path / "seen/track.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [
+        ("plotly", ("run", "walk.csv", "--report")),
+        ("plotly", ("compare", "--report")),
+        ("rerun", ("run", "walk.csv", "--view")),
+        ("uvicorn", ("live",)),
+    ],
+)
+def test_a_missing_extra_is_told_before_anything_is_computed(
+    stario, monkeypatch, package, arguments
+):
+    without(monkeypatch, package)
+    stario(*arguments).assert_one_line_error(package, "not installed", "pip install")
+
+
+def test_live_tells_a_port_that_is_taken(stario):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        stario("live", "--port", port).assert_one_line_error("port", "--port")
+        done = stario("live", "--port", 0, "--lines-port", port)
+        done.assert_one_line_error("lines-port", "--lines-port")
+
+
+def test_live_tells_what_is_no_address_of_a_phone(stario):
+    stario("live", "--port", 0, "--phyphox", "ftp://x").assert_one_line_error("phyphox")
