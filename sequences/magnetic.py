@@ -35,12 +35,17 @@ _TURNING_RAD_S = 0.1
 
 _SIZES_UT = (15.0, 90.0)
 _LEVEL_UT = 6.0
-_STEADY_RAD = math.radians(25.0)
-_FOLLOWS = 0.5
+_VERDICTS = (
+    ("good", math.radians(12.0), 0.75),
+    ("coarse", math.radians(25.0), 0.5),
+)
+"""Largest unsteadiness [rad] and least correlation of each."""
+
+_UP_RAD = math.radians(20.0)
 _IRON_UT = 10.0
 _SURE = 5.0
-"""Size, horizontal size, unsteadiness, correlation and hard iron that part good from bad; the last
-counts from so many of its deviations."""
+"""Size, horizontal size, dip and hard iron that deserve a word; the last counts from so many of its
+deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +63,7 @@ class MagneticFindings:
         hard_iron_uT: b (3,) [uT], None likewise.
         hard_iron_sigma_uT: its deviation (3,) [uT].
         bearing_rms_rad: of the levelled bearing about its line within a minute, median [rad].
-        drift_rad_s: its slope over the whole recording: the gyroscope's drift in yaw [rad/s].
+        drift_rad_s: that line's slope, median: the gyroscope's drift in yaw [rad/s].
         problems: what is wrong, one line each.
     """
 
@@ -76,11 +81,14 @@ class MagneticFindings:
     problems: tuple[str, ...] = ()
 
     @property
-    def usable(self) -> bool:
-        """Whether the levelled bearing is steady enough to hold a yaw."""
+    def verdict(self) -> str:
+        """Whether the levelled bearing can hold a yaw: "good", "coarse" or "not usable"."""
         level = self.size_uT * math.cos(self.dip_rad)
-        follows = self.correlation is None or self.correlation > _FOLLOWS
-        return self.bearing_rms_rad < _STEADY_RAD and level > _LEVEL_UT and follows
+        for word, steady, follows in _VERDICTS:
+            agrees = self.correlation is None or self.correlation > follows
+            if self.bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
+                return word
+        return "not usable"
 
     def as_dict(self) -> dict[str, object]:
         """The findings as plain values, units in the names."""
@@ -96,7 +104,7 @@ class MagneticFindings:
             "hard_iron_sigma_uT": self.hard_iron_sigma_uT,
             "levelled_bearing_rms_rad": self.bearing_rms_rad,
             "gyroscope_drift_rad_s": self.drift_rad_s,
-            "usable": self.usable,
+            "verdict": self.verdict,
         }
 
     def lines(self) -> list[str]:
@@ -114,7 +122,7 @@ class MagneticFindings:
         lines.append(
             f"  levelled bearing: steady to {math.degrees(self.bearing_rms_rad):.1f} deg within a "
             f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
-            f"gyroscope: {'usable' if self.usable else 'not usable'}"
+            f"gyroscope: {self.verdict}"
         )
         return lines
 
@@ -150,7 +158,7 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     R_NB = levelled_attitudes(time, gyro, accel)[nearest]
     field_N = np.einsum("nij,nj->ni", R_NB, values - taken)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
-    bearing = np.unwrap(np.arctan2(field_N[:, 1], field_N[:, 0]))
+    spread, drift = _steadiness(stamps, field_N[:, :2])
     sizes = np.linalg.norm(values, axis=1)
     low, median, high = np.percentile(sizes, [10.0, 50.0, 90.0]).tolist()
     findings = MagneticFindings(
@@ -163,8 +171,8 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         lag_s=lag,
         hard_iron_uT=iron,
         hard_iron_sigma_uT=sigma,
-        bearing_rms_rad=_unsteadiness(stamps, bearing),
-        drift_rad_s=float(np.polyfit(stamps - stamps[0], bearing, 1)[0]),
+        bearing_rms_rad=spread,
+        drift_rad_s=drift,
     )
     return _with_problems(sequence.name, findings)
 
@@ -216,17 +224,32 @@ def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
     return bool(np.linalg.norm(iron[sure]) > _IRON_UT)
 
 
-def _unsteadiness(time: FloatArray, bearing: FloatArray) -> float:
-    """Root mean square about a line [rad], median over windows of a minute."""
-    parts = []
-    edges = np.arange(time[0], max(time[-1] - 0.5 * _WINDOW_S, time[0] + 1e-9), _WINDOW_S)
-    for edge in edges:
+def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
+    """Root mean square [rad] of the bearing about a line and the line's slope [rad/s].
+
+    Medians over windows of a minute. Turns are counted on means over a second, so that a sample
+    beside a magnet does not add one.
+
+    Args:
+        time: (N,) [s].
+        level: (N, 2) horizontal field.
+    """
+    count = max(1, round(1.0 / float(np.median(np.diff(time)))))
+    field = level[:, 0] + 1j * level[:, 1]
+    smooth = np.convolve(field, np.ones(count) / count, mode="same")
+    spreads, slopes = [], []
+    last = max(float(time[-1]) - 0.5 * _WINDOW_S, float(time[0]) + 1e-9)
+    for edge in np.arange(time[0], last, _WINDOW_S):
         part = (time >= edge) & (time < edge + _WINDOW_S)
-        if part.sum() > 2:
-            line = np.polyfit(time[part] - edge, bearing[part], 1)
-            left = bearing[part] - np.polyval(line, time[part] - edge)
-            parts.append(float(np.sqrt(np.square(left).mean())))
-    return float(np.median(parts)) if parts else math.inf
+        if part.sum() > count:
+            clock = time[part] - edge
+            line = np.polyfit(clock, np.unwrap(np.angle(smooth[part])), 1)
+            left = np.angle(field[part] * np.exp(-1j * np.polyval(line, clock)))
+            spreads.append(float(np.sqrt(np.square(left).mean())))
+            slopes.append(float(line[0]))
+    if not slopes:
+        return math.inf, 0.0
+    return float(np.median(spreads)), float(np.median(slopes))
 
 
 def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
@@ -237,7 +260,7 @@ def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
             f"{field}: found {findings.size_uT:.3g} uT, expected the earth's 25 to 65; "
             "is it uncalibrated, in another unit or beside a magnet?"
         )
-    if findings.correlation is not None and findings.correlation < _FOLLOWS:
+    if findings.correlation is not None and findings.correlation < _VERDICTS[-1][2]:
         problems.append(
             f"{field}: does not follow the gyroscope (correlation {findings.correlation:.2f}): "
             "a disturbed place, a held reading or other axes"
@@ -245,7 +268,7 @@ def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
     if iron is not None and sigma is not None and _is_iron(iron, sigma):
         offset = ", ".join(f"{b:+.0f}" for b in iron)
         problems.append(f"{field}: the device adds a constant field of {offset} uT (hard iron)")
-    if findings.dip_rad < -_STEADY_RAD:
+    if findings.dip_rad < -_UP_RAD:
         problems.append(
             f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
             "magnetic equator; elsewhere the accelerometer has Apple's sign: --accel-sign apple"

@@ -40,7 +40,7 @@ def test_size_dip_lag_iron_and_drift_come_back() -> None:
     up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     found = judge_magnetometer(replace(sequence, gyro=sequence.gyro + drift * up_B))
     assert found is not None
-    assert found.usable
+    assert found.verdict == "good"
     assert found.correlation is not None
     assert found.correlation > 0.85
     assert found.lag_s == pytest.approx(0.04, abs=0.01)
@@ -56,11 +56,11 @@ def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
     magnets = tuple((t, t + 4.0, 150.0) for t in np.arange(2.0, 56.0, 8.0).tolist())
     disturbed = judge_magnetometer(walk(MagneticField(magnets=magnets)))
     assert disturbed is not None
-    assert not disturbed.usable
+    assert disturbed.verdict == "not usable"
     turned = Magnetometer(good.magnetometer.time, good.magnetometer.field[:, [1, 2, 0]])
     wrong = judge_magnetometer(replace(good, magnetometer=turned))
     assert wrong is not None
-    assert not wrong.usable
+    assert wrong.verdict == "not usable"
     assert "does not follow the gyroscope" in " ".join(wrong.problems)
     lines = inspect_recording(replace(good, truth=None, accel=-good.accel)).lines()
     assert any("points up by" in line and "--accel-sign apple" in line for line in lines)
@@ -76,7 +76,7 @@ def test_inspection_tells_of_a_good_magnetometer_and_of_none() -> None:
     )
     told = good.as_dict()["magnetometer"]
     assert isinstance(told, dict)
-    assert told["usable"] is True
+    assert told["verdict"] == "good"
     bare = inspect_recording(replace(walk(MagneticField()), magnetometer=None))
     assert bare.as_dict()["magnetometer"] is None
 
@@ -86,9 +86,9 @@ def test_recorded_magnetometers_know_the_gyroscopes_drift() -> None:
     """0.64 deg/s, by the true attitude; and magnets beside a phone are not trusted."""
     found = judge_magnetometer(read_recording(DATA / "oxiod/handheld/data1/syn/imu2.csv"))
     assert found is not None
-    assert found.usable
-    assert abs(math.degrees(found.drift_rad_s)) == pytest.approx(0.66, abs=0.1)
+    assert found.verdict == "coarse"
+    assert abs(math.degrees(found.drift_rad_s)) == pytest.approx(0.64, abs=0.2)
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = judge_magnetometer(read_recording(DATA / name))
     assert magnets is not None
-    assert not magnets.usable
+    assert magnets.verdict == "not usable"
