@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.levelling import LEVELLING_RATE
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SECONDS
@@ -127,7 +126,6 @@ class NavigatorConfig:
         filter: the EKF.
         graph: the factor graph.
         gravity: magnitude [m/s^2].
-        levelling_rate: natural frequency of the loop that levels the attitude [rad/s].
     """
 
     noise: ImuNoise = field(
@@ -138,13 +136,10 @@ class NavigatorConfig:
     filter: FilterConfig = field(default_factory=FilterConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     gravity: float = STANDARD_GRAVITY
-    levelling_rate: float = LEVELLING_RATE
 
     def __post_init__(self) -> None:
         if not 9.5 < self.gravity < 10.1:
             raise ConfigError("gravity", repr(self.gravity), "9.5 to 10.1 m/s^2")
-        if not 0.0 < self.levelling_rate < 10.0:
-            raise ConfigError("levelling_rate", repr(self.levelling_rate), "0 to 10 rad/s")
 
 
 _GROUPS: dict[str, type] = {"noise": ImuNoise, "filter": FilterConfig, "graph": GraphConfig}

@@ -170,7 +170,7 @@ class FrontEnd:
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
         start = Start(first, gravity.R_WB, gravity.still, gravity.force)
-        self._attitude = LevelledAttitude(gravity.R_WB, self._config.levelling_rate)
+        self._attitude = LevelledAttitude(gravity.R_WB)
         self._restart_grid(first)
         intervals = []
         if self.start is None:

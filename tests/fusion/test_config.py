@@ -55,7 +55,6 @@ def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
     config = NavigatorConfig(
         noise=ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3),
         filter=FilterConfig(update_rate=20, gate=0.99),
-        levelling_rate=0.1,
     )
     write_json(tmp_path / "config.json", asdict(config))
     assert read_config(tmp_path / "config.json") == config
@@ -82,7 +81,6 @@ def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
         ({"noise": {"accel_noise": float("inf")}}, "noise.accel_noise"),
         ({"gravity": 0.98}, "gravity"),
         ({"gravity": float("nan")}, "gravity"),
-        ({"levelling_rate": 0.0}, "levelling_rate"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
