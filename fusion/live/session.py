@@ -35,6 +35,9 @@ BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
 
 _HEALTH_SECONDS = 1.0
 
+_SURE = 0.7
+"""Cosine between up and the force from which its sign is known."""
+
 _GAP_SECONDS = 0.5
 """States come ten times a second; further apart, samples were missing."""
 
@@ -103,7 +106,7 @@ class Session:
         self.words: list[dict[str, str]] = []
         self.samples = self.ignored = self.fixes = 0
         self.received = 0.0
-        self.rate = 0.0
+        self.rate, self._factor = 0.0, 1.0
         self._revisions = 0
         self._begin("")
 
@@ -143,7 +146,7 @@ class Session:
         if self._is_new(batch):
             self.stop()
             self.start(batch.recording)
-        self._recording = batch.recording
+        self._recording, self._factor = batch.recording, accel_factor
         samples = [
             (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
             for time, gyro, a in self._merger.add(batch.readings)
@@ -209,6 +212,12 @@ class Session:
         problem = self.problem
         if not problem and self._merger.missing:
             problem = f"no samples of {self._merger.missing}: switch it on in the logger"
+        if not problem and self._factor * self._merger.upward < -_SURE:
+            other = "-m/s2" if self._factor > 0 else "m/s2"
+            problem = (
+                "the accelerometer points down where the phone's own attitude says up, as on an "
+                f"iPhone: send to the address with accel_unit={other}"
+            )
         return {
             "id": self.device,
             "running": self.running,
