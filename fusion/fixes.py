@@ -1,7 +1,7 @@
 """Fixes: what something else than the IMU knows of position, yaw or velocity at some time.
 
 They are given in the map frame, z up: for a track that starts without a pose they say where it is
-and how it is turned (`filter.map_frame`). Yaw is that of the twist about the vertical (`yaw`): for
+and how it is turned (`filter.map_frame`). Yaw is that of the twist about the vertical (`lie`): for
 a level device the direction its x axis points to, counter-clockwise from the map's x axis.
 """
 

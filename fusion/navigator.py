@@ -22,9 +22,9 @@ from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_f
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import Predictor as Predictor
-from stario.fusion.imu.stateful import StatefulInference
+from stario.fusion.imu.stateful import StatefulInference, displacements_of
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
-from stario.fusion.recording import Progress, displacements_of, preprocess
+from stario.fusion.recording import Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track
 from stario.sequences.errors import InputError
@@ -143,7 +143,7 @@ class Navigator:
         """A fix of the body's yaw [rad]; else as `update_position`.
 
         Yaw counts counter-clockwise from the map's x axis (no compass heading); at any tilt it is
-        that of the twist about the vertical (`yaw.yaw_twist`).
+        that of the twist about the vertical (`lie.yaw_twist`).
         """
         self._take(yaw_fix(time, yaw, sigma))
 

@@ -6,25 +6,19 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
-import numpy as np
-from numpy.typing import NDArray
-
-from stario.fusion.checked import floored
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.imu.front_end import FrontEnd, cut_recording
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
-from stario.fusion.imu.stateful import Predictor, StatefulInference
+from stario.fusion.imu.stateful import (
+    Displacement,
+    Predictor,
+    StatefulInference,
+    displacements_of,
+)
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
-
-LEAST_SIGMA = 5e-3
-"""No network knows a second's displacement better than this [m], whatever it says."""
-
-FLAGGED_SCALE = 4.0
-"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
 
 _BATCH = 512
 """Windows of a recording that the network is given at once."""
@@ -81,23 +75,6 @@ def preprocess(
     )
 
 
-def displacements_of(
-    network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
-) -> list[Displacement]:
-    """The network's displacements of the intervals' windows, as far as it can be trusted.
-
-    The windows, and those that move as nothing the weights know, are counted.
-    """
-    windows_N = np.stack([_window(interval) for interval in intervals])
-    counts.windows += len(windows_N)
-    counts.unfamiliar += network.unfamiliar(windows_N)
-    heading = np.array([interval.heading for interval in intervals])
-    return [
-        (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
-        for interval, d_N, C in zip(intervals, *network.predict(windows_N, heading), strict=True)
-    ]
-
-
 def _displacements(
     intervals: Sequence[ImuInterval],
     network: StatefulInference,
@@ -126,8 +103,3 @@ def _batches(intervals: Sequence[ImuInterval], unbroken: bool) -> Iterator[range
             begin, windows = k, 0
         windows += interval.window is not None
     yield range(begin, len(intervals))
-
-
-def _window(interval: ImuInterval) -> NDArray[np.float32]:
-    assert interval.window is not None  # only intervals that have one are asked
-    return interval.window

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stario.sequences.noise import ImuNoise as ImuNoise
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
-    from stario.sequences.readers.own_csv import write_csv as write_csv
+    from stario.sequences.readers.csv_writer import write_csv as write_csv
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
@@ -79,7 +79,7 @@ _MODULES = {
     "with_conventions": "conventions",
     "with_units": "units",
     "world_streams": "windows",
-    "write_csv": "readers.own_csv",
+    "write_csv": "readers.csv_writer",
     "write_tum": "files",
 }
 

@@ -31,6 +31,9 @@ _WINDOWS = 12
 """Length, least and usual [s], and number of the stretches that are looked at, spread over the
 recording: the cost does not grow with it."""
 
+_NO_SENSOR = 1e4
+"""Larger on average is no sensor's, in deg/s, m/s^2 or any unit between."""
+
 _FAST_RAD_S = 15.0
 """Nobody turns a device faster for a twentieth of the time; the fastest recorded is 2.7 rad/s,
 the slowest one read as deg/s 41."""
@@ -96,6 +99,13 @@ def _check_content(sequence: ImuSequence) -> None:
             raise InputError(f"{sequence.name}: {field}", "no finite sample", "numbers")
     if len(sequence) < 2:
         raise InputError(f"{sequence.name}: samples", "1", f"at least {MIN_SECONDS} s of them")
+    for field, values in (("gyro", sequence.gyro), ("accel", sequence.accel)):
+        size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
+        if size > _NO_SENSOR:
+            raise InputError(
+                f"{sequence.name}: {field}", f"{size:.3g} on average", "what a sensor can give",
+                "is another column meant, or a clock among them?",
+            )  # fmt: skip
 
 
 def _check_time(sequence: ImuSequence) -> None:

@@ -14,7 +14,7 @@ from stario.sequences.checks import MIN_SECONDS, check_units
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder, atomic_write
 from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
-from stario.sequences.readers.own_csv import write_csv
+from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 log = logging.getLogger(__name__)

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from stario.sequences.arrays import BoolArray as BoolArray
+from stario.sequences.arrays import FloatArray as FloatArray
+from stario.sequences.arrays import checked_array, checked_time
+from stario.sequences.beside_imu import DeviceAttitude as DeviceAttitude
+from stario.sequences.beside_imu import Magnetometer as Magnetometer
+from stario.sequences.beside_imu import PositionTrack as PositionTrack
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from typing import Any
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 STANDARD_GRAVITY = 9.80665
 """Magnitude of gravity [m/s^2] used unless another is given."""
@@ -62,7 +64,7 @@ class Trajectory:
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
     def __post_init__(self) -> None:
-        time = _checked_time("time", self.time)
+        time = checked_time("time", self.time)
         n = len(time)
         valid = np.asarray(self.valid, dtype=np.bool_)
         valid = np.ones(n, dtype=np.bool_) if valid.size == 0 else valid
@@ -74,7 +76,7 @@ class Trajectory:
         for name, shape in _TRAJECTORY_SHAPES.items():
             value = getattr(self, name)
             if value is not None:
-                arrays[name] = _checked_array(name, value, (n, *shape), where=valid)
+                arrays[name] = checked_array(name, value, (n, *shape), where=valid)
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
 
@@ -123,7 +125,7 @@ class Trajectory:
         Raises:
             InputError: as for `at`.
         """
-        time = _checked_time("time", time)
+        time = checked_time("time", time)
         t = self.time[self.valid]
         if len(t) < 2:
             raise InputError("trajectory", f"{len(t)} valid samples", "at least 2")
@@ -164,110 +166,6 @@ _TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
     "velocity_W": (3,),
     "position_covariance_W": (3, 3),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class PositionTrack:
-    """Known positions without attitude: a position track, or waypoints that the user passed.
-
-    Attributes:
-        time: (N,) [s], strictly increasing.
-        position_W: (N, 3), or horizontal (N, 2) [m].
-        kind: "positions" (a continuous track) or "waypoints" (single instants).
-        valid: (N,) bool, False where the position must not be used; all True by default.
-
-    Raises:
-        InputError: lengths differ, time does not increase, or a valid value is not finite.
-    """
-
-    time: FloatArray
-    position_W: FloatArray
-    kind: Literal["positions", "waypoints"]
-    valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-
-    def __post_init__(self) -> None:
-        time = _checked_time("positions' time", self.time)
-        valid = np.asarray(self.valid, dtype=np.bool_)
-        valid = np.ones(len(time), dtype=np.bool_) if valid.size == 0 else valid
-        if valid.shape != time.shape:
-            raise InputError("positions' valid", f"shape {valid.shape}", f"({len(time)},) as time")
-        columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
-        shape = (len(time), columns)
-        position_W = _checked_array("positions", self.position_W, shape, where=valid)
-        for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
-            object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def slice(self, start: float, stop: float) -> PositionTrack | None:
-        """The positions with start <= time <= stop [s], or None where there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        if not keep.any():
-            return None
-        return PositionTrack(self.time[keep], self.position_W[keep], self.kind, self.valid[keep])
-
-
-@dataclass(frozen=True, eq=False)
-class Magnetometer:
-    """The magnetic field as measured beside the IMU, at its own times.
-
-    Attributes:
-        time: (M,) [s], on the IMU's clock, strictly increasing.
-        field: (M, 3) magnetic flux density in B [uT].
-
-    Raises:
-        InputError: the shapes do not agree, time does not increase or a value is not finite.
-    """
-
-    time: FloatArray
-    field: FloatArray
-
-    def __post_init__(self) -> None:
-        time = _checked_time("magnetometer's time", self.time)
-        everywhere = np.ones(len(time), dtype=np.bool_)
-        field = _checked_array("magnetic field", self.field, (len(time), 3), where=everywhere)
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "field", field)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def slice(self, start: float, stop: float) -> Magnetometer | None:
-        """The samples with start <= time <= stop [s], or None where there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        return Magnetometer(self.time[keep], self.field[keep]) if keep.any() else None
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceAttitude:
-    """The attitude that the device's own fusion gave, in a world of its own with z up.
-
-    Attributes:
-        time: (M,) [s], on the IMU's clock, strictly increasing.
-        attitude_WB: M rotations taking body B to that world.
-
-    Raises:
-        InputError: the lengths differ or time does not increase.
-    """
-
-    time: FloatArray
-    attitude_WB: Rotation
-
-    def __post_init__(self) -> None:
-        time = _checked_time("device attitude's time", self.time)
-        if len(self.attitude_WB) != len(time):
-            found = f"{len(self.attitude_WB)} rotations"
-            raise InputError("device attitude", found, f"{len(time)} as time")
-        object.__setattr__(self, "time", time)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def slice(self, start: float, stop: float) -> DeviceAttitude | None:
-        """The attitudes with start <= time <= stop [s], or None where there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        return DeviceAttitude(self.time[keep], self.attitude_WB[keep]) if keep.any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,32 +289,3 @@ def second_ticks(time: FloatArray) -> FloatArray:
 def _lerp(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
     columns = [np.interp(time, t, values[:, k]) for k in range(values.shape[1])]
     return np.stack(columns, axis=1)
-
-
-def _checked_time(name: str, value: FloatArray) -> FloatArray:
-    time = np.asarray(value, dtype=np.float64)
-    if time.ndim != 1 or time.size == 0:
-        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
-    if not np.isfinite(time).all():
-        raise InputError(name, "a value that is not finite", "finite seconds")
-    steps = np.diff(time)
-    if (steps <= 0).any():
-        k = int(np.argmax(steps <= 0))
-        raise InputError(
-            name, f"{time[k + 1]!r} after {time[k]!r} at row {k + 1}", "strictly increasing seconds"
-        )
-    return time
-
-
-def _checked_array(
-    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
-) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape:
-        raise InputError(name, f"shape {array.shape}", f"{shape}")
-    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) & where
-    if bad.any():
-        raise InputError(
-            name, f"a value that is not finite at row {int(np.argmax(bad))}", "finite values"
-        )
-    return array

@@ -23,7 +23,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Write a simulated walk with its truth as a CSV recording."""
-    from stario.sequences.readers.own_csv import write_csv
+    from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
     from stario.sequences.simulation.walks import WalkStyle, generate_walk
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.error_state import CORE
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.jacobians import Block
+from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import FloatArray
 from stario.sequences.noise import ImuNoise

@@ -17,15 +17,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.error_state import CORE
 from stario.fusion.filter.estimate import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.jacobians import CORE
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import FloatArray, exp_so3, log_se23
-from stario.fusion.yaw import yaw_rotation
+from stario.fusion.lie import FloatArray, exp_so3, log_se23, yaw_rotation
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS

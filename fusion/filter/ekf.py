@@ -18,21 +18,21 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
-from stario.fusion.error_state import CLONE, CORE
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
+    CLONE,
+    CORE,
     bearing_jacobian,
     displacement_jacobian,
     mean_velocity_jacobian,
     position_jacobian,
+    propagated,
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.filter.propagation import propagated
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import FloatArray, exp_times
-from stario.fusion.yaw import yaw_twist
+from stario.fusion.lie import FloatArray, exp_times, yaw_twist
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.fusion.error_state import CLONE, CORE, plain_covariance
 from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.lie import FloatArray, skew
 from stario.sequences.errors import InputError
 

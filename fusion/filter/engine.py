@@ -17,8 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.error_state import CORE
-from stario.fusion.filter.jacobians import Block
+from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.lie import FloatArray
 
 GateMode = Literal["inflate", "reject"]

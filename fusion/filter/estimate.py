@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.error_state import plain_covariance
+from stario.fusion.filter.jacobians import plain_covariance
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState, SmoothedPose
 

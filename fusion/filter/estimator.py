@@ -37,8 +37,8 @@ from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.segments import segment_of
 from stario.fusion.imu.stillness import StillnessDetector
+from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
-from stario.fusion.yaw import yaw_rotation
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 

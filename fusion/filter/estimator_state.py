@@ -15,10 +15,8 @@ from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
+from stario.fusion.imu.stateful import Displacement as Displacement
 from stario.fusion.lie import FloatArray
-
-Displacement = tuple[FloatArray, FloatArray]
-"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
 
 class IntervalMeasurements(NamedTuple):

@@ -1,17 +1,27 @@
-"""Jacobians of the filter's measurements by its right-invariant error.
+"""The filter's right-invariant error: definition, propagation, Jacobians of measurements.
 
-Error state: theta, rho_v, rho_p, d_bg, d_ba of the current state, then theta, rho_p of each clone
-(`error_state`). A Jacobian is a list of blocks; what is in no block is zero. Derivations:
-README.md, "Displacement measurement" and "Fixes".
+    theta [rad], rho_v [m/s], rho_p [m], d_bg [rad/s], d_ba [m/s^2] | theta, rho_p of each clone
+    R = (I + [theta]x) R^,  v = v^ + rho_v - [v^]x theta,  p = p^ + rho_p - [p^]x theta
+
+where ^ marks the estimate. A Jacobian is a list of blocks; what is in no block is zero.
+Derivations: README.md, "Error state" to "Fixes".
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import gtsam
 import numpy as np
 
-from stario.fusion.error_state import CLONE, CORE
-from stario.fusion.lie import FloatArray, skew
-from stario.fusion.yaw import twist
+from stario.fusion.imu.preintegration import Segment
+from stario.fusion.lie import FloatArray, skew, twist
+
+CORE = 15
+"""Size of the error state of one navigation state."""
+
+CLONE = 6
+"""Size of the error state of one cloned pose."""
 
 Block = tuple[int, FloatArray]
 """First column of the error state a Jacobian block stands at, and the block (m, width)."""
@@ -103,3 +113,84 @@ def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> lis
     by_theta = np.array([[z * x / n, z * y / n, -1.0]])
     by_hard_iron = (x * R_WB[1] - y * R_WB[0]) / n
     return [(0, by_theta), (first_field, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]
+
+
+def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
+    """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
+
+    Args:
+        P: (..., n, n) of theta, then a rho for each vector, then whatever does not change.
+        vectors_W: (..., k, 3) velocity and position, or one of them; negative ones turn it back.
+    """
+    A = skew(vectors_W).reshape(*vectors_W.shape[:-2], -1, 3)
+    stop = 3 + A.shape[-2]
+    plain = P.copy()
+    plain[..., 3:stop, :] -= A @ P[..., :3, :]
+    plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
+    # Far from the origin the products' rounding would leave it asymmetric.
+    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
+
+
+class Propagation(NamedTuple):
+    """State at a segment's end and its linearisation, order theta, rho_v, rho_p, d_bg, d_ba."""
+
+    R_WB: FloatArray
+    """(3, 3)."""
+    v_W: FloatArray
+    """(3,) [m/s]."""
+    p_W: FloatArray
+    """(3,) [m]."""
+    transition: FloatArray
+    """(15, 15)."""
+    noise: FloatArray
+    """(15, 15)."""
+
+
+def propagated(
+    segment: Segment,
+    R_WB: FloatArray,
+    v_W: FloatArray,
+    p_W: FloatArray,
+    b_g: FloatArray,
+    b_a: FloatArray,
+) -> Propagation:
+    """`Segment.predict` with the transition and the noise of the right-invariant error.
+
+    gtsam's tangent is local, R exp(w), p + R dp, v + R dv, in the order rotation, position,
+    velocity, accelerometer bias, gyroscope bias; the adjoint of the end state turns it into the
+    right-invariant error.
+    """
+    start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
+    bias_jacobian = np.empty((9, 6), order="F")
+    bias = gtsam.imuBias.ConstantBias(b_a, b_g)
+    end = segment.pim.predict(start, bias, None, bias_jacobian)
+    R, v, p = end.attitude().matrix(), end.velocity(), end.position()
+
+    adjoint = _BIAS_SWAP.copy()
+    adjoint[0:3, 0:3] = R
+    adjoint[3:6, 6:9] = R
+    adjoint[6:9, 3:6] = R
+    adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
+    noise = adjoint @ segment.pim.residualCovariance() @ adjoint.T
+
+    transition = _nav_transition(segment.duration, segment.gravity)
+    by_bias = adjoint[:9, :9] @ bias_jacobian
+    transition[:9, 9:12] = by_bias[:, 3:]
+    transition[:9, 12:15] = by_bias[:, :3]
+    return Propagation(R, v, p, transition, noise)
+
+
+_IDENTITY = np.eye(CORE)
+_BIAS_SWAP = np.zeros((CORE, CORE))
+_BIAS_SWAP[9:12, 12:15] = np.eye(3)
+_BIAS_SWAP[12:15, 9:12] = np.eye(3)
+
+
+def _nav_transition(dt: float, gravity: float) -> FloatArray:
+    """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
+    transition = _IDENTITY.copy()
+    fall, drop = gravity * dt, 0.5 * gravity * dt * dt
+    transition[3, 1], transition[4, 0] = fall, -fall
+    transition[6, 1], transition[7, 0] = drop, -drop
+    transition[6, 3] = transition[7, 4] = transition[8, 5] = dt
+    return transition

@@ -25,9 +25,8 @@ from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimate import nav_states
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.fixes import Fix
-from stario.fusion.lie import FloatArray, exp_so3
+from stario.fusion.lie import FloatArray, exp_so3, yaw_twist
 from stario.fusion.state import NavState
-from stario.fusion.yaw import yaw_twist
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 """Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""

@@ -17,9 +17,8 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.segments import segment_of, segment_of_all
-from stario.fusion.lie import FloatArray, exp_so3, log_so3
+from stario.fusion.lie import FloatArray, exp_so3, log_so3, yaw_twist
 from stario.fusion.state import NavState
-from stario.fusion.yaw import yaw_twist
 from stario.sequences.windows import WINDOW_SECONDS
 
 _SAME_TIME = 1e-6

@@ -20,9 +20,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from stario.fusion.error_state import CORE
-from stario.fusion.lie import FloatArray, log_se23, skew
-from stario.fusion.yaw import twist, yaw_rotation
+from stario.fusion.filter.jacobians import CORE
+from stario.fusion.lie import FloatArray, log_se23, skew, twist, yaw_rotation
 
 _EYE = np.eye(3)
 

@@ -21,7 +21,7 @@ from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.chi_square import chi2_quantile
-from stario.fusion.error_state import CORE
+from stario.fusion.filter.jacobians import CORE
 from stario.fusion.graph.factors import Displacement, KeyframeState, Prior, Term
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stario.fusion.checked import floored
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import turned_windows
+
+LEAST_SIGMA = 5e-3
+"""No network knows a second's displacement better than this [m], whatever it says."""
+
+FLAGGED_SCALE = 4.0
+"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
+
+Displacement = tuple[FloatArray, FloatArray]
+"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
 
 class Predictor(Protocol):
@@ -89,3 +101,25 @@ class StatefulInference:
             raise InputError("snapshot: network", "another kind of memory", "the same network's")
         if self.remembers:
             self._stretch.memory = memory
+
+
+def displacements_of(
+    network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
+) -> list[Displacement]:
+    """The network's displacements of the intervals' windows, as far as it can be trusted.
+
+    The windows, and those that move as nothing the weights know, are counted.
+    """
+    windows_N = np.stack([_window(interval) for interval in intervals])
+    counts.windows += len(windows_N)
+    counts.unfamiliar += network.unfamiliar(windows_N)
+    heading = np.array([interval.heading for interval in intervals])
+    return [
+        (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
+        for interval, d_N, C in zip(intervals, *network.predict(windows_N, heading), strict=True)
+    ]
+
+
+def _window(interval: ImuInterval) -> NDArray[np.float32]:
+    assert interval.window is not None  # only intervals that have one are asked
+    return interval.window

@@ -30,9 +30,15 @@ class Hub:
     Args:
         folder: for recordings.
         new_navigator: makes a navigator for each track.
+
+    Attributes:
+        sessions: by device.
+        refused: messages that could not be read, by where they came in.
+        ending: whether the server is about to stop, and viewers are to be let go.
     """
 
     def __init__(self, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
+        self.ending = False
         self._folder, self._new_navigator = folder, new_navigator
         self.sessions: dict[str, Session] = {}
         self._locks: dict[str, asyncio.Lock] = {}
@@ -83,6 +89,11 @@ class Hub:
             await asyncio.wait_for(self._news.wait(), seconds)
         except TimeoutError:
             return
+
+    def end(self) -> None:
+        """Let the viewers go."""
+        self.ending = True
+        self.announce()
 
     def close(self) -> None:
         """End all recordings."""

@@ -19,6 +19,9 @@ from stario.fusion.live.server import live_app
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
+_LOOKS_EVERY = 0.1
+"""For a signal that ends the server [s]."""
+
 
 class LiveServer:
     """Everything that `stario live` runs.
@@ -105,6 +108,9 @@ class LiveServer:
             while not self._server.started and not web.done():
                 await asyncio.sleep(0.01)
             started()
+            while not self._server.should_exit:
+                await asyncio.sleep(_LOOKS_EVERY)
+            self.hub.end()
             await web
         except OSError as error:
             found = f"{self._lines_port}: {error.strerror or error}"

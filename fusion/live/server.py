@@ -207,7 +207,7 @@ async def _events(request: Request) -> Response:
 
     async def messages() -> AsyncIterator[str]:
         viewer = Viewer(hub)
-        while True:
+        while not hub.ending:
             waiting = asyncio.create_task(hub.news(_AT_LEAST))
             yield f"data: {json.dumps(viewer.message(), separators=(',', ':'))}\n\n"
             await waiting

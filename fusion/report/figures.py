@@ -15,7 +15,7 @@ from stario.sequences.sequence import FloatArray
 PANEL_HEIGHT = 190
 """Of a panel over time [px]."""
 
-_ELLIPSES = 16
+_ELLIPSES = 12
 """Drawn along a track."""
 
 _FONT = {"family": "system-ui, sans-serif", "size": 13, "color": INK}
@@ -25,12 +25,12 @@ _LEFT = 58
 
 def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
     """All tracks from above on equal axes, with 3-sigma ellipses along those that state them."""
-    figure = go.Figure()
+    figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
         figure.add_trace(_path(TRUTH, truth, 3.0))
     for name, series in tracks.items():
         if series.position_covariance is not None:
-            figure.add_trace(_ellipses(name, series))
+            figure.add_trace(_ellipses(name, series, 0.4 * float(np.ptp(frame, axis=1).max())))
     for name, series in tracks.items():
         figure.add_trace(_path(name, series, 2.0))
     for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
@@ -44,7 +44,6 @@ def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
         hovermode="closest",
         dragmode="pan",
     )
-    frame = _frame(tracks, truth)
     for axis, limits, title in (("xaxis", frame[0], "x [m]"), ("yaxis", frame[1], "y [m]")):
         figure.update_layout(
             {
@@ -124,17 +123,25 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
     )
 
 
-def _ellipses(name: str, series: Series) -> go.Scatter:
-    """Some outlines in one trace, nan between them."""
+def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
+    """Some outlines in one trace, nan between them; none that would cross all of the map.
+
+    Args:
+        name: of the track.
+        series: with a covariance.
+        largest: half axis that is drawn [m]; beyond, the slider's ellipse tells it.
+    """
     _, colour, _ = style(name)
     assert series.position_covariance is not None  # asked for only where there is one
     known = np.flatnonzero(np.isfinite(series.position[:, 0]))
     rows = np.unique(known[np.linspace(0, len(known) - 1, _ELLIPSES).round().astype(int)])
+    outlines = [(k, ellipse(series.position_covariance[k])) for k in rows]
     parts = [
-        np.vstack([series.position[k, :2] + ellipse(series.position_covariance[k]), [[np.nan] * 2]])
-        for k in rows
+        np.vstack([series.position[k, :2] + outline, [[np.nan] * 2]])
+        for k, outline in outlines
+        if np.linalg.norm(outline, axis=1).max() <= largest
     ]
-    outline = np.vstack(parts).round(3)
+    outline = np.vstack([np.full((1, 2), np.nan), *parts]).round(3)
     return go.Scatter(
         x=outline[:, 0],
         y=outline[:, 1],

@@ -19,11 +19,12 @@ from stario.sequences.readers.archive import (
 )
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
+from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.euroc import is_euroc, read_euroc
 from stario.sequences.readers.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.imunet import is_imunet, read_imunet
 from stario.sequences.readers.lists import is_list, list_entries
-from stario.sequences.readers.own_csv import is_own_csv, read_own_csv, write_csv
+from stario.sequences.readers.own_csv import is_own_csv, read_own_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
 from stario.sequences.readers.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.phone_files import lone_sensors

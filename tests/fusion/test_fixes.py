@@ -21,8 +21,7 @@ from stario.fusion.fix_file import read_fixes
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.cutting import cut
 from stario.fusion.imu.front_end import cut_recording
-from stario.fusion.lie import exp_se23, exp_so3
-from stario.fusion.yaw import yaw_twist
+from stario.fusion.lie import exp_se23, exp_so3, yaw_twist
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of

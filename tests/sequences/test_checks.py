@@ -186,7 +186,8 @@ def test_units_by_name(walk: ImuSequence) -> None:
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 def test_recordings_pass_and_their_units_are_told() -> None:
-    for path in find_recordings(DATA)[::3]:
+    paths = [path for name in ("euroc", "oxiod", "tumvi") for path in find_recordings(DATA / name)]
+    for path in paths[::3]:
         recording = read_recording(path)
         check_units(recording)
         assert "--gyro-unit deg/s" in refused(in_degrees(recording))
@@ -194,3 +195,12 @@ def test_recordings_pass_and_their_units_are_told() -> None:
         in_g = replace(alone, accel=alone.accel / STANDARD_GRAVITY)
         assert "--accel-unit g" in refused(in_g)
         assert "points down" in refused(replace(recording, accel=-recording.accel))
+
+
+def test_a_clock_among_the_values_is_no_sensor() -> None:
+    walk = simulate_imu(generate_walk(3, 5.0), 100.0)
+    clock = 1.7e18 + 1e7 * np.arange(len(walk))
+    for name in ("gyro", "accel"):
+        values = np.column_stack([clock, np.ones((len(walk), 2))])
+        with pytest.raises(InputError, match=f"{name}: found 1.7e.18 on average, expected what"):
+            check_units(replace(walk, **{name: values}))

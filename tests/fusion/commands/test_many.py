@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from stario.sequences.files import read_tum
-from stario.sequences.readers.own_csv import read_own_csv, write_csv
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.readers.own_csv import read_own_csv
 
 # --- compare and evaluate ----------------------------------------------------------------------
 

@@ -25,7 +25,8 @@ from stario.sequences.archive_writer import write_archive
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers import find_recordings
-from stario.sequences.readers.own_csv import read_own_csv, write_csv
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.readers.own_csv import read_own_csv
 from stario.sequences.sequence import PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk

@@ -18,9 +18,8 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
-from stario.fusion.lie import exp_so3
+from stario.fusion.lie import exp_so3, yaw_twist
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.yaw import yaw_twist
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
 

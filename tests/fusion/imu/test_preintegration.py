@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from stario.fusion.filter.propagation import propagated
+from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.preintegration import corrected_increments, preintegrate
 from stario.fusion.lie import exp_se23, exp_so3, log_se23, log_so3, skew
 from stario.sequences.errors import InputError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.propagation import propagated
+from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.segments import segment_of
 from stario.fusion.lie import exp_so3

@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+import urllib.request
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -150,6 +151,16 @@ def test_an_experiment_without_both_sensors_is_refused():
         buffers_of({"inputs": CONFIG["inputs"][1:]})
     with pytest.raises(InputError, match="phyphox"):
         Phyphox("file:///etc/passwd")
+
+
+def test_a_server_that_stops_lets_its_viewers_go(serve, caplog):
+    server = serve()
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/events", timeout=20) as viewer:
+        assert viewer.readline().startswith(b"data: ")
+        server.stop()
+        rest = viewer.read()
+    assert rest.endswith(b"\n")
+    assert caplog.records == []
 
 
 def test_only_loopback_goes_without_a_token(tmp_path, new_navigator):

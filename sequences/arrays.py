@@ -1,0 +1,50 @@
+"""Arrays as every sequence holds them, checked at the edge."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.sequences.errors import InputError
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def checked_time(name: str, value: FloatArray) -> FloatArray:
+    """Times (N,) [s] that are finite and strictly increase.
+
+    Raises:
+        InputError: they are not.
+    """
+    time = np.asarray(value, dtype=np.float64)
+    if time.ndim != 1 or time.size == 0:
+        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    if not np.isfinite(time).all():
+        raise InputError(name, "a value that is not finite", "finite seconds")
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        k = int(np.argmax(steps <= 0))
+        raise InputError(
+            name, f"{time[k + 1]!r} after {time[k]!r} at row {k + 1}", "strictly increasing seconds"
+        )
+    return time
+
+
+def checked_array(
+    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
+) -> FloatArray:
+    """An array of a shape whose rows are finite where they must be.
+
+    Raises:
+        InputError: it is not.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise InputError(name, f"shape {array.shape}", f"{shape}")
+    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) & where
+    if bad.any():
+        raise InputError(
+            name, f"a value that is not finite at row {int(np.argmax(bad))}", "finite values"
+        )
+    return array

@@ -1,0 +1,116 @@
+"""What may be recorded beside an IMU: positions, the magnetic field, the device's own attitude."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.arrays import BoolArray, FloatArray, checked_array, checked_time
+from stario.sequences.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTrack:
+    """Known positions without attitude: a position track, or waypoints that the user passed.
+
+    Attributes:
+        time: (N,) [s], strictly increasing.
+        position_W: (N, 3), or horizontal (N, 2) [m].
+        kind: "positions" (a continuous track) or "waypoints" (single instants).
+        valid: (N,) bool, False where the position must not be used; all True by default.
+
+    Raises:
+        InputError: lengths differ, time does not increase, or a valid value is not finite.
+    """
+
+    time: FloatArray
+    position_W: FloatArray
+    kind: Literal["positions", "waypoints"]
+    valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+
+    def __post_init__(self) -> None:
+        time = checked_time("positions' time", self.time)
+        valid = np.asarray(self.valid, dtype=np.bool_)
+        valid = np.ones(len(time), dtype=np.bool_) if valid.size == 0 else valid
+        if valid.shape != time.shape:
+            raise InputError("positions' valid", f"shape {valid.shape}", f"({len(time)},) as time")
+        columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
+        shape = (len(time), columns)
+        position_W = checked_array("positions", self.position_W, shape, where=valid)
+        for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> PositionTrack | None:
+        """The positions with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        if not keep.any():
+            return None
+        return PositionTrack(self.time[keep], self.position_W[keep], self.kind, self.valid[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """The magnetic field as measured beside the IMU, at its own times.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        field: (M, 3) magnetic flux density in B [uT].
+
+    Raises:
+        InputError: the shapes do not agree, time does not increase or a value is not finite.
+    """
+
+    time: FloatArray
+    field: FloatArray
+
+    def __post_init__(self) -> None:
+        time = checked_time("magnetometer's time", self.time)
+        everywhere = np.ones(len(time), dtype=np.bool_)
+        field = checked_array("magnetic field", self.field, (len(time), 3), where=everywhere)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "field", field)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> Magnetometer | None:
+        """The samples with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        return Magnetometer(self.time[keep], self.field[keep]) if keep.any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceAttitude:
+    """The attitude that the device's own fusion gave, in a world of its own with z up.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        attitude_WB: M rotations taking body B to that world.
+
+    Raises:
+        InputError: the lengths differ or time does not increase.
+    """
+
+    time: FloatArray
+    attitude_WB: Rotation
+
+    def __post_init__(self) -> None:
+        time = checked_time("device attitude's time", self.time)
+        if len(self.attitude_WB) != len(time):
+            found = f"{len(self.attitude_WB)} rotations"
+            raise InputError("device attitude", found, f"{len(time)} as time")
+        object.__setattr__(self, "time", time)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> DeviceAttitude | None:
+        """The attitudes with start <= time <= stop [s], or None where there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        return DeviceAttitude(self.time[keep], self.attitude_WB[keep]) if keep.any() else None

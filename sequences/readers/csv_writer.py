@@ -1,0 +1,79 @@
+"""Writing a CSV of one's own: samples, magnetometer and truth in rows shared where times agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.files import atomic_write
+from stario.sequences.readers.columns import HEADER, IMU, MAGNETIC_HEADER, TRUTH_HEADER
+from stario.sequences.sequence import FloatArray, ImuSequence
+
+
+def write_csv(path: Path | str, sequence: ImuSequence) -> None:
+    """Write a recording so that `read_own_csv` returns the same numbers, whole or not at all.
+
+    The magnetometer's samples and truth's valid poses or positions go to the IMU's rows where
+    their times are the same and to rows of their own elsewhere; truth's velocity and covariance
+    have no column.
+    Reading counts time from the first IMU sample.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    truth, field = sequence.truth, sequence.magnetometer
+    header, rows = HEADER, _Written(sequence)
+    if field is not None:
+        header += f",{MAGNETIC_HEADER}"
+        rows.add(field.time, field.field)
+    if truth is None and sequence.positions is not None:
+        known = sequence.positions
+        header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
+        rows.add(known.time[known.valid], known.position_W[known.valid])
+    if truth is not None:
+        header += f",{TRUTH_HEADER}"
+        poses = np.column_stack([truth.position_W, truth.quat_xyzw])
+        rows.add(truth.time[truth.valid], poses[truth.valid])
+    with atomic_write(path) as file:
+        file.write("\n".join([header, *rows.merged()]) + "\n")
+
+
+class _Written:
+    """A file's rows as they are put together: the IMU's, with what shares their times."""
+
+    def __init__(self, sequence: ImuSequence) -> None:
+        table = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
+        self._rows = [",".join(map(repr, row)) for row in table.tolist()]
+        # What is added stays in order: it shares rows of the IMU newer than all before them.
+        self._newest = np.maximum.accumulate(np.nan_to_num(sequence.time, nan=-np.inf))
+        advances = np.flatnonzero(np.diff(self._newest, prepend=-np.inf) > 0)
+        self._shared = {float(sequence.time[k]): int(k) for k in advances}
+        self._own: list[tuple[float, str]] = []
+        self._blank = "," * len(IMU)
+
+    def add(self, time: FloatArray, values: FloatArray) -> None:
+        """Columns to the right of those there are, at times (M,) that increase."""
+        empty = "," * values.shape[1]
+        tails = [empty] * len(self._rows)
+        own = []
+        for t, row in zip(time.tolist(), values.tolist(), strict=True):
+            text = "," + ",".join(map(repr, row))
+            if t in self._shared:
+                tails[self._shared[t]] = text
+            else:
+                own.append((t, f"{t!r}{self._blank}{text}"))
+        self._rows = [row + tail for row, tail in zip(self._rows, tails, strict=True)]
+        self._own = [(t, row + empty) for t, row in self._own] + own
+        self._blank += empty
+
+    def merged(self) -> list[str]:
+        """All rows, those without IMU samples before the first IMU row that is later."""
+        own = sorted(self._own, key=lambda item: item[0])
+        places = np.searchsorted(self._newest, [t for t, _ in own]).tolist()
+        merged: list[str] = []
+        taken = 0
+        for place, (_, text) in zip(places, own, strict=True):
+            merged += [*self._rows[taken:place], text]
+            taken = place
+        return merged + self._rows[taken:]
