@@ -58,6 +58,9 @@ def evaluate(
     every: Annotated[
         int, typer.Option(min=1, help="With --by: judge by every so many recordings of a group.")
     ] = 1,
+    ekf: Annotated[
+        bool, typer.Option("--ekf", help="With --by: the mean NIS of the EKF as well; slow.")
+    ] = False,
     models: Annotated[
         str | None,
         typer.Option(
@@ -86,7 +89,7 @@ def evaluate(
     if by is not None:
         listed, skipped = _listed(reading, paths or [], data, split)
         skipped += judge_by_groups(
-            listed, reading, by, estimating.model, against, every, jobs, out, as_json
+            listed, reading, by, estimating.model, against, every, ekf, jobs, out, as_json
         )
         leave_with_skipped(skipped)
         return

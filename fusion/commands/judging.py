@@ -24,6 +24,7 @@ def judge_by_groups(
     ours: str,
     theirs: str | None,
     every: int,
+    ekf: bool,
     jobs: int,
     out: Path | None,
     as_json: bool,
@@ -53,7 +54,13 @@ def judge_by_groups(
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {one.path: one.group for one in chosen}
     with progress_bar("judge", len(chosen)) as progress:
-        judged, skipped = judge(prepared, models, groups, lambda done: progress(done / len(chosen)))
+        judged, skipped = judge(
+            prepared,
+            models,
+            groups,
+            reading.read if ekf else None,
+            lambda done: progress(done / len(chosen)),
+        )
     if not judged:
         return skipped
     found = Judgement(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)

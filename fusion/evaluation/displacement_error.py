@@ -32,6 +32,9 @@ BLOCK_SECONDS = 30.0
 STRETCH_SECONDS = 20
 """Length of the stretches of which `stretch_percent` is the error."""
 
+_LEAST_PAIRS = 20
+"""Displacements of which a recording's error over a horizon is told."""
+
 _LEG = round(2.0 / TICK_SECONDS)
 
 Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
@@ -50,6 +53,7 @@ FIGURES = {
     "root mean square, in % of the path",
     "nis": "mean of error^T covariance^-1 error of single windows, scaled to three axes "
     "(expected: 3)",
+    "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), where it was asked for",
 }
 """Figures of a recording; nan where its kind of truth does not give one."""
 
@@ -93,6 +97,8 @@ class _Sums:
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
         """Errors (K,) by start tick, nan where not known."""
+        if np.isfinite(errors).sum() < _LEAST_PAIRS:
+            return
         self.add(measure, errors)
         per_block = round(BLOCK_SECONDS / TICK_SECONDS)
         squares = np.nan_to_num(errors**2)
@@ -122,6 +128,7 @@ def recording_errors(prepared: Prepared, found: Sequence[Answers]) -> RecordingE
         **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
         "stretch_percent": 100.0 * sums.rms("stretch"),
         "nis": sums.rms("nis") ** 2,
+        "nis_ekf": float("nan"),
     }
     blocks = {name: np.concatenate(parts) for name, parts in sums.blocks.items()}
     return RecordingErrors(prepared.name, prepared.kind, sums.path, figures, blocks)

@@ -7,7 +7,7 @@ Each recording is prepared once and shown to every network. `stario.fusion.evalu
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -23,9 +23,11 @@ from stario.fusion.evaluation.displacement_error import (
 from stario.fusion.evaluation.network_alone import Answering, answers
 from stario.fusion.evaluation.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
 from stario.sequences.batch import Skipped
 from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
+from stario.sequences.sequence import ImuSequence
 
 By = Literal["set", "group", "person", "device", "place", "carry"]
 
@@ -83,6 +85,7 @@ def judge(
     recordings: Iterable[Prepared | Skipped],
     models: Mapping[str, Callable[[str], Predictor | Answering]],
     groups: Mapping[Path, str],
+    read: Callable[[Path], ImuSequence] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[Judged], list[Skipped]]:
     """Show every recording to every network.
@@ -92,6 +95,7 @@ def judge(
         models: by the name of the weights, the network for a group: another for each group where
             each was left out of training in turn.
         groups: of each recording's path; the set's name where none is known.
+        read: how a path is read, for the EKF, whose mean NIS is then told as well; slow.
         progress: called with the number of recordings done.
     """
     judged: list[Judged] = []
@@ -102,12 +106,25 @@ def judge(
         else:
             labels = _labels(prepared, groups.get(prepared.path, ""))
             errors = {
-                name: recording_errors(prepared, answers(model(labels["group"]), prepared))
+                name: _errors(model(labels["group"]), prepared, read)
                 for name, model in models.items()
             }
             judged.append(Judged(prepared.path, labels, errors))
         progress(done)
     return judged, skipped
+
+
+def _errors(
+    model: Predictor | Answering,
+    prepared: Prepared,
+    read: Callable[[Path], ImuSequence] | None,
+) -> RecordingErrors:
+    found = recording_errors(prepared, answers(model, prepared))
+    if read is None or isinstance(model, Answering):
+        return found
+    health = Navigator(model).run(read(prepared.path)).health
+    nis = float("nan") if health is None else health.mean_nis
+    return replace(found, figures=found.figures | {"nis_ekf": nis})
 
 
 def rows_of(judged: Sequence[Judged], by: By, ours: str, theirs: str | None) -> list[Row]:

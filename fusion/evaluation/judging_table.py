@@ -7,18 +7,13 @@ import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from stario.fusion.evaluation.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.displacement_error import FIGURES
-from stario.fusion.evaluation.judging import Judged, Row
+from stario.fusion.evaluation.judging import POOLED, Judged, Row
+from stario.fusion.evaluation.judging_figure import groups_figure
 from stario.sequences.files import atomic_write, write_json
 from stario.sequences.plots import save_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _COLUMNS = {
     "ate_fit_m": ("fit [m]", ".2f"),
@@ -30,7 +25,11 @@ _COLUMNS = {
     "rms_10s_m": ("10 s [m]", ".2f"),
     "rms_30s_m": ("30 s [m]", ".2f"),
     "nis": ("NIS", ".2f"),
+    "nis_ekf": ("EKF NIS", ".2f"),
 }
+
+_DECIDES = "rms_10s_m"
+_WORST = 1.1
 
 WORDS = {
     **FIGURES,
@@ -75,8 +74,25 @@ def judgement_text(found: Judgement) -> str:
         for key, interval in row.ratios.items():
             title = _COLUMNS[key][0].split(" [")[0]
             lines.append(f"{'':<{width}}ratio over {title}: {_interval(interval)}")
+    if told := verdict(found.rows):
+        lines.append(told)
     names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
     return "\n".join([*lines, *names, *(f"{key}: {text}." for key, text in WORDS.items())])
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """Whether ours should replace theirs; empty without a comparison over several groups.
+
+    Taken is what is surely better over all and nowhere worse by more than a tenth.
+    """
+    ratios = {row.name: row.ratios[_DECIDES] for row in rows if _DECIDES in row.ratios}
+    pooled = ratios.pop(POOLED, None)
+    if pooled is None:
+        return ""
+    worst = max(ratios, key=lambda name: ratios[name].ratio)
+    taken = pooled.high < 1.0 and ratios[worst].ratio <= _WORST
+    told = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
+    return f"{'taken' if taken else 'not taken'}: {told}"
 
 
 def judgement_dict(found: Judgement) -> dict[str, object]:
@@ -84,6 +100,7 @@ def judgement_dict(found: Judgement) -> dict[str, object]:
     return {
         "ours": found.ours,
         "theirs": found.theirs,
+        "verdict": verdict(found.rows),
         "groups": [asdict(row) for row in found.rows],
         "recordings": [_recording(one) for one in found.judged],
         "words": WORDS,
@@ -109,7 +126,7 @@ def write_judgement(folder: Path, found: Judgement) -> list[Path]:
     for path, content in zip(written, (rows, single), strict=False):
         _write_csv(path, content)
     write_json(written[2], judgement_dict(found))
-    save_figure(_figure(found), folder / "groups.png")
+    save_figure(groups_figure(found.rows, found.ours, found.theirs), folder / "groups.png")
     return [*written, folder / "groups.png"]
 
 
@@ -137,45 +154,6 @@ def _write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
     writer.writerows(rows)
     with atomic_write(path) as file:
         file.write(text.getvalue())
-
-
-def _figure(found: Judgement) -> Figure:
-    """Error by group, before and after: each line a recording, the bar the medians."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = [row for row in found.rows if row.name != "all"] or found.rows
-    fig = Figure(figsize=(10.0, 1.6 + 0.55 * len(rows)), layout="constrained")
-    FigureCanvasAgg(fig)
-    panels = fig.subplots(1, 2, sharey=True)
-    drawn = (("ate_fit_percent", "stretch_percent"), ("length_ratio",))
-    titles = (
-        "error after a yaw fit [% of the path]\n(position truth: within 20 s)",
-        "length ratio",
-    )
-    for axes, keys, title in zip(panels, drawn, titles, strict=True):
-        for k, row in enumerate(rows):
-            for name, colour, shift in ((found.theirs, "#999999", 0.16), (found.ours, "#0072B2",
-                                                                        -0.16)):  # fmt: skip
-                if name is None:
-                    continue
-                values = [row.medians[name][key] for key in keys]
-                value = next((v for v in values if np.isfinite(v)), np.nan)
-                axes.plot(value, k + shift, "o", color=colour, ms=8,
-                          label=name if k == 0 else None)  # fmt: skip
-                axes.annotate(f"{value:.2f}", (value, k + shift), (7, -3), fontsize=8,
-                              textcoords="offset points", color=colour)  # fmt: skip
-        axes.set_title(title, loc="left", fontsize=10)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#E6E6E6", lw=0.7)
-        axes.margins(x=0.15)
-    panels[0].set_yticks(range(len(rows)), [f"{row.name} ({row.recordings})" for row in rows])
-    panels[0].invert_yaxis()
-    panels[0].set_xlim(left=0.0)
-    panels[1].axvline(1.0, color="#333333", lw=1.0)
-    handles, labels = panels[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    return fig
 
 
 def _cell(value: float, form: str) -> str:

@@ -10,17 +10,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
+import numpy as np
+
 from stario.fusion.live.payload import (
     ACCEL_RAW,
     GRAVITY,
     GYRO,
     GYRO_RAW,
     LINEAR,
+    ORIENTATION,
     TOTAL,
     Reading,
     Vector,
 )
-from stario.sequences.sequence import MAX_IMU_GAP
+from stario.sequences.sequence import MAX_IMU_GAP, FloatArray
 
 Sample = tuple[int, Vector, Vector]
 """Time [ns], angular rate [rad/s], specific force [m/s^2]."""
@@ -94,9 +97,15 @@ class Join:
 
 
 class Merger:
-    """Turns a device's readings into samples, once it is known which sensors it has."""
+    """Turns a device's readings into samples, once it is known which sensors it has.
+
+    Attributes:
+        upward: cosine between the force and up as the device's own attitude has it; 0 where it
+            does not tell.
+    """
 
     def __init__(self) -> None:
+        self.upward = 0.0
         self._waiting: list[Reading] = []
         self._gyro = ""
         self._accel: tuple[str, ...] = ()
@@ -161,4 +170,18 @@ class Merger:
             self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
             return False
         self._gyro, self._accel = gyro, accel
+        self.upward = _cosine(
+            _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
+            *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),
+        )
         return True
+
+
+def _mean(values: Iterable[Vector]) -> FloatArray:
+    table = np.array(list(values)).reshape(-1, 3)
+    return table.mean(axis=0) if len(table) else np.zeros(3)
+
+
+def _cosine(up: FloatArray, *forces: FloatArray) -> float:
+    force = np.sum(forces, axis=0)
+    return float(up @ force / max(np.linalg.norm(up) * np.linalg.norm(force), 1e-9))

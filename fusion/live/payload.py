@@ -39,11 +39,14 @@ _LARGEST = 1e4
 
 _LATEST = 2**63
 _LONGEST_NAME = 80
+_UNIT = 0.05
 
 GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
 TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
 ACCEL_RAW = "accelerometeruncalibrated"
 SENSORS = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW})
+ORIENTATION = "orientation"
+"""The phone's own attitude, of which only the vertical is used."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,9 @@ class Reading:
     """One sample of one sensor.
 
     Attributes:
-        sensor: one of `SENSORS`.
+        sensor: one of `SENSORS`, or `ORIENTATION`.
         time_ns: on the device's clock [ns].
-        value: [rad/s] or [m/s^2].
+        value: [rad/s] or [m/s^2]; of an attitude the unit vector up, in B.
     """
 
     sensor: str
@@ -147,14 +150,29 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
     if not isinstance(name, str):
         raise InputError(f"{where}.name", _kind(name), "the name of a sensor")
     sensor = name.lower()
+    values = entry.get("values", entry)
+    if sensor == ORIENTATION:
+        return _vertical(entry.get("time"), values)
     if sensor not in SENSORS:
         return None
-    values = entry.get("values", entry)
     return Reading(
         sensor,
         _nanoseconds(f"{where}.time", entry.get("time")),
         _axes(f"{where}.values", _object(f"{where}.values", values)),
     )
+
+
+def _vertical(time: Any, values: Any) -> Reading | None:
+    """Up as the phone knows it; None where it does not tell, for no track needs it."""
+    try:
+        x, y, z, w = (_number("q", values.get(f"q{axis}")) for axis in "xyzw")
+        time_ns = _nanoseconds("time", time)
+    except (InputError, AttributeError):
+        return None
+    if abs(x * x + y * y + z * z + w * w - 1.0) > _UNIT:
+        return None
+    up_B = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    return Reading(ORIENTATION, time_ns, up_B)
 
 
 def _together(where: str, readings: list[Reading]) -> list[Reading]:

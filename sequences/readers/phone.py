@@ -41,7 +41,12 @@ from stario.sequences.readers.sensor_table import (
     read_samples,
     sensor_table,
 )
-from stario.sequences.readers.sensor_words import Sensor, is_sensor_word, words_of
+from stario.sequences.readers.sensor_words import (
+    Sensor,
+    is_sensor_word,
+    without_sensor,
+    words_of,
+)
 from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
@@ -66,7 +71,7 @@ def read_phone(path: Path) -> ImuSequence:
     """
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
-    name = folder.resolve().name if path.is_dir() else files.key.replace(" ", "_") or path.stem
+    name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
     return assembled(folder, name, files, pose_files(folder, files.key))
 
 

@@ -60,7 +60,16 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
 
 
 def lone_sensors(path: Path) -> list[Sensor]:
-    """The sensors of a folder or a wide file that lacks a gyroscope or an accelerometer."""
+    """The sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
+
+    Empty where it holds both, or neither.
+    """
+    sensors = _sensors(path)
+    whole = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
+    return [] if whole else sensors
+
+
+def _sensors(path: Path) -> list[Sensor]:
     tables: list[tuple[Sensor | None, SensorTable | None]]
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if _may_hold(file)]

@@ -101,6 +101,12 @@ def is_sensor_word(word: str) -> bool:
     return _sensor(word) is not None or word.startswith(variants)
 
 
+def without_sensor(stem: str) -> str:
+    """What a file's name says besides its sensor, as it is spelt: `Eight_gyr` becomes `Eight`."""
+    kept = _WORD.sub(lambda match: "" if is_sensor_word(match[0].lower()) else match[0], stem)
+    return re.sub(r"[_\W]*$|^[_\W]*", "", re.sub(r"([_\W])[_\W]+", r"\1", kept))
+
+
 def is_uncalibrated(words: Iterable[str]) -> bool:
     """Whether words tell of a sensor's raw variant."""
     return any(word.startswith(("uncal", "raw")) for word in words)

@@ -225,7 +225,9 @@ def _lag(
         speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
         # Glitches are rare but huge: compare where the two do not contradict each other grossly.
         use = good & (np.abs(speed_V - speed_B) < 3.0)
-        return float(np.corrcoef(speed_V[use], speed_B[use])[0, 1]) if use.sum() > 2 else 0.0
+        if use.sum() < 3 or min(np.ptp(speed_V[use]), np.ptp(speed_B[use])) == 0.0:
+            return 0.0
+        return float(np.corrcoef(speed_V[use], speed_B[use])[0, 1])
 
     return _best_lag(score, max_lag)
 

@@ -26,7 +26,7 @@ from stario.sequences.simulation.walks import generate_walk
 
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
-    return simulate_imu(generate_walk(3, 75.0), 100.0, PERFECT_IMU, 3, name="walk")
+    return simulate_imu(generate_walk(9, 75.0), 100.0, PERFECT_IMU, 3, name="walk")
 
 
 def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:

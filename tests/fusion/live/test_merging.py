@@ -1,6 +1,7 @@
 """Sensors with their own clocks become samples at the gyroscope's times, however they arrive."""
 
 import csv
+import json
 import os
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stario.fusion.live.merging import LONGEST_WAIT, Join, Merger
-from stario.fusion.live.payload import GYRO, TOTAL, Reading
+from stario.fusion.live.payload import GYRO, TOTAL, Reading, parse_push
 from stario.sequences import read_recording
 
 SECOND = 10**9
@@ -135,3 +136,21 @@ def test_a_real_walk_that_is_pushed_is_the_one_read_from_its_files():
     np.testing.assert_allclose([s[2] for s in samples], recording.accel, atol=1e-9)
     time = np.array([s[0] - samples[0][0] for s in samples]) / 1e9
     np.testing.assert_allclose(time, recording.time - recording.time[0], atol=1e-6)
+
+
+@pytest.mark.skipif(
+    not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
+)
+def test_a_real_phones_force_points_up_by_its_own_attitude():
+    folder = SENSOR_LOGGER.parent / "shopping_mall_eight"
+    payload = []
+    for file in ("Gyroscope", "TotalAcceleration", "Orientation"):
+        with (folder / f"{file}.csv").open() as table:
+            for _, row in zip(range(120), csv.DictReader(table), strict=False):
+                values = {
+                    key: float(row[key]) for key in row if key in {*"xyz", "qx", "qy", "qz", "qw"}
+                }
+                payload.append({"name": file, "time": row["time"], "values": values})
+    merger = Merger()
+    merger.add(parse_push(json.dumps({"deviceId": "d", "payload": payload}).encode()).readings)
+    assert merger.upward > 0.9

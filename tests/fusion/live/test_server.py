@@ -287,7 +287,7 @@ def test_viewers_are_sent_what_is_new_and_all_of_it_after_a_change(client, hub, 
 
 
 def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, monkeypatch):
-    from stario.fusion.live import session as module
+    from stario.fusion.live import drawn as module
 
     monkeypatch.setattr(module, "MOST_POINTS", 50)
     drawn, navigator = module.Drawn(), new_navigator()
@@ -298,3 +298,21 @@ def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, 
             assert len(drawn.points) <= 50
     assert drawn.revision >= 1
     assert drawn.points[-1][0] == pytest.approx(navigator.state.time)
+
+
+@pytest.mark.parametrize(("unit", "told"), [("m/s2", True), ("-m/s2", False)])
+def test_apples_sign_that_is_not_told_shows_by_the_phones_own_attitude(
+    client, hub, walk, pushes, unit, told
+):
+    attitude = walk.truth.at(walk.time[:300]).attitude_WB.as_quat()
+    for k, body in enumerate(pushes(seconds=3.0)):
+        message = json.loads(body)
+        for entry in message["payload"]:
+            if entry["name"] == "totalacceleration":
+                entry["values"] = {axis: -value for axis, value in entry["values"].items()}
+        quat = dict(zip(("qx", "qy", "qz", "qw"), attitude[20 * k].tolist(), strict=True))
+        time = message["payload"][0]["time"]
+        message["payload"].append({"name": "orientation", "time": time, "values": quat})
+        assert client.post(f"/data?accel_unit={unit}", content=json.dumps(message)).is_success
+    problem = hub.sessions["phone"].status()["problem"]
+    assert ("accel_unit=-m/s2" in problem) == told

@@ -223,7 +223,7 @@ def test_prefixed_files_of_two_recordings_are_two(tmp_path, formats) -> None:
     found = find_recordings(tmp_path)
     assert found == [tmp_path / "s/Two_gyr.csv", tmp_path / "s/one_gyr.csv"]
     two, one = map(read_recording, found)
-    assert (two.name, one.name) == ("two", "one")
+    assert (two.name, one.name) == ("Two", "one")
     assert (two.gyro == 1.0).all()
     assert np.array_equal(one.gyro, formats.walk(100.0, 3.0).gyro)
 
