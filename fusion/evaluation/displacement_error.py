@@ -32,6 +32,9 @@ BLOCK_SECONDS = 30.0
 STRETCH_SECONDS = 20
 """Length of the stretches of which `stretch_percent` is the error."""
 
+_LEAST_PAIRS = 20
+"""Displacements of which a recording's error over a horizon is told."""
+
 _LEG = round(2.0 / TICK_SECONDS)
 
 Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
@@ -94,6 +97,8 @@ class _Sums:
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
         """Errors (K,) by start tick, nan where not known."""
+        if np.isfinite(errors).sum() < _LEAST_PAIRS:
+            return
         self.add(measure, errors)
         per_block = round(BLOCK_SECONDS / TICK_SECONDS)
         squares = np.nan_to_num(errors**2)

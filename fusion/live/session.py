@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stario.fusion.filter.map_frame import KNOWN_YAW
 from stario.fusion.fixes import position_fix
+from stario.fusion.live.drawn import Drawn
 from stario.fusion.live.merging import Merger
 from stario.fusion.live.payload import Batch
 from stario.fusion.live.storage import LiveFile
@@ -20,15 +18,6 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import findings
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import yaw_of
-from stario.sequences.sequence import FloatArray
-
-Point = list[float]
-"""t [s], x, y, z [m], speed [m/s], yaw [deg], the horizontal covariance's xx, xy, yy [m^2], and
-the standard deviation of yaw [deg]."""
-
-MOST_POINTS = 20_000
-"""Kept of a track; beyond, every second one is forgotten, since memory must not grow."""
 
 BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
 """A jump of the device's clock beyond these [ns] begins a new track."""
@@ -37,55 +26,6 @@ _HEALTH_SECONDS = 1.0
 
 _SURE = 0.7
 """Cosine between up and the force from which its sign is known."""
-
-_GAP_SECONDS = 0.5
-"""States come ten times a second; further apart, samples were missing."""
-
-
-@dataclass
-class Drawn:
-    """A track as it is drawn.
-
-    Attributes:
-        points: thinned where there are many.
-        revision: goes up whenever earlier points changed.
-        origin: (3,) what is drawn as zero [m].
-        map_frame: of the newest states.
-        since: index of the first point that fixes still move: behind a gap in which the direction
-            was lost, what was before stays where it is.
-    """
-
-    points: list[Point] = field(default_factory=list)
-    revision: int = 0
-    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
-    map_frame: int = 0
-    since: int = 0
-
-    def add(self, state: NavState) -> None:
-        """The newest state."""
-        behind_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
-        if behind_gap and state.covariance[2, 2] > KNOWN_YAW**2:
-            self.since = len(self.points)
-        self.points.append(point_of(state))
-        if len(self.points) > MOST_POINTS:
-            self.points, self.since = self.points[::2], self.since // 2
-            self.revision += 1
-
-    def move(self, before: NavState, after: NavState) -> None:
-        """The map frame moved and turned: `before` became `after`, and so do earlier points."""
-        turn = float(yaw_of(Rotation.from_matrix(after.R_WB @ before.R_WB.T))[0])
-        R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-        shift = after.p_W[:2] - R @ before.p_W[:2]
-        rise = after.p_W[2] - before.p_W[2]
-        table = np.array(self.points[self.since :]).reshape(-1, 10)
-        table[:, 1:3] = table[:, 1:3] @ R.T + shift
-        table[:, 3] += rise
-        table[:, 5] = (table[:, 5] + math.degrees(turn) + 180.0) % 360.0 - 180.0
-        P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
-        table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
-        self.points = self.points[: self.since] + table.tolist()
-        self.revision += 1
-        self.map_frame = after.map_frame
 
 
 class Session:
@@ -107,7 +47,7 @@ class Session:
         self.samples = self.ignored = self.fixes = 0
         self.received = 0.0
         self.rate, self._factor = 0.0, 1.0
-        self._revisions = 0
+        self._file: LiveFile | None = None
         self._begin("")
 
     def _begin(self, recording: str) -> None:
@@ -115,13 +55,10 @@ class Session:
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
         self._words_at = -math.inf
-        self._revisions = self.drawn.revision + 1
-        self.drawn = Drawn(revision=self._revisions)
+        self.drawn = Drawn(revision=self.drawn.revision + 1)
         self.problem, self.words = "", []
         self.samples = self.fixes = 0
         self.rate = 0.0
-
-    _file: LiveFile | None
 
     @property
     def path(self) -> Path | None:
@@ -276,18 +213,3 @@ class Session:
         if state is None:
             raise InputError(self.device, "no position yet", "a second of samples first")
         return state
-
-
-def point_of(state: NavState) -> Point:
-    """What is drawn of a state, rounded to what a screen shows."""
-    P = state.covariance
-    values = (
-        *state.p_W,
-        float(np.linalg.norm(state.v_W)),
-        math.degrees(float(yaw_of(Rotation.from_matrix(state.R_WB))[0])),
-        P[6, 6],
-        P[6, 7],
-        P[7, 7],
-        math.degrees(math.sqrt(P[2, 2])),
-    )
-    return [round(state.time, 4), *(round(float(value), 5) for value in values)]

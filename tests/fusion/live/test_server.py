@@ -287,7 +287,7 @@ def test_viewers_are_sent_what_is_new_and_all_of_it_after_a_change(client, hub, 
 
 
 def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, monkeypatch):
-    from stario.fusion.live import session as module
+    from stario.fusion.live import drawn as module
 
     monkeypatch.setattr(module, "MOST_POINTS", 50)
     drawn, navigator = module.Drawn(), new_navigator()
