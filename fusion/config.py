@@ -9,13 +9,13 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import ConfigError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.settings import with_settings
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATE_RATES = (1, 2, 5, 10, 20)
@@ -142,32 +142,6 @@ class NavigatorConfig:
             raise ConfigError("gravity", repr(self.gravity), "9.5 to 10.1 m/s^2")
 
 
-_GROUPS: dict[str, type] = {"noise": ImuNoise, "filter": FilterConfig, "graph": GraphConfig}
-
-
-def config_from_dict(values: dict[str, Any]) -> NavigatorConfig:
-    """A configuration from plain values; what is not given keeps its default.
-
-    Raises:
-        ConfigError: a key is unknown or a value does not fit.
-    """
-    _refuse_unknown("", values, NavigatorConfig)
-    default = NavigatorConfig()
-    arguments: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in _GROUPS:
-            if not isinstance(value, dict):
-                raise ConfigError(name, repr(value), "a table of values")
-            _refuse_unknown(f"{name}.", value, _GROUPS[name])
-            for key, entry in value.items():
-                _check_type(f"{name}.{key}", entry, getattr(getattr(default, name), key))
-            value = _built(_GROUPS[name], {**asdict(getattr(default, name)), **value}, name)
-        else:
-            _check_type(name, value, getattr(default, name))
-        arguments[name] = value
-    return NavigatorConfig(**arguments)
-
-
 def read_config(path: Path | str) -> NavigatorConfig:
     """A configuration from a TOML or JSON file.
 
@@ -187,24 +161,4 @@ def read_config(path: Path | str) -> NavigatorConfig:
         raise ConfigError(str(path), str(error), "a TOML or JSON file") from error
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of values")
-    return config_from_dict(values)
-
-
-def _built(group: type, values: dict[str, Any], name: str) -> Any:
-    try:
-        return group(**values)
-    except InputError as error:
-        raise ConfigError(f"{name}.{error.field}", error.found, error.expected) from error
-
-
-def _check_type(name: str, value: object, default: object) -> None:
-    wanted = (int, float) if isinstance(default, float) else type(default)
-    if not isinstance(value, wanted) or isinstance(value, bool) != isinstance(default, bool):
-        raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
-
-
-def _refuse_unknown(prefix: str, values: dict[str, Any], group: type) -> None:
-    known = [f.name for f in fields(group)]
-    for name in values:
-        if name not in known:
-            raise ConfigError(f"{prefix}{name}", "an unknown key", f"one of {', '.join(known)}")
+    return with_settings(NavigatorConfig(), values)

@@ -12,6 +12,7 @@ from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.graph.builder import GraphBuilder
+from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
@@ -42,6 +43,7 @@ def smooth(
     measurements: Sequence[IntervalMeasurements],
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
+    gyro_bias: tuple[FloatArray, FloatArray] | None = None,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
@@ -51,6 +53,8 @@ def smooth(
         measurements: what the filter took in, interval by interval.
         transforms: of the frame since the start.
         config: noise, filter and graph settings.
+        gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as the filter knows it by the
+            magnetic field, which the graph does not see; None without one.
 
     Returns:
         The graph's states with their marginal covariances; those given where the graph does not
@@ -63,6 +67,8 @@ def smooth(
         near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
         builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
     builder.close(local[-1])
+    if gyro_bias is not None:
+        builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from torch import Tensor
 from stario.network.architectures import ARCHITECTURES
 from stario.network.training.augment import Augmentation
 from stario.sequences.errors import ConfigError
+from stario.sequences.settings import with_settings
 from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
@@ -178,19 +179,6 @@ def training_config(values: dict[str, object]) -> TrainingConfig:
     Raises:
         ConfigError: a key is unknown or a value out of range.
     """
-    known = {f.name for f in fields(TrainingConfig)}
-    for name in values:
-        if name not in known:
-            raise ConfigError(name, "unknown key", f"one of {', '.join(sorted(known))}")
     architecture = values.get("architecture", TrainingConfig.architecture)
-    values = {**NETWORK_SETTINGS.get(str(architecture), {}), **values}
-    augmentation = values.pop("augmentation", {})
-    if not isinstance(augmentation, dict):
-        raise ConfigError("augmentation", repr(augmentation), "a table of values")
-    allowed = {f.name for f in fields(Augmentation)}
-    for name in augmentation:
-        if name not in allowed:
-            raise ConfigError(f"augmentation.{name}", "unknown key", f"one of {sorted(allowed)}")
-    if isinstance(augmentation.get("speeds"), list):
-        augmentation = {**augmentation, "speeds": tuple(augmentation["speeds"])}
-    return TrainingConfig(augmentation=Augmentation(**augmentation), **values)  # type: ignore[arg-type]
+    own = NETWORK_SETTINGS.get(str(architecture), {})
+    return with_settings(TrainingConfig(), {**own, **values})

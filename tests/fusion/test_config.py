@@ -10,12 +10,12 @@ from stario.fusion.config import (
     UPDATE_RATES,
     FilterConfig,
     NavigatorConfig,
-    config_from_dict,
     read_config,
 )
 from stario.sequences.errors import ConfigError, StarioError
 from stario.sequences.files import write_json
 from stario.sequences.noise import ImuNoise
+from stario.sequences.settings import with_settings
 
 TOML = """
 gravity = 9.81
@@ -85,7 +85,7 @@ def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
 )
 def test_what_does_not_fit_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        config_from_dict(values)
+        with_settings(NavigatorConfig(), values)
     assert caught.value.field == named
     assert "\n" not in str(caught.value)
 

@@ -13,7 +13,7 @@ from support import GRAPH as CONFIG
 from support import Broken, ate
 
 from stario.fusion import Navigator
-from stario.fusion.config import NavigatorConfig, config_from_dict
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.backends import score_walk, summary
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
@@ -25,6 +25,7 @@ from stario.sequences.metrics import position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.settings import with_settings
 
 Make = Callable[..., Any]
 
@@ -209,7 +210,7 @@ def test_an_unknown_back_end_is_refused_by_name(still_model: Any) -> None:
 @pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
 def test_a_lag_out_of_bounds_is_refused(lag: float) -> None:
     with pytest.raises(ConfigError, match=r"graph\.lag"):
-        config_from_dict({"graph": {"lag": lag}})
+        with_settings(NavigatorConfig(), {"graph": {"lag": lag}})
 
 
 # --- fixes -----------------------------------------------------------------------------------

@@ -318,9 +318,9 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
         ({"architecture": "Star"}, "architecture"),
         ({"seed": -1}, "seed"),
         ({"dropout": "no"}, "dropout"),
-        ({"augmentation": {"speeds": 3}}, "speeds"),
-        ({"augmentation": {"speeds": [1]}}, "speeds"),
-        ({"augmentation": {"speeds": ["slow", "fast"]}}, "speeds"),
+        ({"augmentation": {"speeds": 3}}, "augmentation.speeds"),
+        ({"augmentation": {"speeds": [1]}}, "augmentation.speeds"),
+        ({"augmentation": {"speeds": ["slow", "fast"]}}, "augmentation.speeds"),
     ],
 )
 def test_a_recipe_that_does_not_fit_is_refused(values: dict[str, object], field: str) -> None:

@@ -1,0 +1,47 @@
+"""Settings from a file: groups of fields with defaults, checked field by field."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+from stario.sequences.errors import ConfigError, InputError
+
+Group = TypeVar("Group")
+
+
+def with_settings(default: Group, values: object, name: str = "") -> Group:
+    """A frozen dataclass with some of its values replaced, groups within it likewise.
+
+    Args:
+        default: of which every value not given is kept; its own checks see the result.
+        values: a parsed TOML table or JSON object.
+        name: of the group, for messages.
+
+    Raises:
+        ConfigError: it is no table, a key is unknown, or a value does not fit.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(name, repr(values), "a table of values")
+    known = {item.name: getattr(default, item.name) for item in fields(default)}  # type: ignore[arg-type]
+    prefix, given = f"{name}." if name else "", {}
+    for key, value in values.items():
+        if key not in known:
+            raise ConfigError(f"{prefix}{key}", "an unknown key", f"one of {', '.join(known)}")
+        given[key] = _fitting(f"{prefix}{key}", value, known[key])
+    try:
+        return replace(default, **given)  # type: ignore[type-var]
+    except InputError as error:
+        raise ConfigError(f"{prefix}{error.field}", error.found, error.expected) from error
+
+
+def _fitting(name: str, value: Any, default: Any) -> Any:
+    if is_dataclass(default):
+        return with_settings(default, value, name)
+    if isinstance(default, tuple) and isinstance(value, list):
+        return tuple(value)
+    wanted = (float, int) if isinstance(default, float) else (type(default),)
+    # What defaults to nothing may be anything: the group's own checks decide.
+    if default is not None and type(value) not in wanted:
+        raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
+    return value
