@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from stario.fusion.config import GraphConfig as GraphConfig
     from stario.fusion.config import NavigatorConfig as NavigatorConfig
     from stario.fusion.config import read_config as read_config
+    from stario.fusion.continuous import ContinuousPose as ContinuousPose
     from stario.fusion.evaluation.compare import Comparison as Comparison
     from stario.fusion.evaluation.compare import compare as compare
     from stario.fusion.evaluation.compare import demonstration as demonstration
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Comparison": "evaluation.compare",
+    "ContinuousPose": "continuous",
     "FilterConfig": "config",
     "Fix": "fixes",
     "GraphConfig": "config",

@@ -125,9 +125,12 @@ class GraphBackend:
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """The whole optimised at once; the filter's states where that is not determined."""
-        transforms, states = filtered.estimator.frames.transforms, nav_states(filtered.estimates)
+        estimator = filtered.estimator
+        transforms, states = estimator.frames.transforms, nav_states(filtered.estimates)
+        end, seen = states[-1], estimator.ekf.state.field is not None
+        bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
         own = in_last_frame(states, transforms)
-        whole = smooth(own, states[0], filtered.measurements, transforms, config)
+        whole = smooth(own, states[0], filtered.measurements, transforms, config, bias)
         return Solution(own if whole.fell_back else whole.states, None, [whole.note])
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.continuous import ContinuousPose, advanced
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.front_end import FrontEnd
@@ -68,6 +69,7 @@ class Navigator:
         self.config = config or NavigatorConfig()
         self._fixes = FixQueue()
         self._estimator: StreamEstimator | None
+        self._continuous: ContinuousPose | None
         self._front_end: FrontEnd
         self._begin_stream()
 
@@ -151,6 +153,11 @@ class Navigator:
         return None if self._estimator is None else self._estimator.nav_state()
 
     @property
+    def continuous(self) -> ContinuousPose | None:
+        """The newest pose without the steps of updates; None before the first second is over."""
+        return self._continuous
+
+    @property
     def smoothed(self) -> SmoothedPose | None:
         """The stream's newest pose one window (1 s) late, corrected by all measured since.
 
@@ -181,6 +188,7 @@ class Navigator:
                 "front end": self._front_end,
                 "fixes": self._fixes,
                 "network": self._network.memory,
+                "continuous": self._continuous,
                 "estimator": None if self._estimator is None else self._estimator.state,
             }
         )
@@ -208,6 +216,7 @@ class Navigator:
             estimator.state = tree["estimator"]
         self.prior, self._fixes, self._front_end = prior, tree["fixes"], front_end
         self._network, self._estimator = network, estimator
+        self._continuous = tree["continuous"]
 
     def run(
         self, sequence: ImuSequence, progress: Progress = _silent, fixes: Iterable[Fix] = ()
@@ -249,6 +258,7 @@ class Navigator:
     def _begin_stream(self) -> None:
         self._front_end = FrontEnd(self.config)
         self._estimator = None
+        self._continuous = None
         self._network = self._new_inference()
 
     def _new_inference(self) -> StatefulInference:
@@ -265,7 +275,9 @@ class Navigator:
         if interval.window is not None:
             (displacement,) = displacements_of(self._network, [interval], self._front_end.counts)
         self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
-        return self._estimator.nav_state()
+        state = self._estimator.nav_state()
+        self._continuous = advanced(self._continuous, state)
+        return state
 
     def _take(self, fix: Fix) -> None:
         if self._estimator is None or fix.fault() or fix.time > self._estimator.time:

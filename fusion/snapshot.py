@@ -15,6 +15,7 @@ infinity are written as NaN and Infinity. The tree holds
     prior      what was known of the first pose, or null
     front end  samples, windows and counts
     network    what the network remembers of earlier windows, or null
+    continuous the pose without steps, or null
     fixes      those that wait, and counts of those refused
     estimator  the back end's state, or null before the first second is over
 
@@ -40,7 +41,7 @@ FORMAT, VERSION = "stario snapshot", 7
 @cache
 def _classes() -> dict[str, type]:
     """Every class that a snapshot may hold: plain data, made anew from its attributes."""
-    from stario.fusion import config, fixes
+    from stario.fusion import config, continuous, fixes
     from stario.fusion.filter import (
         ekf_state,
         estimate,
@@ -70,6 +71,7 @@ def _classes() -> dict[str, type]:
             estimator_state.EstimatorState,
             estimator_state.Step,
         ),
+        continuous.ContinuousPose,
         *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
         *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
         *(keyframes.KeyframeGraph, whitening.Whitened, factors.KeyframeState),

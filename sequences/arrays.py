@@ -11,6 +11,13 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
+def correlation(x: FloatArray, y: FloatArray) -> float:
+    """Pearson's correlation of two arrays of one shape; 0 where one is constant or too short."""
+    if x.size < 3 or min(np.ptp(x), np.ptp(y)) == 0.0:
+        return 0.0
+    return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Times (N,) [s] that are finite and strictly increase.
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stario.sequences.arrays import correlation
 from stario.sequences.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, unbroken
@@ -152,7 +153,7 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         return None
     turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
     seen = _against_gyro(time, gyro, stamps, values) if turning > _TURNING_RAD_S else None
-    correlation, lag, iron, sigma = seen or (None, None, None, None)
+    agreement, lag, iron, sigma = seen or (None, None, None, None)
     taken = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
     nearest = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[nearest]
@@ -167,7 +168,7 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         size_uT=median,
         spread_uT=(low, high),
         dip_rad=float(np.median(np.arctan2(-field_N[:, 2], level))),
-        correlation=correlation,
+        correlation=agreement,
         lag_s=lag,
         hard_iron_uT=iron,
         hard_iron_sigma_uT=sigma,
@@ -202,7 +203,7 @@ def _against_gyro(
         # Neighbours share half their span and disturbances last: a tenth of the rows count.
         spread = np.sqrt(10.0 * float(left.var()) * np.diag(np.linalg.inv(normal)))
         seen = -np.cross(rate, mean - iron).ravel()
-        return float(np.corrcoef(change.ravel(), seen)[0, 1]), iron, np.asarray(spread, np.float64)
+        return correlation(change.ravel(), seen), iron, np.asarray(spread, dtype=np.float64)
 
     scores = np.array([fit(lag)[0] for lag in _LAGS_S])
     best = int(np.argmax(scores))
@@ -210,8 +211,8 @@ def _against_gyro(
     if 0 < best < len(scores) - 1:
         a, b, c = scores[best - 1 : best + 2]
         lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
-    correlation, iron, spread = fit(lag)
-    return correlation, lag, iron, spread
+    agreement, iron, spread = fit(lag)
+    return agreement, lag, iron, spread
 
 
 def _at(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:

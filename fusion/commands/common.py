@@ -7,7 +7,7 @@ import sys
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -140,12 +140,21 @@ class Estimating:
     model: Annotated[
         str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
     ] = "default"
+    magnetometer: Annotated[
+        bool,
+        typer.Option(
+            "--magnetometer/--no-magnetometer", help="Use the magnetic field where there is one."
+        ),
+    ] = True
 
     def settings(self) -> NavigatorConfig:
         """The filter's settings."""
         from stario.fusion.config import NavigatorConfig, read_config
 
-        return NavigatorConfig() if self.config is None else read_config(self.config)
+        config = NavigatorConfig() if self.config is None else read_config(self.config)
+        if self.magnetometer:
+            return config
+        return replace(config, filter=replace(config.filter, magnetometer=False))
 
     def network(self) -> DisplacementModel:
         """The network with its weights."""

@@ -12,6 +12,7 @@ from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.graph.builder import GraphBuilder
+from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import Segment
@@ -43,6 +44,7 @@ def smooth(
     measurements: Sequence[IntervalMeasurements],
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
+    gyro_bias: tuple[FloatArray, FloatArray] | None = None,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
@@ -52,6 +54,8 @@ def smooth(
         measurements: what the filter took in, interval by interval.
         transforms: of the frame since the start.
         config: noise, filter and graph settings.
+        gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as the filter knows it by the
+            magnetic field, which the graph does not see; None without one.
 
     Returns:
         The graph's states with their marginal covariances; those given where the graph does not
@@ -64,6 +68,8 @@ def smooth(
         near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
         builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
     builder.close(local[-1])
+    if gyro_bias is not None:
+        builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:

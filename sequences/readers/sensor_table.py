@@ -134,7 +134,13 @@ def read_samples(
     used = [table.clock, *places, *table.biases]
     indices = [place.index for place in used]
     rows = read_table(
-        table.file, max(indices) + 1, table.skip, table.delimiter, indices, table.decimal
+        table.file,
+        max(indices) + 1,
+        table.skip,
+        table.delimiter,
+        indices,
+        table.decimal,
+        killed=True,
     )
     kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
@@ -175,7 +181,13 @@ def read_quaternion(
     """
     indices = [place.index for place in (table.clock, *table.quaternion)]
     rows = read_table(
-        table.file, max(indices) + 1, table.skip, table.delimiter, indices, table.decimal
+        table.file,
+        max(indices) + 1,
+        table.skip,
+        table.delimiter,
+        indices,
+        table.decimal,
+        killed=True,
     )
     if per_second is None or table.clock.unit:
         per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)

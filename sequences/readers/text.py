@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
 from stario.sequences.sequence import FloatArray
+
+_log = logging.getLogger(__name__)
 
 IntArray = NDArray[np.int64]
 
@@ -172,6 +175,7 @@ def read_table(
     delimiter: str | None = ",",
     used: list[int] | None = None,
     decimal: str = ".",
+    killed: bool = False,
 ) -> Table:
     """Rows of numbers; `nan` and empty cells become NaN.
 
@@ -182,13 +186,14 @@ def read_table(
         delimiter: between the cells; None for blanks.
         used: the columns to return, in this order; all if None.
         decimal: what separates a number's fraction, a point or a comma.
+        killed: do without a last row that is cut short: the app was killed while it wrote.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if used is None else used
     return read_quickly(path, skip, delimiter, wanted, decimal) or _read_carefully(
-        path, columns, skip, delimiter, wanted, decimal
+        path, columns, skip, delimiter, wanted, decimal, killed
     )
 
 
@@ -237,6 +242,7 @@ def _read_carefully(
     delimiter: str | None,
     wanted: list[int],
     decimal: str = ".",
+    killed: bool = False,
 ) -> Table:
     lines = read_lines(path)
     if decimal != ".":
@@ -244,6 +250,9 @@ def _read_carefully(
     numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    if killed and len(numbered) > 1 and len(numbered[-1][1].split(delimiter)) < columns:
+        _log.warning("%s: the last row is cut short and left out", path)
+        numbered.pop()
     rows = [line for _, line in numbered]
     try:
         with warnings.catch_warnings():

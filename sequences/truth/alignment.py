@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import correlation
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -225,9 +226,7 @@ def _lag(
         speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
         # Glitches are rare but huge: compare where the two do not contradict each other grossly.
         use = good & (np.abs(speed_V - speed_B) < 3.0)
-        if use.sum() < 3 or min(np.ptp(speed_V[use]), np.ptp(speed_B[use])) == 0.0:
-            return 0.0
-        return float(np.corrcoef(speed_V[use], speed_B[use])[0, 1])
+        return correlation(speed_V[use], speed_B[use])
 
     return _best_lag(score, max_lag)
 
@@ -245,8 +244,7 @@ def _lag_by_axes(
     def score(lag: float) -> float:
         measured = gyro_B.mean_rate(time + lag, stride)
         use = good & (np.linalg.norm(rates - measured, axis=1) < 3.0)
-        x, y = rates[use].ravel(), measured[use].ravel()
-        return float(np.corrcoef(x, y)[0, 1]) if len(x) > 2 else 0.0
+        return correlation(rates[use], measured[use])
 
     return _best_lag(score, _LEFT_LAG_S)
 
@@ -358,6 +356,4 @@ def _correlation(
     rates, good = _rates(time, attitude_WB, valid, stride)
     measured = gyro_B.mean_rate(time, stride)
     good &= np.linalg.norm(rates - measured, axis=1) < 3.0
-    if good.sum() < 2:
-        return 0.0
-    return float(np.corrcoef(rates[good].ravel(), measured[good].ravel())[0, 1])
+    return correlation(rates[good], measured[good])

@@ -215,8 +215,10 @@ def test_a_loggers_files_that_do_not_fit(tmp_path, walks, formats) -> None:
     path = formats.android(tmp_path / "log", walks(200.0)).path
     gyro = path / "Gyroscope.csv"
     lines = gyro.read_text().splitlines()
-    gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0]]))
+    gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0], *lines[51:]]))
     refused(path, "Gyroscope.csv: line 51: found 3 values, expected 5")
+    gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0]]))
+    assert len(read_recording(path)) == 49 - 15  # the app was killed; the other began later
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",nan", *lines[31:]]))
     refused(path, "Gyroscope.csv: row 31, x, y, z: found nan")
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",1e15", *lines[31:]]))

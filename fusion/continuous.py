@@ -1,0 +1,63 @@
+"""A continuous position beside the corrected one, for control and display (REP 105: odom to map).
+
+The corrected state steps at every update, as it should. The continuous position moves with the
+velocity alone; what it lacks to the corrected one is kept apart as `correction_W` and bled in
+slowly. README.md, "Continuous output".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.lie import FloatArray
+from stario.fusion.state import NavState
+
+LARGEST_STEP = 0.01
+"""Of the correction that is bled in from one state to the next [m]."""
+
+BLEED_SECONDS = 1.0
+"""Time constant in which a small correction is bled in [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousPose:
+    """A pose whose position does not step at updates.
+
+    Attributes:
+        time: [s].
+        p_W: (3,) position [m].
+        R_WB: (3, 3) attitude, that of the corrected state.
+        v_W: (3,) velocity of the corrected state [m/s].
+        correction_W: (3,) corrected minus continuous position, not bled in yet [m].
+        map_frame: as in `NavState`; where fixes moved the frame the position begins anew.
+    """
+
+    time: float
+    p_W: FloatArray
+    R_WB: FloatArray
+    v_W: FloatArray
+    correction_W: FloatArray
+    map_frame: int = 0
+
+
+def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
+    """The pose at the next state: moved by the mean velocity and a bounded part of the correction.
+
+    It begins at the corrected position, and anew where the frame was moved or behind a gap, over
+    which nothing is known of the motion.
+
+    Args:
+        before: the pose at the state before, None at first.
+        state: the newest one.
+    """
+    p_W = state.p_W
+    if before is not None and before.map_frame == state.map_frame and not state.in_gap:
+        dt = state.time - before.time
+        carried = before.p_W + 0.5 * dt * (before.v_W + state.v_W)
+        missing = state.p_W - carried
+        part = -math.expm1(-dt / BLEED_SECONDS) * missing
+        p_W = carried + part * min(1.0, LARGEST_STEP / max(float(np.linalg.norm(part)), 1e-12))
+    return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, state.p_W - p_W, state.map_frame)

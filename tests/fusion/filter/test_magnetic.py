@@ -1,0 +1,150 @@
+"""The field's bearing: what it tells of the gyroscope, what it must not tell, what it survives."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavState
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.jacobians import bearing_jacobian
+from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
+from stario.fusion.lie import exp_so3
+from stario.fusion.navigator import Navigator as Stream
+from stario.sequences.sequence import ImuSequence, Magnetometer
+from stario.sequences.simulation.imu import ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from tests.fusion.support import CONFIG, streamed_off
+
+FIELD_W = np.array([15.0, 12.0, -40.0])
+Make = Callable[..., Any]
+
+
+def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnetometer:
+    """The field of a place without steel, with a white noise of 1 uT."""
+    truth = sequence.truth
+    time = np.arange(truth.time[0], truth.time[-1], 1.0 / rate)
+    field = truth.at(time).attitude_WB.inv().apply(FIELD_W)
+    return Magnetometer(time, field + np.random.default_rng(seed).normal(size=field.shape))
+
+
+@pytest.fixture(scope="module")
+def biased_walk() -> ImuSequence:
+    """Two minutes with a gyroscope that drifts by a third of a degree a second."""
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4))
+    walk = generate_walk(3, 120.0, style=style)
+    clean = simulate_imu(walk, 100.0, ImuErrors(gyro_turn_on=1e-4, accel_turn_on=1e-2), 3)
+    sequence = replace(clean, gyro=clean.gyro + np.array([0.0, 0.0, 0.006]))
+    return replace(sequence, magnetometer=measured(sequence))
+
+
+def state() -> EkfState:
+    ekf = StateCloningEkf(2)
+    zero = np.zeros(3)
+    R_WB = exp_so3(np.array([0.3, -0.5, 1.2]))
+    ekf.initialise(0.0, R_WB, zero, np.array([3.0, 1.0, 0.0]), zero, zero, 0.01 * np.eye(15))
+    return first_field(ekf.state, R_WB.T @ FIELD_W)
+
+
+def test_bearing_jacobian_agrees_with_finite_differences() -> None:
+    R = exp_so3(np.array([0.3, -0.5, 1.2]))
+    hard_iron, step, n = np.array([3.0, -2.0, 1.0]), 1e-6, 32
+    m_B = R.T @ FIELD_W + hard_iron
+
+    def residual(error: np.ndarray) -> float:
+        """Azimuth minus bearing of the true state, seen from the estimate: what H is to tell."""
+        m_W = exp_so3(error[:3]) @ R @ (m_B - hard_iron - error[29:32])
+        return error[27] + error[28] - math.atan2(m_W[1], m_W[0])
+
+    numeric = [(residual(d) - residual(-d)) / (2.0 * step) for d in step * np.eye(n)]
+    H = np.zeros(n)
+    for first, block in bearing_jacobian(R, FIELD_W, 27):
+        H[first : first + block.shape[1]] += block[0]
+    np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+def test_yaw_and_azimuth_are_unobservable_together() -> None:
+    (_, by_theta), (_, by_field) = bearing_jacobian(np.eye(3), FIELD_W, 27)
+    assert by_theta[0, 2] + by_field[0, 0] == 0.0
+
+
+def test_a_turned_frame_turns_the_azimuth() -> None:
+    before = state()
+    turned = before.transformed(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([5.0, 0.0, 0.0]))
+    assert turned.field.azimuth - before.field.azimuth == pytest.approx(0.7)
+    np.testing.assert_allclose(
+        turned.R_WB @ before.R_WB.T @ FIELD_W, exp_so3(np.array([0.0, 0.0, 0.7])) @ FIELD_W
+    )
+
+
+def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
+    ekf = StateCloningEkf(2)
+    ekf.state = state()
+    yaw_variance, reference = ekf.state.P[2, 2], MagneticReference()
+    for _ in range(20):
+        m_B = ekf.state.R_WB.T @ FIELD_W
+        _, reference = update_bearing(ekf, reference, m_B)
+    assert ekf.state.P[2, 2] > 0.99 * yaw_variance
+
+
+def test_a_field_of_another_size_counts_for_less() -> None:
+    reference = MagneticReference()
+    for k in range(20):
+        reference = reference.seen(0.5 * k, 45.0, 1.0)
+    gains = []
+    for scale in (1.0, 1.5):
+        ekf = StateCloningEkf(2)
+        ekf.state = state()
+        m_B = exp_so3(np.array([0.0, 0.0, 0.2])) @ ekf.state.R_WB.T @ FIELD_W * scale
+        update_bearing(ekf, replace(reference, size=float(np.linalg.norm(FIELD_W))), m_B)
+        gains.append(float(np.trace(ekf.state.P[27:, 27:])))
+    assert gains[1] > gains[0]
+
+
+def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
+    ends = []
+    for s in (states[0], states[-1]):
+        R = s.R_WB @ sequence.truth.at(np.array([s.time])).attitude_WB.as_matrix()[0].T
+        ends.append(math.atan2(R[1, 0], R[0, 0]))
+    return abs(math.remainder(ends[1] - ends[0], 2.0 * math.pi))
+
+
+def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Make) -> None:
+    """In a stream as in a batch; without it the yaw drifts, a magnet beside the device is found."""
+    oracle = make_oracle(biased_walk, biased_walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    track = Navigator(oracle, CONFIG).run(biased_walk)
+    blind = Navigator(oracle, CONFIG).run(replace(biased_walk, magnetometer=None))
+    assert abs(track.b_g[-1, 2] - 0.006) < 3.0 * np.sqrt(track.covariance[-1, 11, 11])
+    assert abs(track.b_g[-1, 2] - 0.006) < 0.65 * abs(blind.b_g[-1, 2] - 0.006)
+    assert track.health.bearings["applied"] > 200
+    assert blind.health.bearings == {}
+
+    navigator, states, fields = Stream(oracle, CONFIG), [], biased_walk.magnetometer
+    waiting = list(zip(fields.time.tolist(), fields.field, strict=True))
+    for row in zip(biased_walk.time, biased_walk.gyro, biased_walk.accel, strict=True):
+        while waiting and waiting[0][0] <= row[0]:
+            navigator.push_magnetometer(*waiting.pop(0))
+        states.append(navigator.push(*row))
+    states = [s for s in states if s is not None]
+    assert streamed_off(states, track) < 1e-6
+    assert last_yaw_error(states, biased_walk) < math.radians(20.0)
+
+
+def test_what_is_no_field_is_dropped_and_counted(still_model: Any) -> None:
+    navigator = Navigator(still_model, CONFIG)
+    for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):
+        navigator.push_magnetometer(time, field)
+    assert navigator._front_end.counts.field_dropped == 2
+
+
+def test_switched_off_it_changes_nothing(biased_walk: ImuSequence, make_oracle: Make) -> None:
+    short = biased_walk.slice(0.0, 10.0)
+    off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))
+    oracle = make_oracle(short, biased_walk.truth, CONFIG)
+    blind = Navigator(oracle, CONFIG).run(replace(short, magnetometer=None))
+    without = Navigator(oracle, off).run(short)
+    np.testing.assert_array_equal(without.trajectory.position_W, blind.trajectory.position_W)

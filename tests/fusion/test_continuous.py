@@ -1,0 +1,53 @@
+"""The continuous position: it never steps, and it arrives."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from stario.fusion import Navigator, NavState
+from stario.fusion.continuous import LARGEST_STEP, ContinuousPose, advanced
+from stario.sequences.sequence import ImuSequence
+from tests.fusion.support import CONFIG
+
+Make = Callable[..., Any]
+
+
+def at(time: float, x: float, map_frame: int = 0) -> NavState:
+    zero, v_W = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    p_W = np.array([time + x, 0.0, 0.0])
+    return NavState(time, np.eye(3), v_W, p_W, zero, zero, np.eye(15), False, map_frame)
+
+
+def test_a_step_is_bled_in_a_centimetre_at_a_time() -> None:
+    pose = advanced(None, at(0.0, 0.0))
+    lacking = []
+    for k in range(1, 101):
+        before, pose = pose, advanced(pose, at(0.1 * k, 0.5))
+        assert abs(pose.p_W[0] - before.p_W[0] - 0.1) < LARGEST_STEP + 1e-12
+        np.testing.assert_allclose(pose.p_W + pose.correction_W, at(0.1 * k, 0.5).p_W)
+        lacking.append(pose.correction_W[0])
+    assert (np.diff(lacking) < 0.0).all()
+    assert lacking[-1] < 0.01
+
+
+def test_where_fixes_move_the_frame_it_begins_anew() -> None:
+    pose = advanced(advanced(None, at(0.0, 0.0)), at(0.1, 100.0, map_frame=1))
+    np.testing.assert_array_equal(pose.correction_W, np.zeros(3))
+
+
+def test_a_stream_that_is_corrected_does_not_step(walk: ImuSequence, make_oracle: Make) -> None:
+    """Noise of a quarter of a metre makes the corrected position step; this one moves evenly."""
+    navigator = Navigator(make_oracle(walk, walk.truth, CONFIG, noise=0.25, sigma=0.25), CONFIG)
+    poses: list[ContinuousPose] = []
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        if navigator.push(*row) is not None:
+            assert navigator.continuous is not None
+            poses.append(navigator.continuous)
+    p, v, t = (np.array([getattr(q, name) for q in poses]) for name in ("p_W", "v_W", "time"))
+    moved = np.diff(p, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
+    assert np.linalg.norm(moved, axis=1).max() < LARGEST_STEP + 1e-9
+    corrected = p + np.array([q.correction_W for q in poses])
+    stepped = np.diff(corrected, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
+    assert np.linalg.norm(stepped, axis=1).max() > 2.0 * LARGEST_STEP
+    assert np.linalg.norm(poses[-1].correction_W) < 0.5
