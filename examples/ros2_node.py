@@ -7,9 +7,9 @@
                 tf         map -> odom -> base_link (REP 105)
 
 `odom` is continuous (`Navigator.continuous`): it drifts, but neither updates nor fixes make it
-jump, so that controllers may use it. What they correct goes into map -> odom. Metres, radians, quaternions x y z w (REP 103).
-`base_link` is the IMU's frame here; where it is not, publish its static transform and name the
-IMU's frame instead.
+jump, so that controllers may use it. What they correct goes into map -> odom. Metres, radians,
+quaternions x y z w (REP 103). `base_link` is the IMU's frame here; where it is not, publish its
+static transform and name the IMU's frame instead.
 
 With ROS 2 sourced `python examples/ros2_node.py --node` spins the node. Without, the same code
 runs on a bag (`pip install 'stario[bags]'`) or, with no argument, on the bundled demonstration:
