@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import levelled_streams
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack
 from stario.sequences.windows import WINDOW_RATE
 
 _TRACK_STEP = 2.0
@@ -23,8 +23,8 @@ _TRACK_STEP = 2.0
 _SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
 """Legs that are shorter [s] or faster [m/s] are a tap by mistake, or a ride."""
 
-_FASTEST_STEP = 6.0
-"""A track that moves faster between two samples has jumped [m/s]."""
+_FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
+"""A track that moves faster between two samples [m/s] has jumped; a longer step [s] is a gap."""
 
 _TRACK_SIGMA = 0.15
 """Of a track's positions [m]: what carries the truth is not what carries the IMU."""
@@ -111,6 +111,18 @@ def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStr
     return streams
 
 
+def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
+    """Which steps (N - 1,) of a position track are gaps, or jumps of what gave the positions.
+
+    Args:
+        time: (N,) [s].
+        position: (N, 2 or 3) [m].
+    """
+    step = np.diff(time)
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
+    return np.asarray((speed > _FASTEST_STEP) | (step > _LONGEST_STEP))
+
+
 def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Start and stop (M,) [s], displacement (M, 3) [m] and the ends' deviations (M, 2) [m]."""
     time, position = known.time[known.valid], known.position_W[known.valid]
@@ -122,10 +134,8 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
     else:
         ends = np.searchsorted(time, np.arange(time[0], time[-1], _TRACK_STEP))
         ends = np.unique(ends)
-        step = np.diff(time)
-        speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
-        broken = np.concatenate([[0], np.cumsum((speed > _FASTEST_STEP) | (step > 0.25))])
-        whole = np.diff(broken[ends]) == 0
+        breaks = np.concatenate([[0], np.cumsum(broken_steps(time, position))])
+        whole = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]
     displacement = np.diff(position[ends], axis=0)
     speed = np.linalg.norm(displacement, axis=1) / (stop - start)

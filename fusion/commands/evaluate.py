@@ -37,7 +37,10 @@ def evaluate(
         Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Which of them: test, validation, training, holdout, all.")
+        str,
+        typer.Option(
+            help="Which: test, validation, training, holdout, all, or a list file (name, group)."
+        ),
     ] = "test",
     by: Annotated[
         str | None,
@@ -140,6 +143,10 @@ def _listed(
         return [Listed(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or the data of a split: --data")
+    if reading.where:
+        raise InputError(
+            "--where", "with a split", "with PATH", "name the archive instead of --data"
+        )
     return listed(split, data), []
 
 

@@ -56,7 +56,7 @@ class Row:
 
     Attributes:
         name: of the group, or `POOLED`.
-        recordings: how many.
+        recordings: how many could be compared: fewer than three waypoints tell nothing.
         path_km: their true paths together.
         medians: over recordings by the name of the weights and by figure.
         ratios: of errors over 1, 10 and 30 s, ours over theirs, by figure; without weights to
@@ -155,8 +155,8 @@ def _row(name: str, part: Sequence[Judged], ours: str, theirs: str | None) -> Ro
         found = paired_ratio(_strata(part, str(horizon), ours, theirs))
         if found is not None:
             ratios[f"rms_{horizon}s_m"] = found
-    path = sum(j.errors[ours].path_m for j in part) / 1e3
-    return Row(name, len(part), path, medians, ratios)
+    paths = [j.errors[ours].path_m for j in part]
+    return Row(name, sum(path > 0.0 for path in paths), sum(paths) / 1e3, medians, ratios)
 
 
 def _strata(

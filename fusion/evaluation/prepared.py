@@ -25,24 +25,23 @@ from stario.sequences.batch import Skipped, each
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
+from stario.sequences.legs import broken_steps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.readers.archive import split_name
 from stario.sequences.rotations import yaw_of
 from stario.sequences.sequence import (
-    MAX_TRUTH_GAP,
+    BoolArray,
     FloatArray,
     ImuSequence,
     PositionTrack,
     Trajectory,
+    is_gap,
 )
 from stario.sequences.stream_cache import recording_files
 
 log = logging.getLogger(__name__)
 
 Kind = Literal["poses", "positions", "waypoints"]
-
-FASTEST = 6.0
-"""A position track that is faster than this [m/s] has jumped: visual odometry relocalised."""
 
 _ARRAYS = (
     "imu_N",
@@ -156,8 +155,8 @@ def _kept(
 
 
 def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
-    known = truth.valid
-    base = _with_known(stream, truth.time[known], truth.position_W[known], np.inf)
+    time, position_W = truth.time[truth.valid], truth.position_W[truth.valid]
+    base = _with_known(stream, time, position_W, is_gap(np.diff(time)))
     at_tick = truth.at(stream.ticks)
     yaw_WN = yaw_of(at_tick.attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
     yaw_WN[np.isnan(base.position_W)] = np.nan
@@ -167,19 +166,17 @@ def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
 
 
 def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
-    return _with_known(stream, track.time[track.valid], track.position_W[track.valid], FASTEST)
+    time, position_W = track.time[track.valid], track.position_W[track.valid]
+    return _with_known(stream, time, position_W, broken_steps(time, position_W))
 
 
 def _with_known(
-    stream: LevelledStream, time: FloatArray, position_W: FloatArray, fastest: float
+    stream: LevelledStream, time: FloatArray, position_W: FloatArray, bad: BoolArray
 ) -> PreparedPiece:
-    """Positions (n, 2 or 3) interpolated to the ticks, where neither a gap nor a jump is."""
-    steps = np.diff(time)
-    speed = np.linalg.norm(np.diff(position_W[:, :2], axis=0), axis=1) / steps
-    bad = (steps > MAX_TRUTH_GAP + 1e-6) | (speed > fastest)
+    """Positions (n, 2 or 3) interpolated to the ticks but for the steps (n - 1,) that are bad."""
     ticks = stream.ticks
     before = np.searchsorted(time, ticks, side="right") - 1
-    inside = (before >= 0) & (before < len(steps))
+    inside = (before >= 0) & (before < len(bad))
     inside[inside] = ~bad[before[inside]]
     xy = np.interp(ticks, time, position_W[:, 0]) + 1j * np.interp(ticks, time, position_W[:, 1])
     breaks = np.searchsorted(time[1:][bad], ticks, side="right")
@@ -215,7 +212,7 @@ def _key(path: Path, options: dict[str, object]) -> str:
 def _code() -> str:
     digest = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20)
     folder = Path(stario.sequences.__file__).parent
-    for name in ("levelled_stream.py", "levelling.py", "windows.py", "readers/oxiod.py"):
+    for name in ("levelled_stream.py", "levelling.py", "legs.py", "windows.py", "readers/oxiod.py"):
         digest.update((folder / name).read_bytes())
     return digest.hexdigest()
 

@@ -165,6 +165,7 @@ class StateCloningEkf(ErrorStateEngine):
         covariance: FloatArray,
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
+        power: float = 1.0,
     ) -> UpdateResult:
         """Displacement from clone i to clone j, seen in the estimated world.
 
@@ -182,6 +183,7 @@ class StateCloningEkf(ErrorStateEngine):
             gate: NIS from which the measurement counts as an outlier (a quantile of chi-square
                 with 3 degrees of freedom), None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
+            power: how strongly they are inflated; see `update_linear`.
 
         Raises:
             InputError: a slot holds no clone.
@@ -192,7 +194,8 @@ class StateCloningEkf(ErrorStateEngine):
         X = self.state.X
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
-        return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode)
+        residual = d_W - (p_j - p_i)
+        return self.update_linear(residual, blocks, covariance, gate, gate_mode, power)
 
     def update_mean_velocity(
         self,

@@ -72,6 +72,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         covariance: FloatArray,
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
+        power: float = 1.0,
     ) -> UpdateResult:
         """Update with any measurement that is linear in the error.
 
@@ -83,6 +84,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             gate: NIS from which the measurement counts as an outlier, None for no gate.
             gate_mode: "inflate" multiplies an outlier's covariance by NIS / gate, so that a run
                 of outliers can still pull a filter back that is itself wrong; "reject" drops it.
+            power: of NIS / gate by which an outlier's covariance is multiplied.
 
         Returns:
             What happened. Values that are not finite and covariances that are not positive
@@ -103,7 +105,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         if gate is not None and nis > gate:
             if gate_mode == "reject":
                 return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma)
-            scale = nis / gate
+            scale = (nis / gate) ** power
             covariance = covariance * scale
             whitener = _whitener(HPH + covariance)
         if not math.isfinite(nis):

@@ -26,6 +26,7 @@ from stario.fusion.filter.innovations import (
     UpdateCounts,
     counted,
     innovation_row,
+    is_gated,
     stacked,
 )
 from stario.fusion.filter.magnetic import MagneticReference, update_bearing
@@ -45,6 +46,11 @@ from stario.sequences.windows import WINDOW_SECONDS
 GAP_TURN = 0.5
 """How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
 second and 0.36 to 0.7 per second over three in the training and validation recordings."""
+
+_RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
+"""While fewer than this share of the displacements of the last seconds were outliers they are the
+network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
+may itself be wrong. Some five seconds of false displacements are bridged so."""
 
 _ROUNDING = 1e-9
 """Of times [s]."""
@@ -82,6 +88,7 @@ class Estimator:
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
         self._magnetic = MagneticReference()
+        self._outlier_share = 0.5  # trust is to be earned
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -212,7 +219,10 @@ class Estimator:
                 R_WN @ d_N,
                 R_WN @ (covariance_N * f.overlap_scale) @ R_WN.T,
                 chi2_quantile(f.gate, 3),
+                power=_RARE_POWER if self._outlier_share < _RARE else 1.0,
             )
+        late = 1.0 / (f.update_rate * _SHARE_SECONDS)
+        self._outlier_share += late * (is_gated(result) - self._outlier_share)
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
@@ -249,6 +259,7 @@ class Estimator:
             self._map_frame.state,
             self._stillness.window,
             self._magnetic,
+            self._outlier_share,
             self._counts,
             self.in_gap,
             self.oldest,
@@ -259,7 +270,7 @@ class Estimator:
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._magnetic, self._counts = s.magnetic, s.counts
+        self._magnetic, self._outlier_share, self._counts = s.magnetic, s.outlier_share, s.counts
         self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
 
     @property

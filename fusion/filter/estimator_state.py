@@ -55,6 +55,7 @@ class EstimatorState:
         map_frame: where the fixes' frame lies.
         stillness: the last second's sums (`StillnessDetector`).
         magnetic: what the magnetic field usually is.
+        outlier_share: of the displacements of late.
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
@@ -66,6 +67,7 @@ class EstimatorState:
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference
+    outlier_share: float
     counts: UpdateCounts
     in_gap: bool
     oldest: Estimate | None

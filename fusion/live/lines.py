@@ -13,7 +13,7 @@ import logging
 from collections.abc import Sequence
 
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.payload import Batch, json_from, parse_line
+from stario.fusion.live.payload import Batch, joined, json_from, parse_line
 from stario.fusion.live.server import same
 from stario.sequences.errors import InputError
 
@@ -129,16 +129,10 @@ class LineServer:
         batches: list[Batch] = []
         for line in filter(bytes.strip, lines):
             try:
-                batch = parse_line(line, sender)
+                batches.append(parse_line(line, sender))
             except InputError as error:
                 errors.append(str(error))
-                continue
-            last = batches[-1] if batches else None
-            if last and (last.device, last.recording) == (batch.device, batch.recording):
-                last.readings.extend(batch.readings)
-            else:
-                batches.append(batch)
-        for batch in batches:
+        for batch in joined(batches):
             try:
                 await self._hub.take(batch)
             except (InputError, OSError) as error:

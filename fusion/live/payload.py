@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,6 +128,17 @@ def parse_line(line: bytes, sender: str) -> Batch:
         raise InputError("line", "neither gyro nor accel", "at least one of them")
     device = _name("device", message.get("device", sender))
     return Batch(device, _name("recording", message.get("recording", ""), needed=False), readings)
+
+
+def joined(batches: Iterable[Batch]) -> list[Batch]:
+    """Batches with those that follow each other of one recording made one."""
+    made: list[Batch] = []
+    for batch in batches:
+        if made and (made[-1].device, made[-1].recording) == (batch.device, batch.recording):
+            made[-1].readings.extend(batch.readings)
+        else:
+            made.append(batch)
+    return made
 
 
 def json_from(text: bytes) -> Any:

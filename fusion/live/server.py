@@ -34,7 +34,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
-from stario.fusion.live.payload import json_from, parse_line, parse_push
+from stario.fusion.live.payload import Batch, joined, json_from, parse_line, parse_push
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, unit_named
 
@@ -142,12 +142,10 @@ async def _data(request: Request) -> Response:
         _check_origin(request)
         factor = accel_factor(request.query_params.get("accel_unit", "m/s^2"))
         body = await _body(request)
-        if request.headers.get("content-type", "").startswith("application/x-ndjson"):
-            sender = f"http {request.client.host if request.client else ''}"
-            lines = [line for line in body.splitlines() if line.strip()]
-            batches = [parse_line(line, sender) for line in lines]  # all of them, or none
-        else:
-            batches = [parse_push(body)]
+        lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
+        sender = f"http {request.client.host if request.client else ''}"
+        # In a thread, so that a large one holds up nobody else.
+        batches = await asyncio.to_thread(_parsed, body, sender if lines else "")
     except InputError:
         hub.refuse("http")
         raise
@@ -155,6 +153,14 @@ async def _data(request: Request) -> Response:
     for batch in batches:
         count += await hub.take(batch, factor)
     return JSONResponse({"samples": count})
+
+
+def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
+    """The batches of a body, all of them or none."""
+    if not sender_of_lines:
+        return [parse_push(body)]
+    lines = [line for line in body.splitlines() if line.strip()]
+    return joined(parse_line(line, sender_of_lines) for line in lines)
 
 
 def _check_origin(request: Request) -> None:

@@ -25,7 +25,7 @@ class Shown:
         return self.page.evaluate("document.documentElement.scrollWidth > window.innerWidth")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it is open no other test could run an event loop
 def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium")

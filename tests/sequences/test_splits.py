@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from stario.network.training.splits import NAMES
+from stario.network.training.splits import NAMES, listed
 from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.readers import find_recordings
 from stario.sequences.splits import OFFICIAL, leave_out, official_split, random_split, read_list
@@ -143,6 +143,7 @@ def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -
     outside, inside = leave_out(found, "home")
     assert [one.path.name for one in outside] == ["walks.h5:two"]
     assert len(inside) == 2
+    assert listed(str(file), tmp_path) == found
     with pytest.raises(InputError, match="home anna"):
         leave_out(found, "office")
     (tmp_path / "a.csv").unlink()

@@ -17,17 +17,19 @@ NAMES = ("test", "validation", "training", "holdout", "all")
 
 
 def listed(name: str, data: Path) -> list[Listed]:
-    """The recordings of a list of the package.
+    """The recordings of a list of the package, or of one's own.
 
     Args:
-        name: one of `NAMES`.
+        name: one of `NAMES`, or a list file: `name, group` on each line.
         data: folder that the names count from.
 
     Raises:
         InputError: there is no such list, or one of its recordings is not there.
     """
+    if Path(name).is_file():
+        return read_list(Path(name), data)
     if name not in NAMES:
-        raise InputError("split", repr(name), f"one of {', '.join(NAMES)}")
+        raise InputError("split", repr(name), f"one of {', '.join(NAMES)}, or a list file")
     folder = importlib.resources.files("stario.network.training.splits")
     return read_list(Path(str(folder.joinpath(f"{name}.txt"))), data)
 

@@ -394,6 +394,7 @@ def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: P
         (["evaluate", "--data", "missing"], ["missing", "--data"]),
         (["evaluate", "--data", ".", "--split", "practice"], ["split", "practice"]),
         (["evaluate"], ["PATH", "--data"]),
+        (["evaluate", "--data", ".", "--where", "person=dan"], ["--where", "--data"]),
         (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
         (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),

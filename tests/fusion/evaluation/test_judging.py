@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +20,12 @@ from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.fusion.evaluation.prepared import Prepared, prepare, prepared_recordings
 from stario.sequences.batch import Skipped
 from stario.sequences.errors import InputError
+from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
+
+ARCHIVES = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives"
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +131,27 @@ def test_of_waypoints_residuals_follow_a_fit_of_yaw_and_position(walk: ImuSequen
 def test_a_recording_without_truth_is_refused(walk: ImuSequence) -> None:
     with pytest.raises(InputError, match="truth: found none"):
         prepare(walk.without_truth(), Path("walk"))
+
+
+@pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
+@pytest.mark.parametrize(
+    ("name", "kind", "path_m", "error"),
+    [
+        ("kipd.h5:yk_01", "poses", 127.4, "ate_fit_percent"),
+        ("rocip.h5:r4", "positions", 290.3, "stretch_percent"),
+        ("ilc.h5:site2_F1_5dd35c7527889b0006b76852", "waypoints", 65.2, "ate_fit_percent"),
+    ],
+)
+def test_of_real_recordings_the_steps_come_near_the_truth(
+    name: str, kind: str, path_m: float, error: str
+) -> None:
+    path = Path(f"{ARCHIVES}/{name}")
+    prepared = prepare(read_recording(path), path)
+    found = recording_errors(prepared, answers(PedestrianDeadReckoning(), prepared))
+    assert found.kind == kind
+    assert found.path_m == pytest.approx(path_m, rel=0.05)
+    assert found.figures["length_ratio"] == pytest.approx(1.0, abs=0.3)
+    assert found.figures[error] < 15.0
 
 
 def test_what_was_prepared_is_found_again(walk: ImuSequence, tmp_path: Path) -> None:

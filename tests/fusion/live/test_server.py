@@ -316,3 +316,13 @@ def test_apples_sign_that_is_not_told_shows_by_the_phones_own_attitude(
         assert client.post(f"/data?accel_unit={unit}", content=json.dumps(message)).is_success
     problem = hub.sessions["phone"].status()["problem"]
     assert ("accel_unit=-m/s2" in problem) == told
+
+
+def test_lines_may_be_posted_and_are_taken_all_or_none(client, hub, walk):
+    rows = zip(walk.time[:150].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
+    lines = [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
+    ndjson = {"content-type": "application/x-ndjson"}
+    broken = client.post("/data", content="\n".join([*lines[:50], "{}"]), headers=ndjson)
+    assert (broken.status_code, hub.sessions) == (400, {})
+    assert client.post("/data", content="\n".join(lines), headers=ndjson).json() == {"samples": 150}
+    assert hub.refused["http"] == 1
