@@ -6,10 +6,10 @@
     publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
                 tf         map -> odom -> base_link (REP 105)
 
-`odom` is continuous: it drifts, but a fix does not make it jump, so that controllers may use it.
-What fixes correct goes into map -> odom. Metres, radians, quaternions x y z w (REP 103).
-`base_link` is the IMU's frame here; where it is not, publish its static transform and name the
-IMU's frame instead.
+`odom` is continuous (`Navigator.continuous`): it drifts, but neither updates nor fixes make it
+jump, so that controllers may use it. What they correct goes into map -> odom. Metres, radians,
+quaternions x y z w (REP 103). `base_link` is the IMU's frame here; where it is not, publish its
+static transform and name the IMU's frame instead.
 
 With ROS 2 sourced `python examples/ros2_node.py --node` spins the node. Without, the same code
 runs on a bag (`pip install 'stario[bags]'`) or, with no argument, on the bundled demonstration:
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion import Navigator, NavState, demonstration
+from stario.fusion import ContinuousPose, Navigator, NavState, demonstration
 from stario.network import load_model
 from stario.sequences.rotations import about_z, yaw_of
 
@@ -59,7 +59,7 @@ class Odometry:
     Attributes:
         stamp_ns: of the state [ns].
         odom_base: pose of base_link in odom.
-        map_odom: of odom in map, changed by fixes alone.
+        map_odom: of odom in map: what fixes and updates correct.
         pose_covariance: (6, 6) of x, y, z and the rotations about odom's axes.
         linear, angular: twist in base_link [m/s], [rad/s].
         twist_covariance: (6, 6) of both.
@@ -83,7 +83,7 @@ class OdometryBridge:
 
     def __init__(self, navigator: Navigator) -> None:
         self._navigator = navigator
-        self._map_odom = Transform(Rotation.identity(), np.zeros(3))
+        self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom, moved with the map
         self._first_ns: int | None = None
 
     def imu(self, message: Any) -> Odometry | None:
@@ -99,8 +99,8 @@ class OdometryBridge:
 
     def fix(self, message: Any) -> None:
         """A geometry_msgs/PoseWithCovarianceStamped in map, for its position."""
-        before = self._navigator.state
-        if before is None or self._first_ns is None:
+        before, steady = self._navigator.state, self._navigator.continuous
+        if before is None or steady is None or self._first_ns is None:
             return
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         at = message.pose.pose.position
@@ -108,14 +108,18 @@ class OdometryBridge:
         time = (stamp_ns - self._first_ns) / 1e9
         self._navigator.update_position(time, [at.x, at.y, at.z], covariance)
         after = self._navigator.state
-        # base_link stays where it was in odom; roll and pitch are no fix's business (REP 105).
-        turn = about_z(float(yaw_of(_pose(after).R * _pose(before).R.inv())[0]))
-        moved = Transform(turn, after.p_W - turn.apply(before.p_W))
-        self._map_odom = moved @ self._map_odom
+        if after.map_frame == before.map_frame:
+            return  # an ordinary correction, which is bled in
+        # The map was moved: base_link stays where it was in odom, which stays level (REP 105).
+        stays = (self._frame.inverse() @ Transform(_attitude(steady), steady.p_W)).p
+        turn = about_z(float(yaw_of(_attitude(after) * _attitude(before).inv())[0]))
+        R = turn * self._frame.R
+        self._frame = Transform(R, after.p_W - R.apply(stays))
 
     def _odometry(self, state: NavState, gyro: np.ndarray) -> Odometry:
-        R_WB, P = Rotation.from_matrix(state.R_WB), state.covariance
-        to_odom = self._map_odom.R.inv().as_matrix()
+        steady, P = self._navigator.continuous, state.covariance
+        correction = Transform(Rotation.identity(), steady.correction_W)
+        to_odom = self._frame.R.inv().as_matrix()
         pose = np.zeros((6, 6))
         pose[:3, :3], pose[3:, 3:] = P[6:9, 6:9], P[:3, :3]
         pose[:3, 3:], pose[3:, :3] = P[6:9, :3], P[:3, 6:9]
@@ -125,17 +129,17 @@ class OdometryBridge:
         turn = np.kron(np.eye(2), to_odom)
         return Odometry(
             stamp_ns=(self._first_ns or 0) + round(state.time * 1e9),
-            odom_base=self._map_odom.inverse() @ _pose(state),
-            map_odom=self._map_odom,
+            odom_base=self._frame.inverse() @ Transform(_attitude(steady), steady.p_W),
+            map_odom=correction @ self._frame,
             pose_covariance=turn @ pose @ turn.T,
-            linear=R_WB.inv().apply(state.v_W),
+            linear=_attitude(state).inv().apply(state.v_W),
             angular=gyro - state.b_g,
             twist_covariance=twist,
         )
 
 
-def _pose(state: NavState) -> Transform:
-    return Transform(Rotation.from_matrix(state.R_WB), state.p_W)
+def _attitude(pose: NavState | ContinuousPose) -> Rotation:
+    return Rotation.from_matrix(pose.R_WB)
 
 
 def bag_messages(path: Path) -> Iterator[Any]:

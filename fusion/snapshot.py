@@ -53,7 +53,7 @@ def _classes() -> dict[str, type]:
         map_frame,
         zero_velocity,
     )
-    from stario.fusion.graph import builder, factors, fixed_lag, keyframes
+    from stario.fusion.graph import builder, factors, fixed_lag, keyframes, whitening
     from stario.fusion.imu import front_end, gyro_unit, intervals, outliers, preintegration
     from stario.sequences import levelling, noise
 
@@ -74,7 +74,7 @@ def _classes() -> dict[str, type]:
         continuous.ContinuousPose,
         *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
         *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
-        *(keyframes.KeyframeGraph, keyframes.Whitened, factors.KeyframeState),
+        *(keyframes.KeyframeGraph, whitening.Whitened, factors.KeyframeState),
         *factors.KINDS,
     )
     return {each.__name__: each for each in classes}

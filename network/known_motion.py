@@ -13,6 +13,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,10 +57,14 @@ class KnownMotion:
 
     def strangeness(self, windows: NDArray[np.float32]) -> FloatArray:
         """Distance of windows (B, 6, 200) to what is known (B,), 1 at the limit."""
-        described_windows = described(features(windows))
-        centres = np.array(self.centres)
-        distances = np.linalg.norm(described_windows[:, None] - centres, axis=2)
-        return np.asarray(distances.min(axis=1) / self.limit)
+        distances, _ = self._tree.query(described(features(windows)))
+        return np.asarray(distances / self.limit)
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import KDTree
+
+        return KDTree(np.array(self.centres))
 
     def variance_factor(self, windows: NDArray[np.float32]) -> FloatArray:
         """Factors (B,) on the variance of a network's answers: 1 inside, rising outside."""

@@ -1,13 +1,13 @@
-"""Faults put into a recording, and what each costs: the same recording run with and without.
+"""What faults in a recording cost: the same recording run with and without each.
 
-A fault changes the recording, or what is measured of it. What a fault costs the fusion shows best
+What a fault costs the fusion shows best
 where the displacements are the true ones under white noise of a known size; a network's own errors,
 which differ from window to window, hide it. So that is what measures unless a network is given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.spoiling import Corrupt, Fault, faults
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
@@ -25,34 +26,13 @@ from stario.sequences.errors import InputError
 from stario.sequences.metrics import align, evaluate_track
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS
 
-Spoil = Callable[[ImuSequence, np.random.Generator], ImuSequence]
-Corrupt = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
-"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place, given the share (M,) of
-the windows that are over at each one's end."""
-
-
 WHITE_NOISE = 0.05
 """Of the true displacements where no network measures, per axis [m]."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One fault.
-
-    Attributes:
-        name: in the table.
-        spoil: what it does to the recording.
-        corrupt: what it does to the network's answers.
-    """
-
-    name: str
-    spoil: Spoil | None = None
-    corrupt: Corrupt | None = None
 
 
 @dataclass(frozen=True)
@@ -93,27 +73,6 @@ def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, Na
     )
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
     return sequence, NavigatorConfig(noise=noise, filter=known)
-
-
-def faults(duration: float) -> list[Fault]:
-    """Every fault of the table, for a recording that long [s]."""
-    half = 0.5 * duration
-    return [
-        Fault("none"),
-        Fault("network off by 1 m for 5 s", corrupt=_offset_block(5.0 / duration, 1.0)),
-        Fault("5 % of windows off by 2 m", corrupt=_outliers(0.05, 2.0)),
-        Fault("covariance 100 times too small", corrupt=_overconfident(0.01)),
-        *(Fault(f"gap of {gap:g} s", _gap(half, gap)) for gap in (0.1, 1.0, 3.0)),
-        *(Fault(f"{share:.0%} of samples dropped", _drops(share)) for share in (0.05, 0.2)),
-        *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
-        Fault("accelerometer clipped", _clipped(0.98)),
-        *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
-        Fault("one NaN from the network", corrupt=_nan_answer(0)),
-        Fault("one NaN in the covariance", corrupt=_nan_answer(1)),
-        Fault("1 % duplicated, 1 % swapped", _reordered(0.01)),
-        Fault("three wild timestamps", _wild_times(3)),
-        Fault("ten spikes", _spikes(10)),
-    ]
 
 
 def run_faults(
@@ -274,122 +233,3 @@ def _error(track: Track, sequence: ImuSequence) -> float:
 
 
 # --- what the faults do ------------------------------------------------------------------------
-
-
-def _offset_block(share: float, metres: float) -> Corrupt:
-    def corrupt(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
-    ) -> None:
-        mean[(over > 0.5) & (over <= 0.5 + share), 0] += metres
-
-    return corrupt
-
-
-def _outliers(share: float, metres: float) -> Corrupt:
-    def corrupt(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
-    ) -> None:
-        hit = rng.random(len(mean)) < share
-        mean[hit] += rng.choice([-metres, metres], (int(hit.sum()), 3)) / np.sqrt(3.0)
-
-    return corrupt
-
-
-def _overconfident(factor: float) -> Corrupt:
-    def corrupt(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
-    ) -> None:
-        covariance *= factor
-
-    return corrupt
-
-
-def _nan_answer(which: int) -> Corrupt:
-    def corrupt(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
-    ) -> None:
-        (mean, covariance)[which][len(mean) // 2] = np.nan
-
-    return corrupt
-
-
-def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
-    return replace(
-        sequence, time=sequence.time[keep], gyro=sequence.gyro[keep], accel=sequence.accel[keep]
-    )
-
-
-def _gap(start: float, seconds: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        since = sequence.time - sequence.time[0] - start
-        return _kept(sequence, (since <= 0.0) | (since >= seconds))
-
-    return spoil
-
-
-def _drops(share: float) -> Spoil:
-    return lambda sequence, rng: _kept(sequence, rng.random(len(sequence)) >= share)
-
-
-def _resampled(rate: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        time = np.arange(sequence.time[0], sequence.time[-1], 1.0 / rate)
-        gyro, accel = (
-            np.stack([np.interp(time, sequence.time, column) for column in values.T], axis=1)
-            for values in (sequence.gyro, sequence.accel)
-        )
-        return replace(sequence, time=time, gyro=gyro, accel=accel)
-
-    return spoil
-
-
-def _clipped(quantile: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        limit = float(np.quantile(np.abs(sequence.accel).max(axis=1), quantile))
-        return replace(sequence, accel=np.clip(sequence.accel, -limit, limit))
-
-    return spoil
-
-
-def _one_nan(field: str) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        values = getattr(sequence, field).copy()
-        values[len(values) // 2] = np.nan
-        return replace(sequence, **{field: values})
-
-    return spoil
-
-
-def _reordered(share: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        order = np.arange(len(sequence))
-        for k in np.flatnonzero(rng.random(len(order) - 1) < share):
-            order[[k, k + 1]] = order[[k + 1, k]]
-        order = np.repeat(order, 1 + (rng.random(len(order)) < share))
-        return replace(
-            sequence,
-            time=sequence.time[order],
-            gyro=sequence.gyro[order],
-            accel=sequence.accel[order],
-        )
-
-    return spoil
-
-
-def _wild_times(count: int) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        time = sequence.time.copy()
-        time[rng.integers(0, len(time), count)] += 1e6
-        return replace(sequence, time=time)
-
-    return spoil
-
-
-def _spikes(count: int) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
-        gyro, accel = sequence.gyro.copy(), sequence.accel.copy()
-        gyro[rng.integers(0, len(gyro), count // 2), 1] += 200.0
-        accel[rng.integers(0, len(accel), count - count // 2), 2] += 500.0
-        return replace(sequence, gyro=gyro, accel=accel)
-
-    return spoil

@@ -13,7 +13,8 @@ from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
-from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray, exp_so3, log_so3
 from stario.fusion.state import NavState

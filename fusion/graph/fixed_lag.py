@@ -21,7 +21,7 @@ from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
-from stario.fusion.graph.keyframes import IndeterminateError
+from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health, NavState

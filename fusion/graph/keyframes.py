@@ -22,7 +22,8 @@ from scipy.linalg import block_diag
 
 from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.graph.factors import Displacement, KeyframeState, Prior, Term
+from stario.fusion.graph.factors import KeyframeState, Prior, Term
+from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
@@ -33,20 +34,11 @@ _MOVED = 1e-3
 _LOST_SIGMA = 1e5
 """Nobody walks so far, so fast or so biased: a state this uncertain [m, m/s, rad, ...] is free."""
 
-_FALSE, _FALSE_WAY = 0.5, 0.75
-"""Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,
-as the filter does. Displacements go wrong in rows, and count less: five seconds of them off by 1 m
-cost 0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with the half."""
-
 _LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
-
-
-class IndeterminateError(Exception):
-    """The graph does not determine a state; the message names it and its time."""
 
 
 @dataclass(frozen=True)
@@ -250,44 +242,6 @@ class KeyframeGraph:
         return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
 
 
-@dataclass(frozen=True, eq=False)
-class Whitened:
-    """A term with its covariance's whitener (m, m) and the squared norm that is an outlier's."""
-
-    term: Term
-    whitener: FloatArray
-    limit: float
-
-    @classmethod
-    def of(cls, term: Term, limit: float) -> Whitened:
-        """A term with the squared norm of its white residual from which it is an outlier."""
-        return cls(term, np.linalg.inv(np.linalg.cholesky(term.covariance)), limit)
-
-    @property
-    def first(self) -> int:
-        """The first keyframe it touches."""
-        return self.term.keyframes[0]
-
-    def weigh(self, values: Any) -> tuple[FloatArray, list[tuple[int, FloatArray]], float]:
-        """Residual, Jacobian blocks and weight at gtsam `Values`."""
-        residual, blocks = self.term.linearise(values)
-        white = self.whitener @ residual
-        squared = float(white @ white)
-        if not math.isfinite(squared):
-            kind = type(self.term).__name__.lower()
-            raise IndeterminateError(f"a {kind} that is not finite")
-        if squared <= self.limit:
-            return residual, blocks, 1.0
-        power = _FALSE_WAY if isinstance(self.term, Displacement) else _FALSE
-        return residual, blocks, (self.limit / squared) ** power
-
-    def factor(self, values: Any) -> Any:
-        """The linear factor, linearised and weighed at `Values`."""
-        residual, blocks, weight = self.weigh(values)
-        scaled = weight * self.whitener
-        return _linear_factor([(key, scaled @ H) for key, H in blocks], scaled @ residual)
-
-
 def _prior(k: int, state: NavState) -> Prior:
     """A state's covariance as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
@@ -318,13 +272,7 @@ def _world_from_local(R_WB: FloatArray) -> FloatArray:
 def _says_nothing(k: int) -> Any:
     """A factor without information on a keyframe."""
     blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
-    return _linear_factor(blocks, np.zeros(1))
-
-
-def _linear_factor(blocks: list[tuple[int, FloatArray]], b: FloatArray) -> Any:
-    """A `JacobianFactor` of white rows; from Python only a conditional takes any number of keys."""
-    unit = gtsam.noiseModel.Unit.Create(len(b))
-    return gtsam.JacobianFactor(gtsam.GaussianConditional(blocks, 1, b, unit))
+    return linear_factor(blocks, np.zeros(1))
 
 
 def _ordering(keys: list[int]) -> Any:

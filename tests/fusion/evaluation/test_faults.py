@@ -8,10 +8,10 @@ import pytest
 from stario.fusion.evaluation.faults import (
     FaultResult,
     fault_table,
-    faults,
     matched_walk,
     run_faults,
 )
+from stario.fusion.evaluation.spoiling import faults
 from stario.sequences.errors import InputError
 
 SECONDS = 20.0

@@ -17,7 +17,8 @@ from stario.fusion import Navigator, NavState
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
-from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.lie import exp_so3, yaw_twist
 from stario.fusion.recording import PreprocessedRecording
 from stario.sequences.rotations import about_z

@@ -17,7 +17,8 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.backends import score_walk, summary
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
-from stario.fusion.graph.keyframes import IndeterminateError, KeyframeGraph
+from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.state import NavState
 from stario.sequences.errors import ConfigError, InputError
