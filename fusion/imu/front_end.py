@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import SHORT_GAP, ImuInterval, SampleCounts, Start
 from stario.fusion.imu.outliers import Flags, OutlierDetector
 from stario.sequences.errors import InputError
 from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
@@ -307,7 +307,7 @@ def cut_recording(
 
 def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) -> ImuInterval:
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:7]
-    if gap:
+    if gap and time[-1] - time[0] >= SHORT_GAP:
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)

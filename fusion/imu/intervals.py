@@ -22,6 +22,10 @@ class Start:
     force: float
 
 
+SHORT_GAP = 0.2
+"""A gap shorter than this [s] is bridged by the rates at its ends: a walker's hardly change."""
+
+
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
     """The stretch between two times of the grid.
@@ -57,6 +61,11 @@ class ImuInterval:
     anew: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False
+
+    @property
+    def short_gap(self) -> bool:
+        """Whether it is a gap over which rates may be taken for linear between its ends."""
+        return self.gap and self.stop - self.start < SHORT_GAP
 
     def without_window(self) -> ImuInterval:
         """What an estimator needs of it, without what only the network sees."""

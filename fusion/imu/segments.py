@@ -66,7 +66,10 @@ def _unseen(
     b_a: FloatArray,
     config: NavigatorConfig,
 ) -> Segment:
-    """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
+    """Through a gap: constant velocity, under noise wide enough for a walker.
+
+    The attitude stays, or turns as at both ends of a short one.
+    """
     hover = R_WB.T @ [0.0, 0.0, config.gravity] + b_a
     noise = replace(
         config.noise,
@@ -76,6 +79,9 @@ def _unseen(
     # In one step position and velocity would be in error together: no graph can invert that.
     time = np.linspace(interval.start, interval.stop, _GAP_STEPS + 1)
     gyro, accel = np.tile(b_g, (len(time), 1)), np.tile(hover, (len(time), 1))
+    if interval.short_gap:
+        share = np.linspace(0.0, 1.0, len(time))[:, None]
+        gyro = (1.0 - share) * interval.gyro[0] + share * interval.gyro[-1]
     return preintegrate(time, gyro, accel, b_g, b_a, noise, config.gravity)
 
 
