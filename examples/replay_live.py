@@ -17,8 +17,7 @@ import time
 import urllib.request
 from pathlib import Path
 
-from stario.fusion import Navigator, demonstration
-from stario.fusion.live.run import LiveServer
+from stario.fusion import LiveServer, Navigator, demonstration
 from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 

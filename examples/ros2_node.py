@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion import ContinuousPose, Navigator, NavState, demonstration
 from stario.network import load_model
-from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences import about_z, yaw_of
 
 GYRO_NOISE = 0.01
 """Standard deviation of one rate sample [rad/s], for the twist's covariance."""

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from stario.fusion.fixes import velocity_fix as velocity_fix
     from stario.fusion.fixes import yaw_fix as yaw_fix
     from stario.fusion.imu.stateful import Predictor as Predictor
+    from stario.fusion.live.run import LiveServer as LiveServer
     from stario.fusion.navigator import Navigator as Navigator
     from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
     from stario.fusion.state import Health as Health
@@ -43,6 +44,7 @@ _MODULES = {
     "GraphConfig": "config",
     "Health": "state",
     "Innovations": "state",
+    "LiveServer": "live.run",
     "NavState": "state",
     "Navigator": "navigator",
     "NavigatorConfig": "config",

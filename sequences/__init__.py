@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.readers.csv_writer import write_csv as write_csv
+    from stario.sequences.rotations import about_z as about_z
+    from stario.sequences.rotations import yaw_of as yaw_of
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
@@ -52,10 +54,9 @@ _MODULES = {
     "ImuNoise": "noise",
     "ImuSequence": "sequence",
     "InputError": "errors",
+    "LegStream": "legs",
     "MagneticField": "simulation.magnetometer",
     "Magnetometer": "sequence",
-    "LegStream": "legs",
-    "leg_streams": "legs",
     "PERFECT_IMU": "simulation.imu",
     "PHONE_IMU": "simulation.imu",
     "PositionTrack": "sequence",
@@ -66,12 +67,14 @@ _MODULES = {
     "Trajectory": "sequence",
     "WalkStyle": "simulation.walks",
     "WeightsError": "errors",
+    "about_z": "rotations",
     "align": "metrics",
     "check_units": "checks",
     "evaluate_track": "metrics",
     "find_recordings": "readers",
     "generate_walk": "simulation.walks",
     "inspect_recording": "inspection",
+    "leg_streams": "legs",
     "position_nees": "metrics",
     "read_recording": "readers",
     "read_tum": "files",
@@ -81,45 +84,8 @@ _MODULES = {
     "world_streams": "windows",
     "write_csv": "readers.csv_writer",
     "write_tum": "files",
+    "yaw_of": "rotations",
 }
 
-__all__ = [
-    "GOOD_IMU",
-    "INDOOR_FIELD",
-    "PERFECT_IMU",
-    "PHONE_IMU",
-    "STANDARD_GRAVITY",
-    "ConfigError",
-    "DeviceAttitude",
-    "ImuErrors",
-    "ImuNoise",
-    "ImuSequence",
-    "InputError",
-    "LegStream",
-    "MagneticField",
-    "Magnetometer",
-    "PositionTrack",
-    "ReadError",
-    "Skipped",
-    "StarioError",
-    "Trajectory",
-    "WalkStyle",
-    "WeightsError",
-    "align",
-    "check_units",
-    "evaluate_track",
-    "find_recordings",
-    "generate_walk",
-    "inspect_recording",
-    "leg_streams",
-    "position_nees",
-    "read_recording",
-    "read_tum",
-    "simulate_imu",
-    "with_conventions",
-    "with_units",
-    "world_streams",
-    "write_csv",
-    "write_tum",
-]
+__all__ = [*_MODULES]
 __getattr__ = lazy_attributes("stario.sequences", _MODULES)

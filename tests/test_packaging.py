@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -24,16 +25,20 @@ def test_every_package_of_the_tree_is_listed():
     assert found == set(PROJECT["tool"]["setuptools"]["packages"])
 
 
-@pytest.mark.parametrize("package", ["fusion", "network", "sequences"])
-def test_what_a_package_offers_is_what_it_names(package):
+@pytest.mark.parametrize("package", FOLDERS)
+def test_its_readme_names_every_public_name_and_each_can_be_imported(package):
     module = importlib.import_module(f"stario.{package}")
-    assert set(module.__all__) == set(module._MODULES)
+    text = (ROOT / package / "README.md").read_text()
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+        assert re.search(rf"`{name}\b", text), name
 
 
-def test_the_readme_of_sequences_names_every_public_name():
-    text = (ROOT / "sequences/README.md").read_text()
-    names = importlib.import_module("stario.sequences").__all__
-    assert not [name for name in names if f"`{name}" not in text]
+def test_examples_use_public_names_alone():
+    for path in (ROOT / "examples").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stario"):
+                assert node.module.count(".") == 1, f"{path.name}: {node.module}"
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -25,6 +25,7 @@ from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.train import train
+from stario.fusion.commands.worth import fusion
 from stario.sequences.errors import StarioError
 
 app = typer.Typer(
@@ -38,7 +39,7 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, backends, faults, consistency, benchmark):
+for command in (models, fusion, backends, faults, consistency, benchmark):
     check.command()(command)
 app.add_typer(check, name="check")
 

@@ -29,7 +29,7 @@ from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers, workers
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegSampler, leg_loss, leg_samplers
+from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss, leg_samplers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.legs import LegStream
@@ -173,33 +173,40 @@ class _Run:
             group["lr"] = learning_rate(self.config, self.step)
         drawn = self.sampler.batch(self.config.batch // self.config.successive)
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
-        if not self.network.remembers:
-            windows = windows.flatten(0, -3)
-        # All sources in one batch, so that its normalisation sees them all.
         legs = [sampler.batch(size).to(self.device) for sampler, size in self.legs]
-        whole = torch.cat([windows, *(part.windows.flatten(0, 1) for part in legs)])
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
-            mean, log_sigma = self._shared(whole)
-        parts = [len(windows), *(part.windows[:, :, 0, 0].numel() for part in legs)]
-        means, log_sigmas = mean.split(parts), log_sigma.split(parts)
-        squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
-        likelihood = self.step >= self.config.likelihood_from * self.config.steps
-        loss = (
-            loss_with_sigma(squared, log_sigmas[0].flatten(0, -2))
-            if likelihood
-            else squared.sum(1).mean()
-        )
-        for part, told, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
-            shape = part.windows.shape[:2]
-            loss = loss + leg_loss(told.view(*shape, 3), sigma.view(*shape, 3), part)[0]
+        loss, error = self._loss(windows, target, legs)
         self.optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         self._check_finite(float(loss.detach()), float(norm))
         self.optimiser.step()
         self.step += 1
         self._average()
-        return float(squared.detach().sum(1).mean())
+        return error
+
+    def _loss(
+        self, windows: Tensor, target: Tensor, legs: Sequence[LegBatch]
+    ) -> tuple[Tensor, float]:
+        """Loss of windows with full truth and of legs, and the windows' mean squared error [m^2].
+
+        All sources go through the network in one batch, so that its normalisation sees them all.
+        """
+        if not self.network.remembers:
+            windows = windows.flatten(0, -3)
+        whole = torch.cat([windows, *(part.windows.flatten(0, 1) for part in legs)])
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
+            mean, log_sigma = self._shared(whole)
+        sizes = [len(windows), *(part.known.shape[0] * part.share.shape[2] for part in legs)]
+        means, log_sigmas = mean.split(sizes), log_sigma.split(sizes)
+        squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
+        if self.step >= self.config.likelihood_from * self.config.steps:
+            loss = loss_with_sigma(squared, log_sigmas[0].flatten(0, -2))
+        else:
+            loss = squared.sum(1).mean()
+        for part, told, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
+            shape = (len(part.known), -1, 3)
+            loss = loss + leg_loss(told.view(shape), sigma.view(shape), part)[0]
+        return loss, float(squared.detach().sum(1).mean())
 
     def _check_finite(self, loss: float, norm: float) -> None:
         """Stop before a step that would spoil every weight.

@@ -1,0 +1,65 @@
+"""`stario check fusion`: what the fusion is worth against its network, by groups of recordings."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stario.fusion.commands.common import (
+    Estimating,
+    JsonOption,
+    Reading,
+    grouped,
+    leave_with_skipped,
+    print_json,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from stario.fusion.evaluation.worth import Worth
+
+
+@grouped
+def fusion(
+    paths: Annotated[list[Path], typer.Argument(help="Recordings, folders, archives or lists.")],
+    reading: Reading,
+    estimating: Estimating,
+    by: Annotated[
+        str, typer.Option(help="Group by set, or by an attribute such as person, device, carry.")
+    ] = "set",
+    graph: Annotated[bool, typer.Option("--graph", help="The graph as well; slower.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Hold the filter's error against its network's, with NIS and honesty of the yaw, by group."""
+    from stario.fusion.backends import BackendName
+    from stario.fusion.evaluation.worth import worth_of, worth_table
+    from stario.sequences.batch import Skipped, each
+    from stario.sequences.readers.archive import split_name
+
+    model, settings = estimating.network(), estimating.settings()
+    files, skipped = reading.recordings(paths)
+    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
+
+    def judged(path: Path) -> Worth:
+        sequence = reading.read(path)
+        file, member = split_name(path)
+        named = file.stem if member else path.parent.name
+        group = named if by == "set" else str(sequence.attributes.get(by) or "unknown")
+        return worth_of(model, sequence, settings, group, backends)
+
+    found: list[Worth] = []
+    with progress_bar("check fusion") as progress:
+        for done, outcome in enumerate(each(judged, files, jobs=1), 1):
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+            else:
+                found.append(outcome)
+            progress(done / len(files))
+    if as_json:
+        print_json([asdict(one) for one in found])
+    elif found:
+        typer.echo(worth_table(sorted(found, key=lambda one: one.group)))
+    leave_with_skipped(skipped)

@@ -1,0 +1,132 @@
+"""What the fusion is worth: the filter's and the graph's error against the network's, by group.
+
+The network alone is chained along the attitude levelled from the IMU. Errors are horizontal,
+root mean square after a fit of yaw and position: over all poses, or at the waypoints.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.errors import InputError
+from stario.sequences.metrics import evaluate_track, pose_errors
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+
+LEAST_SIGMA = 3.0
+"""Deviations that an honest yaw error stays within."""
+
+
+@dataclass(frozen=True)
+class Worth:
+    """One recording.
+
+    Attributes:
+        recording: its name.
+        group: that it is counted in.
+        network_m: error of the network alone [m].
+        fused_m: by back end [m].
+        nis: the filter's mean; 3 is expected.
+        yaw_error: the filter's, at the end against the start [rad]; nan without true attitude.
+        yaw_sigma: what it says of it [rad].
+    """
+
+    recording: str
+    group: str
+    network_m: float
+    fused_m: dict[str, float]
+    nis: float
+    yaw_error: float
+    yaw_sigma: float
+
+
+def worth_of(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    backends: Sequence[BackendName] = get_args(BackendName),
+) -> Worth:
+    """Run a recording through the network alone and the back ends.
+
+    Raises:
+        InputError: nothing is known of where it led, or it cannot be run.
+    """
+    known: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
+    if known is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    preprocessed = Navigator(model, config).observe(sequence)
+    tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
+    first = tracks[backends[0]]
+    error, sigma = _yaw(first, sequence.truth)
+    return Worth(
+        sequence.name,
+        group,
+        _error(network_track(preprocessed), known),
+        {name: _error(track, known) for name, track in tracks.items()},
+        math.nan if first.nis is None else first.nis,
+        error,
+        sigma,
+    )
+
+
+def worth_table(found: Sequence[Worth]) -> str:
+    """A row for each group: ratios to the network, NIS, and the yaw at the end."""
+    names = list(found[0].fused_m) if found else []
+    head = f"{'group':<22}{'n':>4}{'network':>9}"
+    head += "".join(f"{name + ' mean':>12}{'p95':>6}{'worst':>7}" for name in names)
+    lines = [head + f"{'NIS':>6}{'yaw deg':>9}{'< 3 sigma':>11}"]
+    groups = list(dict.fromkeys(one.group for one in found))
+    parts = [(group, [one for one in found if one.group == group]) for group in groups]
+    for group, part in [*parts, ("all", list(found))] if len(groups) > 1 else parts:
+        lines.append(_row(group, part, names))
+    lines.append("network: median error [m]; ratios to it: geometric mean, 95th percentile, worst")
+    return "\n".join(lines)
+
+
+def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> str:
+    row = f"{group:<22}{len(part):>4}{np.median([one.network_m for one in part]):>9.2f}"
+    for name in names:
+        ratio = np.log([one.fused_m[name] / one.network_m for one in part])
+        figures = np.exp([ratio.mean(), np.quantile(ratio, 0.95), ratio.max()])
+        row += f"{figures[0]:>12.2f}{figures[1]:>6.2f}{figures[2]:>7.2f}"
+    row += f"{np.nanmean([one.nis for one in part]):>6.1f}"
+    yaw = np.array([(one.yaw_error, one.yaw_sigma) for one in part])
+    yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
+    if len(yaw) == 0:
+        return row
+    covered = (yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]).mean()
+    return row + f"{np.degrees(np.median(yaw[:, 0])):>9.1f}{covered:>11.0%}"
+
+
+def _error(track: Track, known: Trajectory | PositionTrack) -> float:
+    """Horizontal, after a fit of yaw and position [m]."""
+    if isinstance(known, Trajectory):
+        return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
+    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
+    time, truth = known.time[inside], known.position_W[inside]
+    ours = [np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1)]
+    return _fitted(ours[0] + 1j * ours[1], truth[:, 0] + 1j * truth[:, 1])
+
+
+def _fitted(ours: np.ndarray, theirs: np.ndarray) -> float:
+    ours, theirs = ours - ours.mean(), theirs - theirs.mean()
+    turn = np.vdot(ours, theirs)
+    return float(np.sqrt(np.mean(np.abs(ours * turn / max(abs(turn), 1e-12) - theirs) ** 2)))
+
+
+def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:
+    if truth is None or track.covariance is None:
+        return math.nan, math.nan
+    yaw: FloatArray = np.unwrap(pose_errors(track.trajectory, truth).yaw)
+    return float(yaw[-1] - yaw[0]), math.sqrt(float(track.covariance[-1, 2, 2]))
