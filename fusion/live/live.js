@@ -197,7 +197,7 @@
       [`${sigmaOf(p).toFixed(2)} m`, "sigma of position"],
       [`${p[4].toFixed(2)} m/s`, "speed"],
       [`${p[5].toFixed(0)} ± ${p[9].toFixed(0)}°`, "yaw, 1 sigma"],
-      [`${(p[3] - device.origin[2]).toFixed(1)} m`, "height"],
+      [`${(Math.round(10 * (p[3] - device.origin[2])) / 10 || 0).toFixed(1)} m`, "height"],
       [`${Math.floor(p[0] / 60)}:${String(Math.floor(p[0] % 60)).padStart(2, "0")}`, "min:s"]] : [];
     device.card.querySelector(".figures").replaceChildren(...figures.map(([value, what]) => {
       const box = document.createElement("div");
