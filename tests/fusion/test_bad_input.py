@@ -396,3 +396,22 @@ def test_a_network_that_claims_to_be_exact_is_not_believed(
     assert np.isfinite(track.covariance).all()
     assert np.sqrt(track.covariance[-1, 6, 6]) > 5e-3
     assert ate(track, walk) < 0.3
+
+
+def test_a_tenth_of_a_second_without_samples_hardly_moves_the_end(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Anywhere: nothing that is given out may hang on a hair."""
+    walk = make_walk(4, 40.0, 100.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    whole = Navigator(oracle, CONFIG).run(walk).trajectory
+    for start in (8.0, 15.0, 22.0, 29.0):
+        keep = (walk.time < start) | (walk.time > start + 0.12)
+        rows = (walk.time[keep], walk.gyro[keep], walk.accel[keep])
+        spoilt = replace(walk, time=rows[0], gyro=rows[1], accel=rows[2])
+        answering = make_oracle(spoilt, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+        ended = Navigator(answering, CONFIG).run(spoilt).trajectory
+        off = np.linalg.norm(ended.position_W[-1] - whole.position_W[-1])
+        assert off < 0.02 * walk.truth.path_length()
+        turned = ended.attitude_WB[-1] * whole.attitude_WB[-1].inv()
+        assert abs(np.degrees(turned.as_rotvec()[2])) < 3.0

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from support import CONFIG
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.continuous import LARGEST_STEP, ContinuousPose, advanced
 from stario.sequences.sequence import ImuSequence
-from tests.fusion.support import CONFIG
 
 Make = Callable[..., Any]
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from support import CONFIG
 
 from stario.fusion.evaluation.worth import Worth, worth_of, worth_table
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack
-from tests.fusion.support import CONFIG
 
 Make = Callable[..., Any]
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import CONFIG, streamed_off
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.filter.ekf import StateCloningEkf
@@ -18,7 +19,6 @@ from stario.fusion.navigator import Navigator as Stream
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from tests.fusion.support import CONFIG, streamed_off
 
 FIELD_W = np.array([15.0, 12.0, -40.0])
 Make = Callable[..., Any]
