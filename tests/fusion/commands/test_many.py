@@ -127,7 +127,7 @@ def test_evaluate_judges_by_groups_against_other_weights(
     assert done.code == 0
     [group] = json.loads(done.out)["groups"]
     assert group["recordings"] == 1
-    assert group["ratios"]["rms_10s_m"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
+    assert group["ratios"]["rms_1s_m"] == {"ratio": 1.0, "low": 1.0, "high": 1.0}
     assert 0.0 < group["medians"]["default"]["nis_ekf"] < 100.0
     assert 0.3 < group["medians"]["default"]["length_ratio"] < 1.3
     assert json.loads((tmp_path / "out/groups.json").read_text())["groups"] == [group]
