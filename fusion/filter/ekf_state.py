@@ -19,6 +19,9 @@ from stario.sequences.errors import InputError
 _CLONE_COLUMNS = [0, 1, 2, 4]
 """Columns R, p of a pose: a clone has no velocity."""
 
+_GYRO_BIAS = slice(9, 12)
+"""Rows of the gyroscope's bias in the error state."""
+
 _FAR = 1e3
 """Farther from the origin than this [m] positions are counted from a point nearby: in the
 right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
@@ -200,6 +203,12 @@ class EkfState:
         if self.field is not None and field_too:
             N[self.first_field, 0] = 1.0
         return replace(self, P=self.P + sigma**2 * (N @ N.T))
+
+    def with_gyro_bias_inflated(self, variance: float) -> EkfState:
+        """The gyroscope's bias less known, by a variance per axis [rad^2/s^2]."""
+        P = self.P.copy()
+        P[_GYRO_BIAS, _GYRO_BIAS] += variance * np.eye(3)
+        return replace(self, P=P)
 
     def with_position_inflated(self, sigma: float) -> EkfState:
         """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""

@@ -52,6 +52,9 @@ _RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
 may itself be wrong. Some five seconds of false displacements are bridged so."""
 
+_CORRECTED_BIAS = 0.01
+"""Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
+
 _ROUNDING = 1e-9
 """Of times [s]."""
 
@@ -89,6 +92,7 @@ class Estimator:
         )
         self._magnetic = MagneticReference()
         self._outlier_share = 0.5  # trust is to be earned
+        self._raw_bias = 0.0
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -182,11 +186,23 @@ class Estimator:
         s = self.ekf.state
         segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
         self.ekf.propagate(segment)
+        self._doubt_gyroscope(interval)
         if interval.gap:
             sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
             self.ekf.state = self.ekf.state.with_yaw_inflated(s.p_W, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
         return segment
+
+    def _doubt_gyroscope(self, interval: ImuInterval) -> None:
+        """A device whose rates gravity shows to be raw may be off as much about the vertical.
+
+        Corrected devices keep within 0.01 rad/s; others are off by up to 0.1, about every axis.
+        """
+        raw = interval.levelled_bias - _CORRECTED_BIAS
+        if raw > self._raw_bias:
+            variance = raw**2 - self._raw_bias**2
+            self.ekf.state = self.ekf.state.with_gyro_bias_inflated(variance)
+            self._raw_bias = raw
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self._map_frame.update(self.ekf, fix)
@@ -260,6 +276,7 @@ class Estimator:
             self._stillness.window,
             self._magnetic,
             self._outlier_share,
+            self._raw_bias,
             self._counts,
             self.in_gap,
             self.oldest,
@@ -271,6 +288,7 @@ class Estimator:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
         self._magnetic, self._outlier_share, self._counts = s.magnetic, s.outlier_share, s.counts
+        self._raw_bias = s.raw_bias
         self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
 
     @property

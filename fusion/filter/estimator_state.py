@@ -56,6 +56,7 @@ class EstimatorState:
         stillness: the last second's sums (`StillnessDetector`).
         magnetic: what the magnetic field usually is.
         outlier_share: of the displacements of late.
+        raw_bias: of the gyroscope, beyond what a device leaves that corrects it [rad/s].
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
@@ -68,6 +69,7 @@ class EstimatorState:
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference
     outlier_share: float
+    raw_bias: float
     counts: UpdateCounts
     in_gap: bool
     oldest: Estimate | None

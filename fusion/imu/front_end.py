@@ -311,7 +311,8 @@ def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) 
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)
-    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB)
+    bias = float(np.linalg.norm(attitude.b_g))
+    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB, levelled_bias=bias)
 
 
 def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:

@@ -44,6 +44,7 @@ class ImuInterval:
         window: (6, 200) the network's input that ends here, None where there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
         heading: of the device in N, averaged over the window [rad].
+        levelled_bias: size of the gyroscope's bias as far as gravity tells it [rad/s].
         field_B: (3,) magnetic field at its end [uT], None where none was measured.
     """
 
@@ -57,6 +58,7 @@ class ImuInterval:
     window: NDArray[np.float32] | None = None
     R_NB_window: FloatArray | None = None
     heading: float = 0.0
+    levelled_bias: float = 0.0
     field_B: FloatArray | None = None
     anew: Start | None = None
     flags: Flags = NO_FLAGS

@@ -1,0 +1,49 @@
+"""A gyroscope that hands out raw rates: gravity shows it, and the filter's prior widens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavigatorConfig
+from stario.sequences import ImuSequence
+
+RAW = np.array([0.04, -0.03, 0.05])
+"""As of an iPhone 5 [rad/s]."""
+
+
+def biased(walk: ImuSequence, bias: np.ndarray) -> ImuSequence:
+    return replace(walk, gyro=walk.gyro + bias)
+
+
+def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle) -> None:
+    config = NavigatorConfig()
+    walk = biased(make_walk(seed=2, seconds=40.0), RAW)
+    track = Navigator(make_oracle(walk, walk.truth, config), config).run(walk)
+    error = track.arrays()["gyro_bias_B"][-1] - RAW
+    sigma = np.sqrt(np.diagonal(track.covariance[-1])[9:12])
+    # Forty seconds do not tell it well; a prior of 2.5e-3 rad/s would have forbidden it.
+    assert np.linalg.norm(error) < 0.6 * np.linalg.norm(RAW)
+    assert (np.abs(error) < 3.0 * sigma).all()
+
+
+@pytest.mark.parametrize("size", [0.0, 3e-3])
+def test_a_corrected_gyroscope_keeps_its_prior(make_walk, still_model, size: float) -> None:
+    """To the bit: nothing is added below the size that corrected devices keep within."""
+    walk = biased(make_walk(seed=2, seconds=20.0), np.array([size, 0.0, 0.0]))
+    navigator = Navigator(still_model)
+    intervals = navigator.observe(walk).intervals
+    assert max(interval.levelled_bias for interval in intervals) < 0.01
+
+
+def test_the_doubt_grows_without_a_jump(make_walk, make_oracle) -> None:
+    """A little more bias is a little more doubt: two near recordings end near each other."""
+    ends = []
+    for size in (0.030, 0.0302):
+        walk = biased(make_walk(seed=2, seconds=30.0), np.array([size, 0.0, 0.0]))
+        config = NavigatorConfig()
+        track = Navigator(make_oracle(walk, walk.truth, config), config).run(walk)
+        ends.append(track.trajectory.position_W[-1])
+    assert np.linalg.norm(ends[1] - ends[0]) < 0.1
