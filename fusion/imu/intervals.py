@@ -151,6 +151,6 @@ class SampleCounts:
             return []
         share = self.unfamiliar / self.windows
         return [
-            f"{share:.0%} of the windows move as little that the weights were trained on: "
+            f"{share:.0%} of the windows move unlike all that the weights were trained on: "
             "the network's sigma is widened there"
         ]

@@ -99,7 +99,7 @@ def test_health_in_words_says_what_to_do():
     noted = findings(
         Health(
             mean_nis=3.0,
-            notes=["60% of the windows move as little that the weights were trained on"],
+            notes=["60% of the windows move unlike all that the weights were trained on"],
         )
     )
     assert [finding.level for finding in noted] == ["warning"]
