@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.config import TrainingConfig
-from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss
+from stario.network.training.weak_truth import LegBatch, LegSampler, by_kind, leg_loss
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.rotations import about_z
@@ -103,12 +103,8 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
         config.augmentation, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
         gyro_noise=0.0, accel_noise=0.0,
     )  # fmt: skip
-    for kind, seconds in (
-        ("waypoints", config.waypoint_seconds),
-        ("positions", config.track_seconds),
-    ):
-        members = [s for s in legs if s.kind == kind and len(s) > seconds * WINDOW_SAMPLES]
-        if members:
+    for kind, members, seconds, _ in by_kind(legs, config):
+        if any(len(stream) > seconds * WINDOW_SAMPLES for stream in members):
             generator = torch.Generator().manual_seed(0)
             found[kind] = LegSampler(members, seconds, plain, generator).batch(_STRETCHES)
     return found

@@ -165,12 +165,22 @@ def leg_samplers(
     """
     if streams and config.successive > 1:
         raise ConfigError("successive", str(config.successive), "1 beside positions or waypoints")
+    return [
+        (LegSampler(members, seconds, config.augmentation, beside.generator), stretches)
+        for _, members, seconds, stretches in by_kind(streams, config)
+    ]
+
+
+def by_kind(
+    streams: Sequence[LegStream], config: TrainingConfig
+) -> list[tuple[str, list[LegStream], int, int]]:
+    """Each kind that there is: its name, its streams, windows in a stretch, stretches in a step."""
     kinds = (
         ("waypoints", config.waypoint_seconds, config.waypoint_stretches),
         ("positions", config.track_seconds, config.track_stretches),
     )
     return [
-        (LegSampler(members, seconds, config.augmentation, beside.generator), stretches)
+        (kind, members, seconds, stretches)
         for kind, seconds, stretches in kinds
         if (members := [stream for stream in streams if stream.kind == kind])
     ]

@@ -8,6 +8,7 @@ the latter three numbers may be written with a decimal comma.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from stario.sequences.readers.sensor_words import (
     time_unit_of,
     unit_of,
 )
-from stario.sequences.readers.text import IntArray, head_lines, read_table
+from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
@@ -131,17 +132,7 @@ def read_samples(
         ReadError: a row is malformed, a unit is unknown, or a value is none that a sensor gives.
     """
     places = table.axes[axes]
-    used = [table.clock, *places, *table.biases]
-    indices = [place.index for place in used]
-    rows = read_table(
-        table.file,
-        max(indices) + 1,
-        table.skip,
-        table.delimiter,
-        indices,
-        table.decimal,
-        killed=True,
-    )
+    rows = _rows(table, [table.clock, *places, *table.biases])
     kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
     values = rows.values[:, 1:4]
@@ -159,6 +150,15 @@ def read_samples(
     if sensor != "mag":
         checked(table.file, titles, np.where(kept.reshape(-1, 1), values, 0.0), rows.first_row)
     return Samples(stamps[kept], values[kept], unit)
+
+
+def _rows(table: SensorTable, used: Sequence[Place]) -> Table:
+    """The columns asked for; what a killed recorder left of a last row is left out."""
+    indices = [place.index for place in used]
+    columns = max(indices) + 1
+    return read_table(
+        table.file, columns, table.skip, table.delimiter, indices, table.decimal, killed=True
+    )
 
 
 def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:
@@ -179,16 +179,7 @@ def read_quaternion(
     Raises:
         ReadError: a row is malformed.
     """
-    indices = [place.index for place in (table.clock, *table.quaternion)]
-    rows = read_table(
-        table.file,
-        max(indices) + 1,
-        table.skip,
-        table.delimiter,
-        indices,
-        table.decimal,
-        killed=True,
-    )
+    rows = _rows(table, [table.clock, *table.quaternion])
     if per_second is None or table.clock.unit:
         per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
