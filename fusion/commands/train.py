@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import (
-    JobsOption,
-    PathsArgument,
-    Reading,
-    grouped,
-    leave_with_skipped,
-    progress_bar,
-)
+from stario.fusion.commands.common import leave_with_skipped, progress_bar
+from stario.fusion.commands.options import JobsOption, PathsArgument, Reading, grouped
 from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
