@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,8 +16,9 @@ from stario.fusion.commands.common import (
     grouped,
     leave_with_skipped,
     progress_bar,
+    recipe_values,
 )
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
@@ -164,14 +164,7 @@ def train(
 def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     from stario.network.training.config import training_config
 
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ConfigError(str(path), str(error), "a JSON file with settings") from error
-        if not isinstance(values, dict):
-            raise ConfigError(str(path), type(values).__name__, "a table of settings")
+    values = {} if path is None else recipe_values(path)
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
