@@ -53,12 +53,13 @@ def train(
             "the test recordings, choose and calibrate by those of its list `holdout`."
         ),
     ] = None,
-    few: Annotated[
-        bool,
+    learn_from: Annotated[
+        str,
         typer.Option(
-            "--few", help="With --data: the eight recordings of the paper's comparison alone."
+            help="With --data: all; open, those whose licence allows any use; or few, the eight "
+            "recordings of the paper's comparison."
         ),
-    ] = False,
+    ] = "all",
     leave_out: Annotated[
         str | None,
         typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
@@ -112,7 +113,7 @@ def train(
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
-        reading, paths or [], validation or [], _lists(data, leave_out, few), streams_of
+        reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
@@ -168,24 +169,29 @@ def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
-def _lists(data: Path | None, group: str | None, few: bool) -> tuple[list[Path], list[Path]]:
+def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
     """Recordings to learn from and to be kept, of the lists in the package."""
-    from stario.network.training.splits import listed, split_paths
+    from stario.network.training.splits import listed
     from stario.sequences.splits import leave_out
 
     if data is None:
-        if group is not None:
-            raise InputError("--leave-out", "no --data", "the folder of the development recordings")
+        for option, given in (("--leave-out", group is not None), ("--learn-from", name != "all")):
+            if given:
+                raise InputError(option, "no --data", "the folder of the development recordings")
         return [], []
-    if few:
-        return split_paths(data, "training"), split_paths(data, "validation")
-    everything = listed("all", data)
+    if name not in ("all", "open", "few"):
+        raise InputError("--learn-from", repr(name), "all, open or few")
+    everything = (
+        listed("training", data) + listed("validation", data)
+        if name == "few"
+        else listed(name, data)
+    )
     if group is not None:
         outside, inside = leave_out(everything, group)
     else:
-        inside = listed("holdout", data)
-        kept = {one.path for one in inside}
-        outside = [one for one in everything if one.path not in kept]
+        held = {one.path for one in listed("holdout", data)}
+        outside = [one for one in everything if one.path not in held]
+        inside = [one for one in everything if one.path in held]
     return [one.path for one in outside], [one.path for one in inside]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from stario.fusion.filter.estimate import Estimate
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.lie import FloatArray, skew
+from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 
 _CLONE_COLUMNS = [0, 1, 2, 4]
@@ -71,24 +72,14 @@ class EkfState:
     field: FieldState | None = None
 
     @classmethod
-    def initial(
-        cls,
-        time: float,
-        R_WB: FloatArray,
-        v_W: FloatArray,
-        p_W: FloatArray,
-        b_g: FloatArray,
-        b_a: FloatArray,
-        covariance: FloatArray,
-        slots: int,
-    ) -> EkfState:
-        """A state without clones; the covariance (15, 15) is that of `plain_covariance`."""
-        origin_W = p_W if np.linalg.norm(p_W) > _FAR else np.zeros(3)
+    def initial(cls, state: NavState, slots: int) -> EkfState:
+        """A state without clones, from one with plain errors."""
+        origin_W = state.p_W if np.linalg.norm(state.p_W) > _FAR else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
-        X[0, :, :3], X[0, :, 3], X[0, :, 4] = R_WB, v_W, p_W - origin_W
+        X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
         P = np.zeros((CORE + CLONE * slots,) * 2)
-        P[:CORE, :CORE] = plain_covariance(covariance, -X[0, :, 3:].T)
-        return cls(time, X, origin_W, b_g, b_a, P, (None,) * slots)
+        P[:CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
+        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
 
     @property
     def R_WB(self) -> FloatArray:

@@ -168,4 +168,4 @@ class FixedLagEstimator:
             self._ahead.propagate(segment)
 
     def _restart_from(self, s: NavState) -> None:
-        self._ahead.initialise(s.time, s.R_WB, s.v_W, s.p_W, s.b_g, s.b_a, s.covariance)
+        self._ahead.initialise(s)

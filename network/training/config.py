@@ -86,7 +86,8 @@ class TrainingConfig:
         track_stretches: the same of stretches along a track of positions without attitude.
         track_seconds: windows in each; short, as heads and phones drift apart in yaw.
         shares: of the windows that each source makes up, by a part of its recordings' path;
-            those that none names are drawn by their length and liveliness.
+            those that none names are drawn by their length and liveliness. "simulated" is the
+            share of simulated walks among all windows.
         compiled: compile the network for training (torch.compile; needs a C++ compiler on CPUs,
             which saves a third of the time).
         augmentation: how windows are varied.

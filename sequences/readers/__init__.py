@@ -23,6 +23,7 @@ from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.euroc import is_euroc, read_euroc
 from stario.sequences.readers.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.imunet import is_imunet, read_imunet
+from stario.sequences.readers.json_export import is_json_export, laid_out
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
@@ -63,17 +64,30 @@ def _is_archive_or_member(path: Path) -> bool:
 def _read_zip(path: Path) -> ImuSequence:
     """Read the one recording in a zip; its errors name the zip and the file in it."""
     with unpacked(path) as folder:
-        try:
-            found = find_recordings(folder)
-            if len(found) > 1:
-                names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
-                expected = "one recording in a zip"
-                raise ReadError(path, "zip", f"{len(found)}, {names}", expected, "unpack it")
-            sequence = read_recording(found[0])
-        except ReadError as error:
-            field = error.field.replace(str(folder), str(path))
-            raise ReadError(path, field, error.found, error.expected, error.fix) from None
-    return replace(sequence, name=path.stem) if found[0] == folder else sequence
+        found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
+        if len(found) > 1:
+            names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
+            raise ReadError(
+                path, "content", f"{len(found)} recordings, {names}", "one", "unpack it"
+            )
+        return _read_unpacked(path, folder, found[0] if found else folder)
+
+
+def _read_json(path: Path) -> ImuSequence:
+    with laid_out(path) as folder:
+        return _read_unpacked(path, folder, folder)
+
+
+def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
+    """Read what was unpacked from `path`; errors name `path` instead of the folder."""
+    try:
+        sequence = read_recording(inside)
+    except ReadError as error:
+        file = str(error.path).replace(str(folder), str(path))
+        field = error.field.removeprefix(f"{error.path}: ")
+        found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
+        raise ReadError(file, field, found, error.expected, fix) from None
+    return replace(sequence, name=path.stem) if inside == folder else sequence
 
 
 FORMATS: dict[str, Format] = {
@@ -91,12 +105,25 @@ FORMATS: dict[str, Format] = {
     "wide": Format(is_wide, read_wide),
     "events": Format(is_event_lines, read_event_lines),
     "zip": Format(is_zip, _read_zip),
+    "json": Format(is_json_export, _read_json),
     "csv": Format(is_own_csv, read_own_csv),
 }
 """Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
 well, `ridi` that of IMUNet's processed recordings."""
 
-_SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".bag", ".mcap", ".db3", ".hdf5", ".h5", ".zip")
+_SUFFIXES = (
+    ".csv",
+    ".txt",
+    ".tsv",
+    ".log",
+    ".bag",
+    ".mcap",
+    ".db3",
+    ".hdf5",
+    ".h5",
+    ".zip",
+    ".json",
+)
 """Files that may be a recording by themselves."""
 
 
