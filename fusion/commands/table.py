@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import Reading as ReadingOptions
-from stario.fusion.commands.common import leave_with_skipped, recipe_values
+from stario.fusion.commands.common import leave_with_skipped
+from stario.fusion.commands.options import Reading as ReadingOptions
+from stario.fusion.commands.options import recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
