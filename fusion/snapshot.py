@@ -44,7 +44,6 @@ def _classes() -> dict[str, type]:
     from stario.fusion import config, continuous, fixes
     from stario.fusion.filter import (
         ekf_state,
-        estimate,
         estimator_state,
         frame_transform,
         initial,
@@ -67,7 +66,7 @@ def _classes() -> dict[str, type]:
             ekf_state.EkfState,
             ekf_state.FieldState,
             magnetic.MagneticReference,
-            estimate.Estimate,
+            ekf_state.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,
         ),

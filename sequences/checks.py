@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
+from stario.sequences.rotations import cumulative_rotations
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
-from stario.sequences.truth.alignment import cumulative_rotations
 from stario.sequences.truth.fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken

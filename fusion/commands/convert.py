@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import Reading, grouped, leave_with_skipped
+from stario.fusion.commands.common import leave_with_skipped
+from stario.fusion.commands.options import Reading, grouped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:

@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import (
-    JobsOption,
-    PathsArgument,
-    Reading,
-    grouped,
-    leave_with_skipped,
-    progress_bar,
-)
+from stario.fusion.commands.common import leave_with_skipped, progress_bar
+from stario.fusion.commands.options import JobsOption, PathsArgument, Reading, grouped
 from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -148,7 +142,9 @@ def train(
             on_step=lambda step, error: progress(step / recipe.steps),
             on_epoch=lambda report: typer.echo(
                 f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
-                f"validation {report.validation_error:.4f} m^2",
+                f"validation {report.validation_error:.4f} m^2; "
+                f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
+                "time in drawing them",
                 err=True,
             ),
             trained_on=material.words,

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.ekf_state import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose

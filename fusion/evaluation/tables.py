@@ -25,6 +25,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.text_table import aligned
 
 PROTOCOLS = {
     "network_true_attitude": "network, true attitude",
@@ -162,20 +163,15 @@ def table_text(table: NetworkTable) -> str:
     """The table for a person: a block for each protocol and metric, recordings by networks."""
     networks = list(table.parameters)
     recordings = list(dict.fromkeys(e.recording for e in table.entries))
-    width = max([12, *(len(name) + 2 for name in networks)])
-    first = max([12, *(len(name) + 2 for name in recordings)])
     lines = []
     for protocol, words in PROTOCOLS.items():
         for metric, title in METRICS.items():
             lines.append(f"{words}: {title}")
-            lines.append(f"{'':<{first}}" + "".join(f"{name:>{width}}" for name in networks))
+            rows = [["", *networks]]
             for recording in [*recordings, ""]:
                 cells = [table.mean_and_spread(n, protocol, metric, recording) for n in networks]
-                lines.append(
-                    f"{recording or 'mean':<{first}}"
-                    + "".join(f"{_cell(*cell):>{width}}" for cell in cells)
-                )
-            lines.append("")
+                rows.append([recording or "mean", *(_cell(*cell) for cell in cells)])
+            lines += [*aligned(rows), ""]
     return "\n".join([*lines, *(f"{name}: {text}." for name, text in _words(table).items())])
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
@@ -35,8 +35,7 @@ from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocit
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.segments import segment_of
+from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.map_frame import MapFrameState

@@ -15,8 +15,7 @@ from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.segments import segment_of, segment_of_all
+from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
 from stario.fusion.lie import FloatArray, exp_so3, log_so3, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.windows import WINDOW_SECONDS

@@ -14,8 +14,7 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimate import nav_states
+from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.initial import PriorPose

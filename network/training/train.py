@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -40,12 +41,23 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What one epoch ended with; errors are mean squared displacement errors [m^2]."""
+    """What one epoch ended with; errors are mean squared displacement errors [m^2].
+
+    Attributes:
+        epoch: its number, from 1.
+        training_error: of its augmented windows.
+        validation_error: mean over recordings and kinds of weak truth.
+        validation_by_recording: of each of them.
+        windows_per_second: learned from, of this process, with and without full truth.
+        drawing_share: of the time that went into drawing them, the network waiting.
+    """
 
     epoch: int
     training_error: float
     validation_error: float
     validation_by_recording: dict[str, float]
+    windows_per_second: float = 0.0
+    drawing_share: float = 0.0
 
 
 def train(
@@ -141,6 +153,7 @@ class _Run:
         if not workers.leads:
             torch.manual_seed(config.seed + workers.rank)  # dropout of its own
         self.step = 0
+        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         self.history: list[EpochReport] = []
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -162,6 +175,7 @@ class _Run:
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
         """One epoch; returns the mean squared error on its (augmented) windows."""
         self.network.train()
+        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         errors = []
         for _ in range(self.config.steps_per_epoch):
             errors.append(self._one_step())
@@ -171,9 +185,11 @@ class _Run:
     def _one_step(self) -> float:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
+        begin = perf_counter()
         drawn = self.sampler.batch(self.config.batch // self.config.successive)
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
         legs = [sampler.batch(size).to(self.device) for sampler, size in self.legs]
+        ready = perf_counter()
         loss, error = self._loss(windows, target, legs)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
@@ -182,6 +198,10 @@ class _Run:
         self.optimiser.step()
         self.step += 1
         self._average()
+        self._drawing_s += ready - begin
+        self._learning_s += perf_counter() - ready
+        parts = [windows, *(part.windows for part in legs)]
+        self._windows += sum(part[..., 0, 0].numel() for part in parts)
         return error
 
     def _loss(
@@ -253,6 +273,8 @@ class _Run:
             training_error=training_error,
             validation_error=self.workers.agreed(float(np.mean(list(errors.values()) or [0.0]))),
             validation_by_recording=errors,
+            windows_per_second=self._windows / (self._drawing_s + self._learning_s),
+            drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
         )
 
     def record(self, report: EpochReport) -> None:

@@ -3,7 +3,7 @@ import pytest
 
 from stario.fusion.evaluation.benchmark import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimate import plain_covariances
+from stario.fusion.filter.ekf_state import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import exp_se23, exp_so3, log_so3, skew

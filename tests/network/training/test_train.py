@@ -87,6 +87,16 @@ def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
     assert list(reports[-1].validation_by_recording) == ["c", "d"]
 
 
+def test_an_epoch_tells_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that goes on by a second whenever it is read."""
+    clock = count()
+    monkeypatch.setattr("stario.network.training.train.perf_counter", lambda: float(next(clock)))
+    reports: list[EpochReport] = []
+    run(tmp_path, replace(TINY, epochs=1), on_epoch=reports.append)
+    assert reports[0].windows_per_second == TINY.batch / 2
+    assert reports[0].drawing_share == 0.5
+
+
 def test_the_model_predicts_what_it_was_validated_on(
     finished: tuple[Path, list[EpochReport]],
 ) -> None:
