@@ -170,7 +170,7 @@ class Inspection:
     def _timing_lines(self) -> list[str]:
         t = self.timing
         lines = [
-            f"{self.name}: {t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
+            f"{t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
             f"jitter {1e3 * t.jitter_s:.2f} ms"
         ]
         if t.gaps:

@@ -56,7 +56,9 @@ def _inspect(
     record = found.as_dict() | {"motion": motion and motion.as_dict()}
     write_json(folder / "inspection.json", record)
     if told:
-        typer.echo("\n".join([*found.lines(), *(motion.lines() if motion else [])]))
+        typer.echo(
+            "\n".join([sequence.summary(), *found.lines(), *(motion.lines() if motion else [])])
+        )
         typer.echo(f"figure: {folder / 'inspection.png'}")
     return record
 

@@ -49,11 +49,13 @@ class Format:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
         read: reads it, or raises ReadError.
+        words: what it is called before a person, where the reader knows no better.
         options: names of what else `read` takes, all text.
     """
 
     recognises: Callable[[Path], bool]
     read: Callable[..., ImuSequence]
+    words: str
     options: tuple[str, ...] = ()
 
 
@@ -91,38 +93,29 @@ def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
 
 
 FORMATS: dict[str, Format] = {
-    "archive": Format(_is_archive_or_member, read_archive),
-    "ronin": Format(is_ronin, read_ronin),
-    "ridi": Format(is_ridi, read_ridi),
-    "imunet": Format(is_imunet, read_imunet),
-    "rnin": Format(is_rnin, read_rnin),
-    "tlio": Format(is_tlio, read_tlio),
-    "bag": Format(is_bag, read_bag, options=("imu_topic", "truth_topic")),
-    "euroc": Format(is_euroc, read_euroc),
-    "oxiod": Format(is_oxiod, read_oxiod),
-    "advio": Format(is_advio, read_advio),
-    "phone": Format(is_phone, read_phone),
-    "wide": Format(is_wide, read_wide),
-    "events": Format(is_event_lines, read_event_lines),
-    "zip": Format(is_zip, _read_zip),
-    "json": Format(is_json_export, _read_json),
-    "csv": Format(is_own_csv, read_own_csv),
+    "archive": Format(_is_archive_or_member, read_archive, "archive"),
+    "ronin": Format(is_ronin, read_ronin, "RoNIN"),
+    "ridi": Format(is_ridi, read_ridi, "RIDI"),
+    "imunet": Format(is_imunet, read_imunet, "IMUNet's recorder"),
+    "rnin": Format(is_rnin, read_rnin, "RNIN"),
+    "tlio": Format(is_tlio, read_tlio, "TLIO"),
+    "bag": Format(is_bag, read_bag, "ROS bag", options=("imu_topic", "truth_topic")),
+    "euroc": Format(is_euroc, read_euroc, "EuRoC layout"),
+    "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
+    "advio": Format(is_advio, read_advio, "ADVIO"),
+    "phone": Format(is_phone, read_phone, "phone"),
+    "wide": Format(is_wide, read_wide, "phone"),
+    "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
+    "zip": Format(is_zip, _read_zip, "zip"),
+    "json": Format(is_json_export, _read_json, "Sensor Logger"),
+    "csv": Format(is_own_csv, read_own_csv, "CSV of one's own"),
 }
 """Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
 well, `ridi` that of IMUNet's processed recordings."""
 
 _SUFFIXES = (
-    ".csv",
-    ".txt",
-    ".tsv",
-    ".log",
-    ".bag",
-    ".mcap",
-    ".db3",
-    ".hdf5",
-    ".h5",
-    ".zip",
-    ".json",
+    *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
+    *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
 """Files that may be a recording by themselves."""
 
@@ -151,7 +144,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
             raise InputError(option, f"an option of a {name} recording", known)
-    return FORMATS[name].read(path, **options)
+    sequence = FORMATS[name].read(path, **options)
+    return sequence if sequence.source else replace(sequence, source=FORMATS[name].words)
 
 
 def find_recordings(

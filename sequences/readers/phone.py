@@ -27,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.apps import app_of
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import on_one_clock
 from stario.sequences.readers.own_csv import is_own_csv
@@ -160,6 +161,7 @@ def assembled(
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0]),
         device_attitude=_device_attitude(attitude, stamps[0]),
+        source="" if core_motion else app_of(files),
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:

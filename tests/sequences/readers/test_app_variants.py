@@ -288,6 +288,16 @@ def test_a_variant_is_the_same_walk(variant: str, walk: ImuSequence, tmp_path: P
         np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
 
 
+def test_a_recording_says_in_a_line_what_it_is(walk: ImuSequence, tmp_path: Path) -> None:
+    android(tmp_path / "a", walk)
+    ios_logger(tmp_path / "b", walk)
+    tail = "15.0 s at 100.0 Hz, magnetometer at 100 Hz"
+    assert read_recording(tmp_path / "a").summary() == f"a: Sensor Logger, {tail}, truth: none"
+    assert read_recording(tmp_path / "b").summary() == (
+        f"b: iOS Logger, {tail}, the device's own attitude, truth: none"
+    )
+
+
 def test_sensors_of_different_rates_keep_the_gyroscopes(walk: ImuSequence, tmp_path: Path) -> None:
     save(tmp_path / "s/Gyroscope.csv", ZYX, ns(walk), walk.time, walk.gyro[:, ::-1])
     rows = slice(None, None, 2)
