@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import Estimate
@@ -26,6 +25,7 @@ from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray, exp_so3, log_se23, yaw_rotation
 from stario.sequences.errors import InputError
+from stario.sequences.nees import nees_bounds
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -111,13 +111,12 @@ def consistency(
         nis.append(run_nis)
         progress((k + 1) / runs)
     table = np.stack(tables)  # runs, seconds, (nees, yaw error^2, yaw variance)
-    low, high = (float(chi2.ppf(p, CORE * runs)) / runs for p in (0.025, 0.975))
     return Consistency(
         runs=runs,
         seconds=seconds,
         nees=float(table[:, :, 0].mean()),
         nees_end=float(table[:, -1, 0].mean()),
-        nees_bounds=(low, high),
+        nees_bounds=nees_bounds(CORE, runs),
         yaw=float((table[:, :, 1] / table[:, :, 2]).mean()),
         nis=float(np.mean(nis)),
         yaw_sigma=float(np.sqrt(table[:, -1, 2].mean())),

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.noise import PHONE_NOISE
 
 _PROBABILITY = 0.999
