@@ -116,6 +116,8 @@ def _data_sets(
         name, equals, folder = word.partition("=")
         if not (name and equals and folder):
             raise InputError("--set", repr(word), "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        if name in {one.name for one in known}:
+            raise InputError("--set", repr(name), "a name of its own", f"leave {name} out: --sets")
         known.append(folder_set(name, Path(folder), seed))
     return known
 

@@ -6,16 +6,15 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.tables import Entry, NetworkTable, Sample
+from stario.fusion.evaluation.tables import METRICS, Entry, NetworkTable, Sample
 from stario.fusion.table.cells import Cell, read_tracks
-from stario.fusion.table.errors import CONVENTION
+from stario.fusion.table.errors import CONVENTION, TRUE_ATTITUDE
 from stario.fusion.table.summary import (
     COLUMNS,
     Filled,
@@ -74,7 +73,7 @@ def write_results(
     with atomic_write(out / "table.csv") as file:
         file.write(_csv(tables))
     for name, found in filled.items() if drawn else ():
-        samples = _samples([cell for cell in cells if cell.dataset.name == name], out)
+        samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
         table = _network_table(found, samples)
         if table.entries:
             folder = out / name / "figures"
@@ -106,25 +105,34 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
         for seed, content in filled[name].items():
             for one in content["recordings"]:
                 for protocol, errors in one["tracks"].items():
-                    values = (float("nan") if e is None else e for e in errors.values())
+                    values = (_number(errors[metric]) for metric in METRICS)
                     table.entries.append(
                         Entry(one["recording"], name, f"seed {seed}", protocol, *values)
                     )
     return table
 
 
-def _samples(cells: Sequence[Cell], out: Path) -> list[Sample]:
+def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
     """Tracks of some recordings, each network's of its first seed."""
     samples: dict[str, Sample] = {}
     for cell in cells:
-        if cell.recipe is None or cell.seed != 0:
+        content = filled.get(cell.network, {}).get(cell.seed)
+        if cell.recipe is None or cell.seed != 0 or content is None:
             continue
+        found = {one["recording"]: one["tracks"] for one in content["recordings"]}
         for name, shown in read_tracks(cell, out).items():
             track = _level(shown.time, shown.position_W)
             truth = _level(shown.time, shown.truth_W)
-            sample = samples.setdefault(name, Sample(name, truth, {}))
-            samples[name] = replace(sample, tracks={**sample.tracks, cell.network: track})
+            errors = found[name][TRUE_ATTITUDE]
+            sample = samples.setdefault(name, Sample(name, truth, {}, {}))
+            sample.tracks[cell.network] = track
+            sample.errors[cell.network] = _number(errors["ate_m"]), _number(errors["rte_m"])
     return list(samples.values())
+
+
+def _number(value: float | None) -> float:
+    """JSON has no nan."""
+    return float("nan") if value is None else value
 
 
 def _level(time: FloatArray, xy: FloatArray) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import pickle
 from functools import partial
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from stario.fusion.commands.cli import app
 from stario.fusion.table import cells as cells_module
 from stario.fusion.table import training
 from stario.fusion.table.cells import LEADING, Cell, fill_cell
@@ -160,3 +163,31 @@ def test_a_cell_travels_to_other_machines(dataset: DataSet, reading: Reading) ->
 def test_an_unknown_backend_is_refused() -> None:
     with pytest.raises(ConfigError, match="--backend"):
         backend("mpi")
+
+
+def test_the_command_leaves_tables_and_figures(
+    dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = dataset.training[0].parent
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
+    out = tmp_path / "out"
+    arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]
+    arguments += ["--networks", "DeepILS,R-ResNet", "--config", str(tmp_path / "recipe.json")]
+    done = CliRunner().invoke(app, ["check", "table", *arguments])
+    assert done.exit_code == 0, done.output
+    text = (out / "table.md").read_text()
+    assert text in done.output
+    for words in ("1 steps of 6 windows", "| R-ResNet |", "`pdr`", "4.165, 3.724", "core hours"):
+        assert words in text
+    with (out / "table.csv").open() as file:
+        assert [row["network"] for row in csv.DictReader(file)] == [
+            "pdr", "R-ResNet", "DeepILS", "default",
+        ]  # fmt: skip
+    content = json.loads((out / "table.json").read_text())["sets"]["ronin"]
+    assert (content["training"], content["validation"], content["tested"]) == (2, 1, 1)
+    figures = {path.name for path in (out / "ronin/figures").glob("*.png")}
+    assert figures == {"ate_parameters.png", "distributions.png", "pde.png", "trajectories.png"}
+    clash = ["check", "table", "--out", str(out), "--set", f"a={folder}", "--set", f"a={folder}"]
+    with pytest.raises(InputError, match="a name of its own"):
+        CliRunner().invoke(app, clash, catch_exceptions=False)
