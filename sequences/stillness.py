@@ -1,10 +1,10 @@
 """Stillness: stretches in which a device lies still, and what its sensors say there.
 
 One test for all who ask, each with the factor that its question needs: the scatter of both sensors
-about their means against the white noise of a phone's IMU (`PHONE_NOISE`), by chi-square. A filter's
-own densities are no measure here: they stand for errors of scale and alignment, which only motion
-brings. (Whether a start's mean force shows the vertical is another question: a hand may tremble,
-but a trolley may not gain speed; `levelling`.)
+about their means against the white noise of a phone's IMU (`PHONE_NOISE`), by chi-square. The
+filter's own densities are no measure here: they stand for errors of scale and alignment, which only
+motion brings. (Whether a start's mean force shows the vertical is another question: a hand may
+tremble, but a trolley may not gain speed; `levelling`.)
 
 Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
 rate and whatever filter the sensor has above 10 Hz (IEEE Std 952, annex C).
