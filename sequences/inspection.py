@@ -18,7 +18,7 @@ from stario.sequences.sequence import (
     is_gap,
     too_slow,
 )
-from stario.sequences.still import Rest, find_rest
+from stario.sequences.stillness import Rest, find_rest
 from stario.sequences.truth.fit import TruthFit, fit_truth
 
 _LATE_S = 0.02

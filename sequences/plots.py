@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from stario.sequences.boxes import box_of, excess, frame_around, rounds, size_of
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.metrics import PoseErrors, pose_errors
@@ -379,7 +379,7 @@ def _reach(*values: FloatArray) -> float:
 
 
 def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
-    low, bound, top = chi2.ppf([0.001, 0.95, 0.9999], dof)
+    low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
     _draw_dots(axes, time, np.maximum(nis, low), gated)
     axes.axhline(dof, color=_INK, lw=1.0, label=f"expected {dof}")
     axes.axhline(bound, color=_INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")

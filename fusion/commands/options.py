@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import typing
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.sequences.errors import InputError, StarioError
+from stario.sequences.errors import ConfigError, InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
@@ -202,6 +203,21 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     flat.__annotations__ = {name: option.annotation for name, option in options.items()}
     return flat
+
+
+def recipe_values(path: Path) -> dict[str, Any]:
+    """Settings of a training recipe, of a JSON file.
+
+    Raises:
+        ConfigError: it cannot be read, or is no table of settings.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(str(path), str(error), "a JSON file with settings") from error
+    if not isinstance(values, dict):
+        raise ConfigError(str(path), type(values).__name__, "a table of settings")
+    return values
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

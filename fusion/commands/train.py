@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stario.fusion.commands.common import leave_with_skipped, progress_bar
-from stario.fusion.commands.options import JobsOption, PathsArgument, Reading, grouped
-from stario.sequences.errors import ConfigError, InputError
+from stario.fusion.commands.options import (
+    JobsOption,
+    PathsArgument,
+    Reading,
+    grouped,
+    recipe_values,
+)
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
@@ -161,14 +166,7 @@ def train(
 def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     from stario.network.training.config import training_config
 
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ConfigError(str(path), str(error), "a JSON file with settings") from error
-        if not isinstance(values, dict):
-            raise ConfigError(str(path), type(values).__name__, "a table of settings")
+    values = {} if path is None else recipe_values(path)
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 

@@ -19,7 +19,8 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track, track_from_states
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import evaluate_track, position_nees
+from stario.sequences.metrics import evaluate_track
+from stario.sequences.nees import position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu

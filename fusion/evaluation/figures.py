@@ -136,28 +136,28 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
         _draw_sample(axes, sample, colours)
     for axes in panels[len(samples) :]:
         axes.remove()
-    handles, labels = panels[0].get_legend_handles_labels()
-    fig.legend(
-        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=9
-    )
     return fig
 
 
 def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     path = sample.truth.position_W[sample.truth.valid]
-    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label="truth")
+    length = sample.truth.path_length()
+    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label=f"truth, {length:.0f} m")
     names = list(sample.tracks)
     if _AGAINST in names:
         ours = [name for name in names if name.startswith("StarIO")]
         names = [_AGAINST, *(ours or [n for n in names if n != _AGAINST])]
     for name in names[:4]:
         track, colour = sample.tracks[name].position_W, colours[name]
-        axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=name)
+        ate, rte = sample.errors[name]
+        label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"
+        axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=label)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
     axes.plot(*path[0, :2], "o", mfc="white", mec=_INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     _dress(axes)
 
 

@@ -62,11 +62,19 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Tracks of one recording with the true attitude, aligned with the truth, for a figure."""
+    """Tracks of one recording with the true attitude, aligned with the truth, for a figure.
+
+    Attributes:
+        recording: its name.
+        truth: the true track.
+        tracks: by network.
+        errors: ATE and RTE [m] of each track.
+    """
 
     recording: str
     truth: Trajectory
     tracks: dict[str, Trajectory]
+    errors: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,6 +234,7 @@ def _tracks(
         raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
     entries: list[Entry] = []
     shown: dict[str, Trajectory] = {}
+    shown_errors: dict[str, tuple[float, float]] = {}
     for weights, model in models:
         for protocol, track in _of_protocols(model, sequence, config):
             found = evaluate_track(track, sequence.truth, convention=convention)
@@ -233,7 +242,8 @@ def _tracks(
             entries.append(Entry(sequence.name, model.name, weights, protocol, *errors))
             if protocol == "network_true_attitude":
                 shown.setdefault(model.name, align(track, sequence.truth, "first"))
-    return entries, Sample(sequence.name, sequence.truth, shown)
+                shown_errors.setdefault(model.name, (found.ate_m, found.rte_m))
+    return entries, Sample(sequence.name, sequence.truth, shown, shown_errors)
 
 
 def _of_protocols(

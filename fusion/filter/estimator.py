@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
@@ -39,6 +38,7 @@ from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 

@@ -80,13 +80,16 @@ def measured() -> dict[str, str]:
 
 
 def survey(
-    names: Sequence[str], cache: Path, progress: Callable[[float], None] = lambda share: None
+    names: Sequence[str],
+    cache: Path | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[ModelRow]:
     """Count, time and weigh networks.
 
     Args:
         names: of architectures.
-        cache: folder that keeps exported graphs, which take up to half a minute each to make.
+        cache: folder that keeps exported graphs, which take up to half a minute each to make; None
+            leaves ONNX Runtime out.
         progress: called with the share of the work done.
 
     Raises:
@@ -98,7 +101,9 @@ def survey(
         "torch": [TorchEngine(model.training_form) for model in models],
         "onnxruntime": None,
     }
-    if all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")):
+    if cache is not None and all(
+        importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")
+    ):
         graphs: list[Engine] = []
         for done, model in enumerate(models, 1):
             graphs.append(_graph_engine(model, cache))

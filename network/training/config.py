@@ -26,7 +26,8 @@ from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
     # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 walks of ten seconds.
-    "RNIN": {"successive": 10, "batch": 250},
+    # Stretches of weak truth are as many windows in a row, or twice as many.
+    "RNIN": {"successive": 10, "batch": 250, "track_seconds": 10},
 }
 """Settings that a network's own paper asks for, over the recipe's defaults."""
 

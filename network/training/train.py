@@ -213,10 +213,11 @@ class _Run:
         """
         if not self.network.remembers:
             windows = windows.flatten(0, -3)
-        whole = torch.cat([windows, *(part.windows.flatten(0, 1) for part in legs)])
+        stretches = [self._in_rows(part.windows) for part in legs]
+        whole = torch.cat([windows, *stretches])
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
             mean, log_sigma = self._shared(whole)
-        sizes = [len(windows), *(part.known.shape[0] * part.share.shape[2] for part in legs)]
+        sizes = [len(windows), *map(len, stretches)]
         means, log_sigmas = mean.split(sizes), log_sigma.split(sizes)
         squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
         if self.step >= self.config.likelihood_from * self.config.steps:
@@ -227,6 +228,11 @@ class _Run:
             shape = (len(part.known), -1, 3)
             loss = loss + leg_loss(told.view(shape), sigma.view(shape), part)[0]
         return loss, float(squared.detach().sum(1).mean())
+
+    def _in_rows(self, stretches: Tensor) -> Tensor:
+        """Windows (S, K, 6, 200) one by one, or as many in a row as a network remembers."""
+        windows, successive = stretches.flatten(0, 1), self.config.successive
+        return windows.view(-1, successive, *windows.shape[1:]) if successive > 1 else windows
 
     def _check_finite(self, loss: float, norm: float) -> None:
         """Stop before a step that would spoil every weight.
@@ -344,12 +350,13 @@ class _Run:
         if not self.workers.leads:
             return path
         self.averaged.load_state_dict(self.best)
+        residuals, log_sigma = held_out.residuals(self.averaged)
         card = Card(
             architecture=self.config.architecture,
-            calibration=kept or calibrate(*held_out.residuals(self.averaged)),
+            calibration=kept or calibrate(residuals, log_sigma),
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
-            figures={"validation_mse_m2": held_out.errors(self.averaged)},
+            figures={"validation_mse_m2": held_out.errors(self.averaged, residuals)},
             known_motion=known,
         )
         save_model(path, self.averaged, card)

@@ -161,8 +161,8 @@ def test_an_epoch_without_a_finite_error_is_never_the_best(
     """The likelihood begins with epoch 3; with nothing of its own it keeps what was before."""
     whole, epoch = ValidationSet.errors, count(1)
 
-    def errors(self: ValidationSet, network: DisplacementNetwork) -> dict[str, float]:
-        found = whole(self, network)
+    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+        found = whole(self, *arguments)
         return found | {"c": math.nan} if next(epoch) in spoilt else found
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
