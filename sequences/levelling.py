@@ -31,10 +31,10 @@ START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
 
 STILL_ACCEL = 0.3
-"""Deviation of the specific force [m/s^2] below which a device counts as held still."""
+"""Deviation of the specific force [m/s^2] up to which its mean shows the vertical to 0.01 rad."""
 
 STILL_GYRO = 0.1
-"""Root mean square rate [rad/s] below which a device counts as held still."""
+"""Root mean square rate [rad/s], likewise: no measure of rest, for a hand may tremble."""
 
 _LEAST_FORCE = 1.0
 """Mean specific force [m/s^2] below which it shows no vertical: free fall, a dead sensor."""

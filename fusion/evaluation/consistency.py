@@ -131,16 +131,16 @@ class AnalyticWalk:
     Attributes:
         time: (N,) [s].
         R_WB: (N, 3, 3).
-        v_W: (N, 3) [m/s].
-        p_W: (N, 3) [m].
+        velocity_W: (N, 3) [m/s].
+        position_W: (N, 3) [m].
         gyro: (N, 3) exact rate in B [rad/s].
         accel: (N, 3) exact specific force in B [m/s^2].
     """
 
     time: FloatArray
     R_WB: FloatArray
-    v_W: FloatArray
-    p_W: FloatArray
+    velocity_W: FloatArray
+    position_W: FloatArray
     gyro: FloatArray
     accel: FloatArray
 
@@ -223,8 +223,8 @@ def _first_errors(
     turn = exp_so3(-theta)
     prior = PriorPose(
         R_WB=turn @ walk.R_WB[0],
-        v_W=walk.v_W[0] - velocity * rng.normal(size=3),
-        p_W=walk.p_W[0] - position * rng.normal(size=3),
+        v_W=walk.velocity_W[0] - velocity * rng.normal(size=3),
+        p_W=walk.position_W[0] - position * rng.normal(size=3),
         tilt_sigma=tilt,
         yaw_sigma=yaw,
         velocity_sigma=velocity,
@@ -244,7 +244,7 @@ def _seen(
     stop = round(interval.stop * RATE)
     start = stop - round(WINDOW_SECONDS * RATE)
     d_N = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T).T @ (
-        walk.p_W[stop] - walk.p_W[start]
+        walk.position_W[stop] - walk.position_W[start]
     )
     # The filter takes overlapping windows for less certain than each one is.
     sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
@@ -256,6 +256,6 @@ def _errors(
 ) -> tuple[float, float, float]:
     X, P = now.X, now.P
     R = walk.R_WB[k] @ X[:, :3].T
-    pose = log_se23(R, walk.v_W[k] - R @ X[:, 3], walk.p_W[k] - R @ X[:, 4])
+    pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])
     error = np.concatenate([pose, b_g - now.b_g, b_a - now.b_a])
     return float(error @ np.linalg.solve(P, error)), float(error[2] ** 2), float(P[2, 2])
