@@ -190,7 +190,7 @@ class Inspection:
     def _rest_lines(self) -> list[str]:
         rest = self.rest
         if rest is None:
-            return ["at rest: never for a second, so noise and bias cannot be told"]
+            return ["at rest: never for a second, so noise and bias are not known"]
         bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
         return [
             f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",

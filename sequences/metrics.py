@@ -165,7 +165,7 @@ def evaluate_track(
     errors = pose_errors(align(estimate, truth, alignment), truth)
     time = errors.estimate.time
     error = errors.position_W[:, : 2 if horizontal else 3]
-    path = _way(errors.truth, horizontal)
+    path = _path_length(errors.truth, horizontal)
     rte, scaled = _relative_error(time, error, rte_interval, convention)
     return TrackMetrics(
         ate_m=_average(error, convention),
@@ -217,7 +217,7 @@ def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.
     return right - (wanted - time[right - 1] < time[right] - wanted)
 
 
-def _way(truth: Trajectory, horizontal: bool) -> float:
+def _path_length(truth: Trajectory, horizontal: bool) -> float:
     if not horizontal:
         return truth.path_length()
     return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()

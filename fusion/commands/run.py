@@ -111,9 +111,9 @@ def _run(
     if not shown.figures:
         return record
     typer.echo(sequence.summary())
-    way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
+    told = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    typer.echo(f"{way} travelled by the estimate, which ends {ends:.1f} m from its start")
+    typer.echo(f"{told} travelled by the estimate, which ends {ends:.1f} m from its start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     for line in track.health.lines() if track.health else []:

@@ -181,19 +181,22 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
 
 
 def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float, float]]:
-    """Seconds of training and of evaluation, and windows per second of training, by network."""
+    """Seconds of training, of evaluation, and windows per second of a training step, by network."""
     sums: dict[str, list[float]] = {}
     for filled in tables:
         for name, seeds in filled.items():
-            total = sums.setdefault(name, [0.0, 0.0, 0.0])
+            total = sums.setdefault(name, [0.0, 0.0, 0.0, 0.0])
             for content in seeds.values():
                 trained = content.get("trained", {})
                 total[0] += trained.get("seconds", 0.0)
                 total[1] += content["seconds"]
-                total[2] += trained.get("windows", 0.0)
+                step = trained.get("step_seconds")
+                if step:
+                    total[2] += trained["windows"] / step
+                    total[3] += 1
     return {
-        name: (training, testing, windows / training if training else float("nan"))
-        for name, (training, testing, windows) in sums.items()
+        name: (training, testing, speeds / count if count else float("nan"))
+        for name, (training, testing, speeds, count) in sums.items()
     }
 
 

@@ -77,8 +77,8 @@ def train_cell(
     """Train a cell's network, from its checkpoint on; the folder receives the model and `SPARE`.
 
     Returns:
-        Plain values: errors of the last epoch [m^2], steps, windows, seconds of computing time,
-        the recipe, and the recordings that could not be used.
+        Plain values: errors of the last epoch [m^2], steps, windows in each, seconds of computing
+        time, of a step's in the mean, the recipe, and the recordings that could not be used.
 
     Raises:
         InputError, ConfigError: as of `stario.network.training.train.train`.
@@ -95,6 +95,7 @@ def train_cell(
     def finished(report: EpochReport) -> None:
         reports.append(report)
         clock.keep()
+        clock.pause()
 
     train(
         recipe,
@@ -102,6 +103,7 @@ def train_cell(
         material.weights,
         [s.part(0, _VALIDATION_SAMPLES) for s in kept.streams] or simulated(_VALIDATION_WALKS, 1),
         folder,
+        on_step=lambda step, error: clock.step(),
         on_epoch=finished,
         trained_on=material.words,
         legs=material.legs,
@@ -111,8 +113,9 @@ def train_cell(
     history = json.loads((folder / "log.json").read_text(encoding="utf-8"))
     return {
         "steps": recipe.steps,
-        "windows": recipe.steps * recipe.batch + _leg_windows(recipe, material.legs),
+        "windows": recipe.batch + _leg_windows(recipe, material.legs),
         "seconds": clock.seconds,
+        "step_seconds": clock.step_seconds,
         "training_error_m2": history[-1]["training_error"],
         "validation_error_m2": history[-1]["validation_error"],
         "recipe": asdict(recipe),
@@ -161,7 +164,7 @@ def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
     kinds = {getattr(stream, "kind", "") for stream in legs}
     waypoints = recipe.waypoint_stretches * recipe.waypoint_seconds if "waypoints" in kinds else 0
     tracks = recipe.track_stretches * recipe.track_seconds if "positions" in kinds else 0
-    return recipe.steps * (waypoints + tracks)
+    return waypoints + tracks
 
 
 class _Clock:
@@ -172,10 +175,28 @@ class _Clock:
         path.parent.mkdir(parents=True, exist_ok=True)
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else 0.0
         self._before, self._began = float(before), process_time()
+        self._last: float | None = None
+        self._steps: list[float] = []
 
     @property
     def seconds(self) -> float:
         return self._before + process_time() - self._began
 
+    @property
+    def step_seconds(self) -> float:
+        """Mean of the steps that were seen whole; nan where there was none."""
+        return sum(self._steps) / len(self._steps) if self._steps else float("nan")
+
+    def step(self) -> None:
+        """A step is done."""
+        if self._last is not None:
+            self._steps.append(process_time() - self._last)
+        self._last = process_time()
+
+    def pause(self) -> None:
+        """What follows is no step."""
+        self._last = None
+
     def keep(self) -> None:
+        """Note the time so far."""
         write_json(self._path, self.seconds)
