@@ -48,7 +48,7 @@ def convert(
         return
     files, skipped = reading.recordings(sources)
     names = convert_all(_read(reading, files, skipped), target)
-    typer.echo(f"{len(names)} recordings in {target}")
+    typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
     leave_with_skipped(skipped)
 
 

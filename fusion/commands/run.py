@@ -116,6 +116,10 @@ def _run(
     typer.echo(f"{told} travelled by the estimate, which ends {ends:.1f} m from its start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
+    elif sequence.positions is not None:
+        from stario.fusion.evaluation.known_positions import position_error_words
+
+        typer.echo(position_error_words(track, sequence.positions))
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")

@@ -79,12 +79,12 @@ def train(
         str | None, typer.Option(help="Weights to start from: default, or a safetensors file.")
     ] = None,
     last_stage: Annotated[
-        bool,
+        str | None,
         typer.Option(
-            "--last-stage",
-            help="Learn from the validation recordings too, keep the calibration of --start-from.",
+            help="Learn from the validation recordings too; sigma is calibrated as that of these "
+            "weights, which left them out.",
         ),
-    ] = False,
+    ] = None,
     cache: Annotated[
         Path | None,
         typer.Option(
@@ -107,8 +107,6 @@ def train(
     from stario.sequences.stream_cache import cache_folder
 
     recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
-    if last_stage and start_from is None:
-        raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
@@ -119,7 +117,7 @@ def train(
     if recorded_only:
         captured, generated = None, 0
     material = gather(
-        recorded + held_out if last_stage else recorded,
+        recorded + held_out if last_stage is not None else recorded,
         _captured(captured, recipe, folder) if captured else [],
         _generated(generated, recipe.seed, recipe.attitude, folder),
         recipe.shares,
@@ -132,6 +130,7 @@ def train(
             "some to choose and calibrate by",
             "name them: --validation",
         )
+    calibrated_by = last_stage or (None if kept.streams else start_from)
     # Sigma needs windows with full truth; where nobody has any, those of generated walks.
     windows = kept.streams or _generated(10, recipe.seed + 1, recipe.attitude, folder)
     if leads():
@@ -154,7 +153,7 @@ def train(
             ),
             trained_on=material.words,
             start_from=load_model(start_from) if start_from else None,
-            keep_calibration=last_stage or (start_from is not None and not kept.streams),
+            calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
             legs=material.legs,
             validation_legs=kept.legs,
         )

@@ -15,6 +15,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.known_positions import position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -115,16 +116,7 @@ def _error(track: Track, known: Trajectory | PositionTrack) -> float:
     """Horizontal, after a fit of yaw and position [m]."""
     if isinstance(known, Trajectory):
         return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
-    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
-    time, truth = known.time[inside], known.position_W[inside]
-    ours = [np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1)]
-    return _fitted(ours[0] + 1j * ours[1], truth[:, 0] + 1j * truth[:, 1])
-
-
-def _fitted(ours: np.ndarray, theirs: np.ndarray) -> float:
-    ours, theirs = ours - ours.mean(), theirs - theirs.mean()
-    turn = np.vdot(ours, theirs)
-    return float(np.sqrt(np.mean(np.abs(ours * turn / max(abs(turn), 1e-12) - theirs) ** 2)))
+    return position_error(track, known)[0]
 
 
 def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:

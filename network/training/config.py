@@ -21,7 +21,7 @@ from torch import Tensor
 from stario.network.architectures import ARCHITECTURES
 from stario.network.training.augment import Augmentation
 from stario.sequences.errors import ConfigError
-from stario.sequences.settings import with_settings
+from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
@@ -127,9 +127,7 @@ class TrainingConfig:
             if not (isinstance(value, int) and value >= 1):
                 raise ConfigError(name, repr(value), "a count of at least 1")
         for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and low <= value <= high):
-                raise ConfigError(name, repr(value), f"a number from {low} to {high}")
+            check_number(self, name, low, high)
         if self.architecture not in ARCHITECTURES:
             known = f"one of {', '.join(ARCHITECTURES)}"
             raise ConfigError("architecture", repr(self.architecture), known)

@@ -70,7 +70,7 @@ def train(
     on_epoch: Callable[[EpochReport], None] = lambda report: None,
     trained_on: Sequence[str] = (),
     start_from: DisplacementModel | None = None,
-    keep_calibration: bool = False,
+    calibration: Calibration | None = None,
     legs: Sequence[LegStream] = (),
     validation_legs: Sequence[LegStream] = (),
 ) -> Path:
@@ -86,8 +86,8 @@ def train(
         on_epoch: called after each validation.
         trained_on: words for the card.
         start_from: a model whose weights are the first ones.
-        keep_calibration: keep that model's calibration, for a last stage that learns from the
-            validation recordings as well: their errors then say nothing any more.
+        calibration: of other weights, taken over where errors of `validation` say nothing:
+            a last stage learns from it as well, and weak truth alone has no windows to tell by.
         legs: stretches of weak truth, positions or waypoints, to learn from besides.
         validation_legs: some that choose the weights besides.
 
@@ -117,7 +117,6 @@ def train(
             run.record(report)
             if these.leads:
                 on_epoch(report)
-        calibration = start_from.card.calibration if start_from and keep_calibration else None
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 

@@ -119,6 +119,16 @@ _SUFFIXES = (
 )
 """Files that may be a recording by themselves."""
 
+_CONTAINERS = (
+    (b"SQLite format 3", "an SQLite database"),
+    (b"PK\x03\x04", "a zip without text files, as a spreadsheet is"),
+    (b"\xd0\xcf\x11\xe0", "a spreadsheet"),
+    (b"\x1f\x8b", "a file compressed with gzip"),
+    (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
+    (b"MATLAB", "a MATLAB file"),
+)
+"""How files begin that may hold a recording but are not unpacked."""
+
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
     """Read a recording.
@@ -287,6 +297,8 @@ def _unknown(path: Path) -> ReadError:
         there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
+    elif kind := next((words for start, words in _CONTAINERS if magic(path).startswith(start)), ""):
+        found, fix = kind, "export as CSV, or as the zip or folder that the app writes"
     elif magic(path, 2)[:1] == b"\x80":
         found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     elif (line := first_line(path)) is None:

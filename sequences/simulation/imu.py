@@ -27,6 +27,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
+from stario.sequences.settings import check_number
 from stario.sequences.simulation.magnetometer import MagneticField, simulate_magnetometer
 
 _MIN_POSES = 6
@@ -66,12 +67,10 @@ class ImuErrors:
 
     def __post_init__(self) -> None:
         for item in fields(self)[1:]:
-            value = getattr(self, item.name)
-            if item.name.endswith("_range"):
-                if not value > 0:
-                    raise InputError(item.name, repr(value), "a range > 0, inf for none")
-            elif not (math.isfinite(value) and value >= 0):
-                raise InputError(item.name, repr(value), "a finite deviation >= 0")
+            if not item.name.endswith("_range"):
+                check_number(self, item.name)
+            elif not getattr(self, item.name) > 0:
+                raise InputError(item.name, repr(getattr(self, item.name)), "above 0, inf for none")
 
 
 PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))

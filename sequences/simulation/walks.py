@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.settings import check_number
 from stario.sequences.simulation.carrying import CARRIES, CarryMotion, Gait
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
 
@@ -65,9 +66,7 @@ class WalkStyle:
                     name, repr(getattr(self, name)), f"one of {', '.join(CARRYING_MODES)}"
                 )
         for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(name, repr(value), f"a value from {low} to {high}")
+            check_number(self, name, low, high)
         if len(self.mount_rotvec) != 3 or not all(map(math.isfinite, self.mount_rotvec)):
             raise InputError("mount_rotvec", repr(self.mount_rotvec), "three finite angles [rad]")
 

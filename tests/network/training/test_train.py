@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 
 from stario.network.architectures import build_network
-from stario.network.card import card_path
+from stario.network.card import Calibration, card_path
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
@@ -429,13 +429,14 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
     assert found.get(change, "Missing") in refused(model)
 
 
-def test_a_last_stage_starts_from_weights_and_keeps_their_calibration(
+def test_a_last_stage_starts_from_weights_and_takes_a_calibration_over(
     model: Path, tmp_path: Path
 ) -> None:
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1)
-    last = load_model(run(tmp_path / "last", slow, start_from=first, keep_calibration=True))
-    assert last.card.calibration == first.card.calibration
+    other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
+    last = load_model(run(tmp_path / "last", slow, start_from=first, calibration=other))
+    assert last.card.calibration == other
     before = dict(first.training_form.named_parameters())
     for name, value in last.training_form.named_parameters():
         torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)

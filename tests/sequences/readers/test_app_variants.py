@@ -354,6 +354,20 @@ def test_a_tracess_rotation_vector_is_the_devices_attitude(
     assert (read_recording(tmp_path / "trace.txt").device_attitude is None) == (code == "AHRS")
 
 
+@pytest.mark.parametrize(
+    ("start", "told"),
+    [
+        (b"SQLite format 3\0" + bytes(40), "an SQLite database"),
+        (b"PK\x03\x04xl/workbook.xml", "a zip without text files"),
+        (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
+    ],
+)
+def test_what_is_not_unpacked_is_named(start: bytes, told: str, tmp_path: Path) -> None:
+    (tmp_path / "export.data").write_bytes(start)
+    with pytest.raises(ReadError, match=rf"found [\w ,]*{told}.*; export as CSV"):
+        read_recording(tmp_path / "export.data")
+
+
 def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) -> None:
     android(tmp_path / "s", walk)
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as file:
