@@ -28,6 +28,7 @@ _COLOURS = (
     "#999999", "#000000", "#8DB600",
 )  # fmt: skip
 _STYLES = ("-", "--", ":")
+_MARKERS = "osD^vP"
 _AGAINST = "R-ResNet"
 
 
@@ -69,19 +70,19 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     for k, (network, parameters) in enumerate(table.parameters.items()):
         mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
         axes.errorbar(
-            parameters / 1e6, mean, yerr=spread, fmt="o", ms=9, color=_colour(k), capsize=4
-        )
-        axes.annotate(
-            network, (parameters / 1e6, mean), (8, 6), textcoords="offset points", fontsize=9
-        )
+            parameters / 1e6, mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
+            color=_colour(k), label=network,
+        )  # fmt: skip
     axes.set(xlabel="parameters [millions], the paper's convention", ylabel="ATE [m]", xscale="log")
     ticks = [1, 2, 3, 5, 10, 15]
     axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
     axes.set_xticks([], minor=True)
     counts = [p / 1e6 for p in table.parameters.values()]
     axes.set_xlim(0.7 * min(counts), 1.9 * max(counts))
-    axes.set_ylim(bottom=0.0)
     axes.margins(y=0.15)
+    axes.set_ylim(bottom=0.0)
+    # Beside, not at the points: half of the networks have about as many parameters and errors.
+    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     _dress(axes)
     return fig
 

@@ -8,8 +8,8 @@ from stario.fusion.evaluation.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
 from stario.sequences.sequence import PositionTrack
 
-LEAST = 3
-"""Fewer positions are met by a turn and a shift alone."""
+LEAST = 2
+"""One position is met by a shift alone; of two the distance is compared."""
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:

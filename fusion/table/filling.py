@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
@@ -97,6 +98,7 @@ def _dask() -> Iterator[None]:
     from joblib import parallel_config
 
     distributed = optional_package("distributed", "cluster")
+    logging.getLogger("distributed").setLevel(logging.WARNING)
     with distributed.Client(), parallel_config("dask"):
         yield
 

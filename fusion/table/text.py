@@ -66,10 +66,11 @@ _WORK = ("training_s", "evaluation_s", "windows_per_s")
 
 def _recipe_words(recipe: TrainingConfig) -> str:
     return (
-        f"Every network: {recipe.steps} steps of {recipe.batch} windows, peak rate {recipe.rate:g},"
-        f" {recipe.precision}, {recipe.attitude} attitude; where there are waypoints or positions "
-        f"{recipe.waypoint_stretches} stretches of {recipe.waypoint_seconds} s and "
-        f"{recipe.track_stretches} of {recipe.track_seconds} s in each step besides."
+        f"Every network: steps of the training {recipe.steps}, windows in each {recipe.batch}, "
+        f"peak rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. Where a set "
+        f"has any, each step learns from stretches besides, of {recipe.waypoint_seconds} s between "
+        f"waypoints {recipe.waypoint_stretches} and of {recipe.track_seconds} s along positions "
+        f"{recipe.track_stretches}."
     )
 
 

@@ -179,7 +179,13 @@ def test_the_command_leaves_tables_and_figures(
     assert done.exit_code == 0, done.output
     text = (out / "table.md").read_text()
     assert text in done.output
-    for words in ("1 steps of 6 windows", "| R-ResNet |", "`pdr`", "4.165, 3.724", "core hours"):
+    for words in (
+        "steps of the training 1, windows in each 6",
+        "| R-ResNet |",
+        "`pdr`",
+        "4.165, 3.724",
+        "core hours",
+    ):
         assert words in text
     with (out / "table.csv").open() as file:
         assert [row["network"] for row in csv.DictReader(file)] == [
