@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 7
+FORMAT, VERSION = "stario snapshot", 8
 
 
 @cache
@@ -43,10 +43,12 @@ def _classes() -> dict[str, type]:
     """Every class that a snapshot may hold: plain data, made anew from its attributes."""
     from stario.fusion import config, continuous, fixes
     from stario.fusion.filter import (
+        accelerometer,
         ekf_state,
         estimate,
         estimator_state,
         frame_transform,
+        gyro_bias,
         initial,
         innovations,
         magnetic,
@@ -67,6 +69,8 @@ def _classes() -> dict[str, type]:
             ekf_state.EkfState,
             ekf_state.FieldState,
             magnetic.MagneticReference,
+            gyro_bias.GyroBiasPrior,
+            accelerometer.AccelerometerWorth,
             estimate.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,

@@ -156,6 +156,12 @@ class LevelledAttitude:
         self.R_NB = self._levelled(attitudes, time, accel)
         return attitudes
 
+    @property
+    def bias_sigma(self) -> float:
+        """Of the bias about the level axes, per axis [rad/s]; gravity never tells the third."""
+        level = self.R_NB[:2]
+        return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
+
     def restart(self) -> None:
         """After a gap the tilt is not known well: level quickly again."""
         self._P = self._P + np.diag([_TILT_SIGMA**2] * 2 + [0.0] * 4)

@@ -26,6 +26,9 @@ from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health, NavState
 
+_SAME = 0.8
+"""Ratio of the variances of bias priors from which on a graph begins anew."""
+
 _ROUNDS = 3
 """Of each optimisation: the next keyframe's goes on from there."""
 
@@ -40,6 +43,7 @@ class FixedLagState:
         ahead: the newest state, carried on by the IMU from the last keyframe.
         origin_W: (3,) of the graph's positions [m]: see `EkfState`.
         map_frame: frame transforms before the graph began.
+        bias_prior: variance of the gyroscope bias's prior when the graph began [rad^2/s^2].
         fallbacks: how often the graph fell back to the filter, and why it last did.
     """
 
@@ -48,6 +52,7 @@ class FixedLagState:
     ahead: EkfState
     origin_W: FloatArray
     map_frame: int
+    bias_prior: float
     fallbacks: tuple[int, str]
 
 
@@ -73,6 +78,7 @@ class FixedLagEstimator:
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)
         self._map_frame = 0
+        self._bias_prior = 0.0
         self._builder: GraphBuilder
         self._begin(0)
 
@@ -81,11 +87,11 @@ class FixedLagEstimator:
     ) -> None:
         """Move to the interval's end and take in what was measured; as `Estimator.step`."""
         taken = self._filter.step(interval, displacement, fixes)
-        if self._filter.map_frame != self._map_frame or interval.anew is not None:
+        if self._stale or interval.anew is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
         near = [self._near(accepted) for accepted in taken.fixes]
-        if self._builder.step(interval, taken.displacement, near, taken.zero_velocity):
+        if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -96,7 +102,7 @@ class FixedLagEstimator:
         accepted = self._filter.late_fix(fix)
         if accepted is None:
             return None
-        if self._filter.map_frame != self._map_frame or self._filter.judged != judged:
+        if self._stale or self._filter.judged != judged:
             self._begin(self._builder.count)
             return accepted
         for taken in accepted:
@@ -113,6 +119,7 @@ class FixedLagEstimator:
             self._ahead.state,
             self._origin_W,
             self._map_frame,
+            self._bias_prior,
             self._fallbacks,
         )
 
@@ -120,6 +127,7 @@ class FixedLagEstimator:
     def state(self, s: FixedLagState) -> None:
         self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
         self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
+        self._bias_prior = s.bias_prior
 
     @property
     def time(self) -> float:
@@ -140,6 +148,12 @@ class FixedLagEstimator:
         note = f"graph fell back to the filter {times} times, last for {why}"
         return replace(health, notes=[*health.notes, note])
 
+    @property
+    def _stale(self) -> bool:
+        """Whether the filter knows by now that the graph began from something else."""
+        ratio = self._filter.bias_prior.variance / self._bias_prior
+        return self._filter.map_frame != self._map_frame or not _SAME < ratio < 1.0 / _SAME
+
     def _near(self, accepted: Accepted) -> Fix:
         """A fix as the filter inflated it, from the graph's origin."""
         return accepted.inflated.shifted(-self._origin_W)
@@ -148,6 +162,7 @@ class FixedLagEstimator:
         """A new graph from the filter's state."""
         first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
+        self._bias_prior = self._filter.bias_prior.variance
         first = first.shifted(-self._origin_W)
         self._builder = GraphBuilder(self._config, first, count, streaming=True)
         self._restart_from(first)

@@ -88,7 +88,7 @@ def _unseen(
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     """White noise, wider where a sensor was saturated."""
     noise, f = config.noise, config.filter
-    gyro, accel = noise.gyro_noise, noise.accel_noise
+    gyro, accel = noise.gyro_noise, interval.accel_factor * noise.accel_noise
     # What a saturated sensor missed is as unknown as what happens in a gap.
     if interval.flags.gyro:
         gyro = max(gyro, f.gap_gyro_noise)

@@ -106,7 +106,8 @@ def test_a_stream_takes_displacements_as_its_filter_judges_them(
     spoilt, two = spoilt_track(preprocessed, CONFIG, 5.0, range(40, 50))
     assert none == 0
     assert two in (2, 3)  # after them a right one may look false
-    assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.1
+    # The accelerometer counts for a little less behind them (`AccelerometerWorth`).
+    assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.12
 
 
 def test_what_the_filter_weighs_otherwise_a_stream_judges_itself(
