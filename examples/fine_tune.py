@@ -43,9 +43,10 @@ def main(folder: Path, epochs: int = 1) -> DisplacementModel:
         epochs=epochs, epoch_windows=64, batch=32, rate=2e-4, likelihood_from=0.0,
         waypoint_stretches=2, waypoint_seconds=12,
     )  # fmt: skip
+    before = load_model("default")
     weights = train(
         config, full[0], [1.0] * len(full[0]), full[1], folder,
-        start_from=load_model("default"), keep_calibration=True, legs=legs,
+        start_from=before, calibration=before.card.calibration, legs=legs,
     )  # fmt: skip
     return load_model(weights)
 

@@ -31,21 +31,27 @@ def replay(
     """Push a recording in batches; returns the samples that the server took."""
     first_ns, began, taken = time.time_ns(), time.monotonic(), 0
     stop = min(recording.duration, seconds)
+    sensors = [
+        ("gyroscope", recording.time, recording.gyro),
+        ("totalacceleration", recording.time, recording.accel),
+    ]
+    if recording.magnetometer is not None:
+        field = recording.magnetometer
+        sensors.append(("magnetometer", field.time, field.field))
     for number in range(int(stop / PERIOD) + 1):
         begin, end = number * PERIOD, min(stop, (number + 1) * PERIOD)
-        elapsed = recording.time - recording.time[0]
-        rows = (elapsed >= begin) & (elapsed < end)
-        payload = [
-            {
-                "name": name,
-                "time": first_ns + round(t * 1e9),
-                "values": dict(zip("xyz", value, strict=True)),
-            }
-            for name, values in (("gyroscope", "gyro"), ("totalacceleration", "accel"))
-            for t, value in zip(
-                elapsed[rows].tolist(), getattr(recording, values)[rows].tolist(), strict=True
-            )
-        ]
+        payload = []
+        for name, times, values in sensors:
+            elapsed = times - recording.time[0]
+            rows = (elapsed >= begin) & (elapsed < end)
+            payload += [
+                {
+                    "name": name,
+                    "time": first_ns + round(t * 1e9),
+                    "values": dict(zip("xyz", value, strict=True)),
+                }
+                for t, value in zip(elapsed[rows].tolist(), values[rows].tolist(), strict=True)
+            ]
         time.sleep(max(0.0, end / speed - (time.monotonic() - began)))
         message = {"messageId": number, "sessionId": str(first_ns), "deviceId": device}
         body = json.dumps(message | {"payload": payload}).encode()

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, IntervalMeasurements
 from stario.fusion.filter.frame_transform import in_last_frame, smoothed_track

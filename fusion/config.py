@@ -7,7 +7,6 @@ is saved beside its results and can be given to the next run as it is.
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 from stario.sequences.errors import ConfigError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.settings import with_settings
+from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATE_RATES = (1, 2, 5, 10, 20)
@@ -77,9 +76,8 @@ class FilterConfig:
         if not 0.5 <= self.gate < 1.0:
             raise ConfigError("gate", repr(self.gate), "a probability from 0.5 to below 1")
         for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
-                raise ConfigError(item.name, repr(value), "a finite value >= 0")
+            if item.name not in ("update_rate", "magnetometer"):
+                check_number(self, item.name)
         if self.covariance_scale == 0.0:
             raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
 
@@ -115,8 +113,7 @@ class GraphConfig:
     lag: float = 5.0
 
     def __post_init__(self) -> None:
-        if not 2.0 <= self.lag <= 60.0:
-            raise ConfigError("lag", repr(self.lag), "2 to 60 s")
+        check_number(self, "lag", 2.0, 60.0)
 
 
 @dataclass(frozen=True)
@@ -142,8 +139,7 @@ class NavigatorConfig:
     gravity: float = STANDARD_GRAVITY
 
     def __post_init__(self) -> None:
-        if not 9.5 < self.gravity < 10.1:
-            raise ConfigError("gravity", repr(self.gravity), "9.5 to 10.1 m/s^2")
+        check_number(self, "gravity", 9.5, 10.1)
 
 
 def read_config(path: Path | str) -> NavigatorConfig:

@@ -45,7 +45,6 @@ def _classes() -> dict[str, type]:
     from stario.fusion.filter import (
         accelerometer,
         ekf_state,
-        estimate,
         estimator_state,
         frame_transform,
         gyro_bias,
@@ -71,7 +70,7 @@ def _classes() -> dict[str, type]:
             magnetic.MagneticReference,
             gyro_bias.GyroBiasPrior,
             accelerometer.AccelerometerWorth,
-            estimate.Estimate,
+            ekf_state.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,
         ),

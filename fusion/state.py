@@ -135,8 +135,8 @@ class Health:
         fixes: absolute fixes applied (of these gated), and left out by reason.
         zero_velocity: updates at rest (one per state there) applied, and left out by reason.
         bearings: of the magnetic field applied (of these gated), and left out by reason.
-        accel_noise_factor: by which the accelerometer's noise exceeded the configured density at the
-            end, as the innovations tell.
+        accel_noise_factor: of the accelerometer's noise to the configured density at the end, as
+            the innovations tell.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.

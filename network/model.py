@@ -167,9 +167,10 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: of weights in the package ("default"; "first-stage", which left groups out;
-            "walks-36min", those before), a safetensors file with its card beside it, or an ONNX
-            file of `export_onnx`, which ONNX Runtime then computes.
+        name_or_path: of weights in the package ("default"; "open", whose sources allow any use;
+            "first-stage", which left groups out; "walks-36min", those before), a safetensors file
+            with its card beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then
+            computes.
 
     Raises:
         WeightsError: the file or its card is missing, cut short, or they do not match.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stario.sequences.legs import leg_streams as leg_streams
     from stario.sequences.metrics import align as align
     from stario.sequences.metrics import evaluate_track as evaluate_track
-    from stario.sequences.metrics import position_nees as position_nees
+    from stario.sequences.nees import position_nees as position_nees
     from stario.sequences.noise import ImuNoise as ImuNoise
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
@@ -75,7 +75,7 @@ _MODULES = {
     "generate_walk": "simulation.walks",
     "inspect_recording": "inspection",
     "leg_streams": "legs",
-    "position_nees": "metrics",
+    "position_nees": "nees",
     "read_recording": "readers",
     "read_tum": "files",
     "simulate_imu": "simulation.imu",

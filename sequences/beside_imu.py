@@ -79,6 +79,11 @@ class Magnetometer:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def rate(self) -> float:
+        """Median sampling rate [Hz]; 0 for a single sample."""
+        return float(1.0 / np.median(np.diff(self.time))) if len(self) > 1 else 0.0
+
     def slice(self, start: float, stop: float) -> Magnetometer | None:
         """The samples with start <= time <= stop [s], or None where there are none."""
         keep = (self.time >= start) & (self.time <= stop)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
+from stario.sequences.rotations import cumulative_rotations
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
-from stario.sequences.truth.alignment import cumulative_rotations
 from stario.sequences.truth.fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
@@ -112,7 +112,7 @@ def _check_time(sequence: ImuSequence) -> None:
     rate = sequence.rate
     if MIN_RATE <= rate <= MAX_RATE:
         return
-    fix = ""
+    fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
     for unit, per_second in TIME_UNITS.items():
         if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
             fix = f"time seems to be in {unit}: write `t [{unit}]` in the CSV's header"
@@ -176,7 +176,8 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
             field,
             f"an average of {average:.3g}",
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            "if it is in g, pass `--accel-unit g` or write `ax [g]` in the CSV's header",
+            "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if an iPhone wrote it) "
+            "or write `ax [g]` in the CSV's header",
         )
     if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
         raise InputError(

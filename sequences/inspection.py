@@ -18,7 +18,7 @@ from stario.sequences.sequence import (
     is_gap,
     too_slow,
 )
-from stario.sequences.still import Rest, find_rest
+from stario.sequences.stillness import Rest, find_rest
 from stario.sequences.truth.fit import TruthFit, fit_truth
 
 _LATE_S = 0.02
@@ -170,7 +170,7 @@ class Inspection:
     def _timing_lines(self) -> list[str]:
         t = self.timing
         lines = [
-            f"{self.name}: {t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
+            f"{t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
             f"jitter {1e3 * t.jitter_s:.2f} ms"
         ]
         if t.gaps:
@@ -190,7 +190,7 @@ class Inspection:
     def _rest_lines(self) -> list[str]:
         rest = self.rest
         if rest is None:
-            return ["at rest: never for a second, so noise and bias cannot be told"]
+            return ["at rest: never for a second, so noise and bias are not known"]
         bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
         return [
             f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",

@@ -31,10 +31,10 @@ START_SECONDS = 1.0
 """Length of the stretch whose mean specific force levels the first attitude [s]."""
 
 STILL_ACCEL = 0.3
-"""Deviation of the specific force [m/s^2] below which a device counts as held still."""
+"""Deviation of the specific force [m/s^2] up to which its mean shows the vertical to 0.01 rad."""
 
 STILL_GYRO = 0.1
-"""Root mean square rate [rad/s] below which a device counts as held still."""
+"""Root mean square rate [rad/s], likewise: no measure of rest, for a hand may tremble."""
 
 _LEAST_FORCE = 1.0
 """Mean specific force [m/s^2] below which it shows no vertical: free fall, a dead sensor."""
@@ -42,7 +42,7 @@ _LEAST_FORCE = 1.0
 _TILT_SIGMA = 0.05
 """Of the tilt at first and behind a gap [rad]."""
 
-_BIAS_SIGMA = 0.01
+BIAS_SIGMA = 0.01
 """Of the gyroscope's bias at first, per axis [rad/s]: right ones keep, raw ones find theirs."""
 
 _BIAS_WALK = 2e-5
@@ -140,7 +140,7 @@ class LevelledAttitude:
     def __init__(self, R_NB: FloatArray) -> None:
         self.R_NB = R_NB
         self.b_g = np.zeros(3)
-        tilt, bias = _TILT_SIGMA**2, _BIAS_SIGMA**2
+        tilt, bias = _TILT_SIGMA**2, BIAS_SIGMA**2
         # Of theta about N's axes, R = (I + [theta]x) R^, and of the bias, true minus estimate.
         self._P = np.diag([tilt, tilt, 0.0, bias, bias, bias])
 

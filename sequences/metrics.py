@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, cast, get_args
 
 import numpy as np
-from scipy.stats import chi2
 
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z, yaw_of
@@ -83,16 +82,6 @@ class PoseErrors:
     position_W: FloatArray
     yaw: FloatArray
     coverage: float
-
-
-@dataclass(frozen=True, eq=False)
-class PositionNees:
-    """3-D position NEES of a track: time (M,) [s], nees (M,), and its mean and median."""
-
-    time: FloatArray
-    nees: FloatArray
-    mean: float
-    median: float
 
 
 def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
@@ -176,7 +165,7 @@ def evaluate_track(
     errors = pose_errors(align(estimate, truth, alignment), truth)
     time = errors.estimate.time
     error = errors.position_W[:, : 2 if horizontal else 3]
-    path = _way(errors.truth, horizontal)
+    path = _path_length(errors.truth, horizontal)
     rte, scaled = _relative_error(time, error, rte_interval, convention)
     return TrackMetrics(
         ate_m=_average(error, convention),
@@ -192,85 +181,6 @@ def evaluate_track(
         rte_interval_s=rte_interval,
         rte_scaled=scaled,
     )
-
-
-def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised estimation error squared, e^T P^-1 e; chi-square with k degrees if P is true.
-
-    Args:
-        error: (N, k).
-        covariance: (N, k, k), in the squared units of `error`.
-
-    Returns:
-        (N,), without unit.
-
-    Raises:
-        InputError: shapes do not agree or a covariance is not positive definite.
-    """
-    error = np.asarray(error, dtype=np.float64)
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if error.ndim != 2:
-        raise InputError("error", f"shape {error.shape}", "(N, k)")
-    n, k = error.shape
-    if covariance.shape != (n, k, k):
-        raise InputError("covariance", f"shape {covariance.shape}", f"({n}, {k}, {k}) as error")
-    try:
-        factor = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        row = int(np.argmax([np.linalg.eigvalsh(P).min() <= 0 for P in covariance]))
-        raise InputError(
-            "covariance", f"row {row} not positive definite", "positive definite matrices"
-        ) from None
-    whitened = np.linalg.solve(factor, error[..., None])[..., 0]
-    return np.asarray(np.sum(whitened**2, axis=1), dtype=np.float64)
-
-
-def nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Bounds of the mean NEES (or NIS) of a consistent estimator over independent samples.
-
-    Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 5.4.
-
-    Args:
-        dof: length of the error vector; the expectation of the mean.
-        runs: number of independent samples averaged; poses of one track are not independent.
-        confidence: probability between the bounds.
-
-    Raises:
-        InputError: `dof` or `runs` below 1, or a confidence outside (0, 1).
-    """
-    for name, count in (("dof", dof), ("runs", runs)):
-        if count < 1:
-            raise InputError(name, repr(count), "at least 1")
-    if not 0 < confidence < 1:
-        raise InputError("confidence", repr(confidence), "a probability between 0 and 1")
-    tail = (1 - confidence) / 2
-    low, high = chi2.ppf([tail, 1 - tail], dof * runs) / runs
-    return float(low), float(high)
-
-
-def position_nees(
-    estimate: Trajectory, truth: Trajectory, alignment: Alignment = "first"
-) -> PositionNees:
-    """NEES of a track's 3-D position under its own covariance.
-
-    Poses with a covariance of exactly zero, such as a start that is the origin by definition,
-    carry no statement and are left out. Aligning takes away the share of the initial yaw in the
-    error but not in the covariance: for a check of that share give the truth's frame and "none".
-
-    Raises:
-        InputError: no overlap, no covariance, or one that is not positive definite.
-    """
-    if estimate.position_covariance_W is None:
-        raise InputError("estimate.position_covariance_W", "None", "(N, 3, 3) [m^2]")
-    errors = pose_errors(align(estimate, truth, alignment), truth)
-    covariance = errors.estimate.position_covariance_W
-    assert covariance is not None  # align and selection keep it
-    stated = covariance.any(axis=(1, 2))
-    if not stated.any():
-        raise InputError("estimate.position_covariance_W", "only zeros", "covariances [m^2]")
-    values = nees(errors.position_W[stated], covariance[stated])
-    time = errors.estimate.time[stated]
-    return PositionNees(time, values, float(values.mean()), float(np.median(values)))
 
 
 def _relative_error(
@@ -307,7 +217,7 @@ def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.
     return right - (wanted - time[right - 1] < time[right] - wanted)
 
 
-def _way(truth: Trajectory, horizontal: bool) -> float:
+def _path_length(truth: Trajectory, horizontal: bool) -> float:
     if not horizontal:
         return truth.path_length()
     return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
-from stario.sequences.errors import InputError
+from stario.sequences.settings import check_number
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,7 @@ class ImuNoise:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(item.name, repr(value), "a finite density >= 0")
+            check_number(self, item.name)
 
 
 PHONE_NOISE = ImuNoise(gyro_noise=2e-4, accel_noise=2e-3, gyro_walk=2e-5, accel_walk=2e-4)

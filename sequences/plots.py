@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from stario.sequences.boxes import box_of, excess, frame_around, rounds, size_of
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.metrics import PoseErrors, pose_errors
@@ -80,10 +80,12 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
         InputError: there is nothing to draw.
     """
     paths = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
-    way_truth = None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
+    path_truth = (
+        None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
+    )
     boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
-    if way_truth is not None and np.isfinite(way_truth[1]).any():
-        typical = way_truth[1]
+    if path_truth is not None and np.isfinite(path_truth[1]).any():
+        typical = path_truth[1]
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track that did not run away.
         by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
@@ -97,14 +99,14 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = _panels(fig)
     fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
-    if way_truth is not None:
-        _draw_way(axes, way_truth[1], "truth", "black", width=2.2 * fine, order=2)
+    if path_truth is not None:
+        _draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
         label, colour = _style(name, k)
         far = excess(box, home)
         if far > 0.5 * size_of(home):
             label += f" (leaves the figure, by {_distance(far)})"
-        _draw_way(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+        _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
     axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
@@ -323,7 +325,7 @@ def _distance(metres: float) -> str:
     return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
 
 
-def _draw_way(
+def _draw_path(
     axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
 ) -> None:
     axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
@@ -379,7 +381,7 @@ def _reach(*values: FloatArray) -> float:
 
 
 def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
-    low, bound, top = chi2.ppf([0.001, 0.95, 0.9999], dof)
+    low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
     _draw_dots(axes, time, np.maximum(nis, low), gated)
     axes.axhline(dof, color=_INK, lw=1.0, label=f"expected {dof}")
     axes.axhline(bound, color=_INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")

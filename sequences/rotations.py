@@ -39,3 +39,28 @@ def tilt_aligning(up_B: FloatArray) -> Rotation:
     if sine < 1e-12:
         return Rotation.identity() if cosine > 0 else Rotation.from_rotvec([np.pi, 0.0, 0.0])
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
+
+
+def cumulative_rotations(steps: Rotation) -> FloatArray:
+    """Products q_0 q_1 ... q_k as (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
+    count = len(steps) + 1
+    width = int(np.ceil(np.sqrt(count)))
+    padded = np.tile([0.0, 0.0, 0.0, 1.0], (width * width, 1))
+    padded[1:count] = steps.as_quat()
+    blocks = padded.reshape(width, width, 4)
+    for k in range(1, width):
+        blocks[:, k] = _product(blocks[:, k - 1], blocks[:, k])
+    starts = blocks[:, -1].copy()
+    for k in range(1, width):
+        starts[k] = _product(starts[k - 1], starts[k])
+    blocks[1:] = _product(starts[:-1, None], blocks[1:])
+    products = blocks.reshape(-1, 4)[:count]
+    return np.asarray(products / np.linalg.norm(products, axis=1)[:, None], dtype=np.float64)
+
+
+def _product(p: FloatArray, q: FloatArray) -> FloatArray:
+    """Products of quaternions (..., 4), xyzw; SciPy's composition costs far more than this."""
+    a, b = p[..., :3], q[..., :3]
+    vector = p[..., 3:] * b + q[..., 3:] * a + np.cross(a, b)
+    scalar = p[..., 3] * q[..., 3] - np.sum(a * b, axis=-1)
+    return np.concatenate([vector, scalar[..., None]], axis=-1)

@@ -187,6 +187,7 @@ class ImuSequence:
         positions: known positions where there is no pose (`truth`): a track or waypoints, or None.
         attributes: what else is known of the recording (person, device, place, carry, ...).
         device_attitude: what the device's own fusion said of its attitude, or None.
+        source: the format or app that it was read from, for a person.
 
     Raises:
         InputError: the arrays' shapes do not agree or there is no sample.
@@ -202,6 +203,7 @@ class ImuSequence:
     positions: PositionTrack | None = None
     attributes: Mapping[str, str | float] = field(default_factory=dict)
     device_attitude: DeviceAttitude | None = None
+    source: str = ""
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
@@ -230,6 +232,15 @@ class ImuSequence:
         steps = np.diff(self.time)
         steps = steps[np.isfinite(steps) & (steps > 0)]
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
+
+    def summary(self) -> str:
+        """What the recording is, in one line for a person."""
+        field, own = self.magnetometer, self.device_attitude
+        told = [self.source] if self.source else []
+        told.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
+        told.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
+        told += [] if own is None else ["the device's own attitude"]
+        return f"{self.name}: {', '.join(told)}, truth: {self.truth_words()}"
 
     def truth_words(self) -> str:
         """What is known of the true track, for a person."""

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, is_dataclass, replace
+from numbers import Real
 from typing import Any, TypeVar
 
 from stario.sequences.errors import ConfigError, InputError
 
 Group = TypeVar("Group")
+
+
+def check_number(settings: object, name: str, low: float = 0.0, high: float = math.inf) -> None:
+    """Refuse a field that is no finite number within bounds.
+
+    Raises:
+        ConfigError: naming it, and the bounds.
+    """
+    value: Any = getattr(settings, name)  # NumPy's own numbers are Real, too
+    if not (isinstance(value, Real) and math.isfinite(value) and low <= float(value) <= high):
+        bounds = f"of at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
+        raise ConfigError(name, repr(value), f"a finite number {bounds}")
 
 
 def with_settings(default: Group, values: object, name: str = "") -> Group:

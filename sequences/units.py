@@ -27,6 +27,8 @@ _SPELLINGS = {
     "ut": "uT",
     "µt": "uT",
     "μt": "uT",
+    "î¼t": "uT",
+    "\ufffdt": "uT",
     "microtesla": "uT",
     "nt": "nT",
     "mt": "mT",
@@ -52,19 +54,24 @@ _SPELLINGS = {
     "rad/sec": "rad/s",
     "dps": "deg/s",
     "°/s": "deg/s",
+    "\ufffd/s": "deg/s",
     "deg/sec": "deg/s",
     "degs-1": "deg/s",
     "m/s2": "m/s^2",
     "m/s/s": "m/s^2",
     "m/s²": "m/s^2",
+    "m/s\ufffd": "m/s^2",
     "ms-2": "m/s^2",
     "-m/s2": "-m/s^2",
 }
 
 
 def unit_named(text: str) -> str:
-    """The tables' spelling of a unit: case, blanks and `^` do not matter (`rad s^-1`: `rad/s`)."""
-    plain = text.lower().replace(" ", "").replace("^", "")
+    """The tables' spelling of a unit: case, blanks and `^` do not matter (`rad s^-1`: `rad/s`).
+
+    Signs that another program read in the wrong encoding (`m/sÂ²`, `\ufffdT`) are known as well.
+    """
+    plain = text.lower().replace(" ", "").replace("^", "").replace("â", "")
     return _SPELLINGS.get(plain, plain)
 
 

@@ -8,16 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    Estimating,
-    JsonOption,
-    PathsArgument,
-    Reading,
-    grouped,
-    leave_with_skipped,
-    print_json,
-    progress_bar,
-)
+from stario.fusion.commands.common import collected, leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.options import Estimating, JsonOption, PathsArgument, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.backends import Score
@@ -43,24 +35,20 @@ def backends(
     """
     from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
     from stario.network.training.splits import split_paths
-    from stario.sequences.batch import Skipped, each
+    from stario.sequences.batch import each
 
     scores: list[Score] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
         files, skipped = reading.recordings(paths or split_paths(data or Path(), split))
         settings, network = estimating.settings(), estimating.network()
+
+        def scored(file: Path) -> Score:
+            return score_recording(network, reading.read(file), settings)
+
         with progress_bar("backends", len(files)) as progress:
-
-            def scored(file: Path) -> Score:
-                return score_recording(network, reading.read(file), settings)
-
-            for k, outcome in enumerate(each(scored, files, jobs=1), 1):
-                if isinstance(outcome, Skipped):
-                    skipped.append(outcome)
-                else:
-                    scores.append(outcome)
-                progress(k / len(files))
+            outcomes = each(scored, files, jobs=1)
+            scores = collected(outcomes, skipped, lambda done: progress(done / len(files)))
     else:
         with progress_bar("backends", walks) as progress:
             for seed in range(walks):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from stario.fusion.commands.common import JsonOption, print_json
+from stario.fusion.commands.common import print_json
+from stario.fusion.commands.options import JsonOption
 
 
 def benchmark(as_json: JsonOption = False) -> None:

@@ -24,6 +24,7 @@ from stario.fusion.commands.live import live
 from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
+from stario.fusion.commands.table import table
 from stario.fusion.commands.train import train
 from stario.fusion.commands.worth import fusion
 from stario.sequences.errors import StarioError
@@ -39,7 +40,7 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, fusion, backends, faults, consistency, benchmark):
+for command in (models, table, fusion, backends, faults, consistency, benchmark):
     check.command()(command)
 app.add_typer(check, name="check")
 

@@ -1,221 +1,86 @@
-"""What the commands share: groups of options, reading, progress and tables."""
+"""What the commands share: the way through recordings, progress, tables and JSON."""
 
 from __future__ import annotations
 
-import inspect
 import sys
-import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from stario.sequences.errors import InputError, StarioError
+from stario.fusion.commands.options import Reading
+from stario.sequences.errors import InputError
+from stario.sequences.text_table import aligned, figure
 
 if TYPE_CHECKING:
-    from stario.fusion.config import NavigatorConfig
     from stario.fusion.recording import Progress
-    from stario.network.model import DisplacementModel
     from stario.sequences.batch import Skipped
     from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
-PathsArgument = Annotated[
-    list[Path] | None, typer.Argument(help="Recordings, folders or lists of some.")
-]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
-FixesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--fixes",
-        help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or yaw.",
-    ),
-]
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
-]
-ReportOption = Annotated[
-    bool, typer.Option("--report", help="Also write report.html: map, slider, plots, health.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
+Result = TypeVar("Result")
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Options that say how a recording is read."""
+def collected(
+    outcomes: Iterable[Result | Skipped],
+    skipped: list[Skipped],
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[Result]:
+    """What came of recordings, in order; those that could not be used join `skipped`.
 
-    format: Annotated[
-        str, typer.Option("--format", help="Format of the recording: auto, or its name.")
-    ] = "auto"
-    gyro_unit: Annotated[
-        str, typer.Option("--gyro-unit", help="Unit of the gyroscope: rad/s or deg/s.")
-    ] = "rad/s"
-    accel_unit: Annotated[
-        str,
-        typer.Option(
-            "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
-        ),
-    ] = "m/s^2"
-    accel_sign: Annotated[
-        str,
-        typer.Option(
-            "--accel-sign", help="Where the accelerometer points at rest: up, or down: apple."
-        ),
-    ] = "up"
-    axes: Annotated[
-        str,
-        typer.Option(
-            "--axes",
-            help="The truth's x, y, z in the file's axes, such as y,-x,z (--axes=-y,x,z).",
-        ),
-    ] = "x,y,z"
-    imu_topic: Annotated[
-        str | None, typer.Option("--imu-topic", help="Of a bag, where it holds several IMUs.")
-    ] = None
-    truth_topic: Annotated[
-        str | None, typer.Option("--truth-topic", help="Of a bag: poses or odometry that are true.")
-    ] = None
-    gravity: Annotated[
-        str,
-        typer.Option(
-            "--gravity",
-            help="Included in the accelerometer, or removed: put back by the true attitude.",
-        ),
-    ] = "included"
-    where: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--where",
-            help="Of archives only recordings with this attribute, such as person=dan or "
-            "'name=r*'; of several values of one attribute any, of several attributes all.",
-        ),
-    ] = None
-
-    def as_read(self) -> dict[str, object]:
-        """What a recording's numbers depend on: all options but those that choose recordings."""
-        return {
-            item.name: getattr(self, item.name) for item in fields(self) if item.name != "where"
-        }
-
-    def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
-        """Recordings at the paths, in folders or in lists, and what leads to none."""
-        from stario.sequences.batch import Skipped
-        from stario.sequences.readers import find_recordings
-
-        if self.format != "auto":  # a format that is named is that of the path itself
-            return list(paths), []
-        chosen = _attributes(self.where or ())
-        files: list[Path] = []
-        errors: list[StarioError] = []
-        for path in paths:
-            try:
-                files += find_recordings(path, errors.append, chosen)
-            except StarioError as error:
-                errors.append(error)
-        return files, [Skipped("", str(error)) for error in errors]
-
-    def read(self, path: Path) -> ImuSequence:
-        """The recording at a path, in rad/s, m/s^2 of specific force and its truth's axes."""
-        from stario.sequences.conventions import with_conventions
-        from stario.sequences.readers import read_recording
-
-        topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
-        named = {name: topic for name, topic in topics.items() if topic is not None}
-        sequence = read_recording(path, self.format, **named)
-        return with_conventions(
-            sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
-        )
-
-
-@dataclass(frozen=True)
-class Estimating:
-    """Options that say what estimates a track."""
-
-    config: Annotated[
-        Path | None, typer.Option("--config", help="TOML or JSON file with settings of the filter.")
-    ] = None
-    model: Annotated[
-        str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
-    ] = "default"
-    magnetometer: Annotated[
-        bool,
-        typer.Option(
-            "--magnetometer/--no-magnetometer", help="Use the magnetic field where there is one."
-        ),
-    ] = True
-
-    def settings(self) -> NavigatorConfig:
-        """The filter's settings."""
-        from stario.fusion.config import NavigatorConfig, read_config
-
-        config = NavigatorConfig() if self.config is None else read_config(self.config)
-        if self.magnetometer:
-            return config
-        return replace(config, filter=replace(config.filter, magnetometer=False))
-
-    def network(self) -> DisplacementModel:
-        """The network with its weights."""
-        from stario.network.model import load_model
-
-        return load_model(self.model)
-
-    def network_for(self, jobs: int) -> DisplacementModel | str:
-        """The network, or, once it is known to load, its name for processes to load it by."""
-        network = self.network()
-        return network if jobs == 1 else self.model
-
-
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command for typer whose parameters `Reading` and `Estimating` become their fields' options.
-
-    So a group's options are written once, and a command that takes `reading: Reading` has them.
+    Args:
+        outcomes: as `stario.sequences.batch.each` yields them.
+        skipped: takes them up.
+        progress: called with the number of recordings that are done.
     """
-    hints = typing.get_type_hints(command, include_extras=True)
-    groups = {name: kind for name, kind in hints.items() if kind in (Reading, Estimating)}
-    options: dict[str, inspect.Parameter] = {}
-    members: dict[str, list[str]] = {}
-    for parameter in inspect.signature(command).parameters.values():
-        group = groups.get(parameter.name)
-        if group is None:
-            options[parameter.name] = parameter.replace(
-                annotation=hints[parameter.name], kind=inspect.Parameter.KEYWORD_ONLY
-            )
-            continue
-        kinds = typing.get_type_hints(group, include_extras=True)
-        members[parameter.name] = [item.name for item in fields(group)]
-        for item in fields(group):
-            options[item.name] = inspect.Parameter(
-                item.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=item.default,
-                annotation=kinds[item.name],
-            )
+    from stario.sequences.batch import Skipped
 
-    @wraps(command)
-    def flat(**values: Any) -> None:
-        made = {
-            name: groups[name](**{key: values.pop(key) for key in keys})
-            for name, keys in members.items()
-        }
-        command(**values, **made)
-
-    flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
-    flat.__annotations__ = {name: option.annotation for name, option in options.items()}
-    return flat
+    results: list[Result] = []
+    for done, outcome in enumerate(outcomes, 1):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            results.append(outcome)
+        progress(done)
+    return results
 
 
-def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
-    """Patterns by attribute, of `key=pattern` words."""
-    chosen: dict[str, list[str]] = {}
-    for word in words:
-        key, equals, pattern = word.partition("=")
-        if not (key and equals and pattern):
-            raise InputError("--where", repr(word), "attribute=value", "such as person=dan")
-        chosen.setdefault(key, []).append(pattern)
-    return chosen
+def one_by_one(
+    reading: Reading,
+    paths: Sequence[Path],
+    out: Path | None,
+    work: Callable[[ImuSequence, Path], dict[str, object]],
+    as_json: bool,
+    single: str = "",
+) -> None:
+    """Let `work` make a record of each recording, and a folder where it leaves its files.
+
+    Args:
+        reading: how recordings are read.
+        paths: of recordings, folders or lists.
+        out: the folder of a single recording, or of the folders of many; None for `runs`.
+        work: given a recording and its folder; more than one recording have distinct names.
+        as_json: print the records.
+        single: an option that was given and goes with one recording alone.
+    """
+    from stario.fusion.evaluation.many import distinct_name
+    from stario.sequences.batch import each
+
+    files, skipped = reading.recordings(paths)
+    if single and len(files) > 1:
+        raise InputError(single, f"{len(files)} recordings", "one recording")
+    names: set[str] = set()
+
+    def recorded(file: Path) -> dict[str, object]:
+        sequence = reading.read(file)
+        name = distinct_name(sequence.name, names)
+        return work(sequence, out if out and len(files) == 1 else (out or Path("runs")) / name)
+
+    records = collected(each(recorded, files, jobs=1), skipped)
+    if as_json and records:
+        print_json(records[0] if len(files) == 1 else records)
+    leave_with_skipped(skipped)
 
 
 def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
@@ -269,10 +134,8 @@ def track_table(
         "seconds_network": "network [s]",
         "seconds_filter": "rest [s]",
     }
-    lines = [f"{'':<22}" + "".join(f"{title:>12}" for title in columns.values())]
-    for name, figures in metrics.items():
-        cells = [figures.get(key) for key in columns]
-        lines.append(f"{name:<22}" + "".join(f"{_cell(value):>12}" for value in cells))
+    rows = [[name, *(figure(found.get(key)) for key in columns)] for name, found in metrics.items()]
+    lines = aligned([["", *columns.values()], *rows])
     if truth is None:
         return "\n".join(lines)
     lines += [f"{key}: {words[key]}." for key in ("ate_m", "rte_m", "alignment")]
@@ -280,10 +143,6 @@ def track_table(
     if covered < _WHOLE:
         lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")
     return "\n".join(lines)
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.3f}"
 
 
 def print_json(content: object) -> None:

@@ -8,6 +8,13 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands.common import (
+    collected,
+    leave_with_skipped,
+    print_json,
+    progress_bar,
+    track_table,
+)
+from stario.fusion.commands.options import (
     Estimating,
     FixesOption,
     JobsOption,
@@ -17,10 +24,6 @@ from stario.fusion.commands.common import (
     Reading,
     ReportOption,
     grouped,
-    leave_with_skipped,
-    print_json,
-    progress_bar,
-    track_table,
 )
 from stario.sequences.errors import InputError
 
@@ -40,8 +43,8 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
-    from stario.fusion.evaluation.compare import Comparison, demonstration
     from stario.fusion.evaluation.compare import compare as compare_tracks
+    from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import comparison_dict, write_comparison
     from stario.fusion.fix_file import read_fixes
@@ -61,13 +64,12 @@ def compare(
             model = estimating.network()
             made = compare_tracks(model, demonstration(), settings, progress, known)
             comparisons.append(made)
-        for outcome in compare_recordings(
-            files, network, settings, reading.read, jobs, known, progress=progress
-        ):
-            if isinstance(outcome, Comparison):
-                comparisons.append(outcome)
-            else:
-                skipped.append(outcome)
+        comparisons += collected(
+            compare_recordings(
+                files, network, settings, reading.read, jobs, known, progress=progress
+            ),
+            skipped,
+        )
     folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:

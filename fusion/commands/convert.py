@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import Reading, grouped, leave_with_skipped
+from stario.fusion.commands.common import leave_with_skipped
+from stario.fusion.commands.options import Reading, grouped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def convert(
         return
     files, skipped = reading.recordings(sources)
     names = convert_all(_read(reading, files, skipped), target)
-    typer.echo(f"{len(names)} recordings in {target}")
+    typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
     leave_with_skipped(skipped)
 
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
+from stario.fusion.commands.common import leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.judging import judge_by_groups
+from stario.fusion.commands.options import (
     Estimating,
     JobsOption,
     JsonOption,
@@ -15,11 +17,7 @@ from stario.fusion.commands.common import (
     PathsArgument,
     Reading,
     grouped,
-    leave_with_skipped,
-    print_json,
-    progress_bar,
 )
-from stario.fusion.commands.judging import judge_by_groups
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,13 +8,8 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    Estimating,
-    JsonOption,
-    Reading,
-    grouped,
-    print_json,
-)
+from stario.fusion.commands.common import print_json
+from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
 
 
 @grouped

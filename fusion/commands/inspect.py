@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    JsonOption,
-    OutOption,
-    Reading,
-    grouped,
-    leave_with_skipped,
-    print_json,
-)
+from stario.fusion.commands.common import one_by_one
+from stario.fusion.commands.options import JsonOption, OutOption, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.familiarity import Familiarity
@@ -33,29 +28,10 @@ def inspect(
     as_json: JsonOption = False,
 ) -> None:
     """Look recordings over: timing, noise, units, signs, magnetometer, truth, kind of motion."""
-    from stario.fusion.evaluation.many import distinct_name
     from stario.network.model import load_model
-    from stario.sequences.batch import Skipped, each
 
-    network = load_model(model)
-    files, skipped = reading.recordings([path])
-    names: set[str] = set()
-
-    def inspected(file: Path) -> dict[str, object]:
-        sequence = reading.read(file)
-        name = distinct_name(sequence.name, names)
-        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-        return _inspect(sequence, folder, network, told=not as_json)
-
-    records: list[dict[str, object]] = []
-    for outcome in each(inspected, files, jobs=1):
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            records.append(outcome)
-    if as_json and records:
-        print_json(records[0] if len(files) == 1 else records)
-    leave_with_skipped(skipped)
+    work = partial(_inspect, network=load_model(model), told=not as_json)
+    one_by_one(reading, [path], out, work, as_json)
 
 
 def _inspect(
@@ -80,7 +56,9 @@ def _inspect(
     record = found.as_dict() | {"motion": motion and motion.as_dict()}
     write_json(folder / "inspection.json", record)
     if told:
-        typer.echo("\n".join([*found.lines(), *(motion.lines() if motion else [])]))
+        typer.echo(
+            "\n".join([sequence.summary(), *found.lines(), *(motion.lines() if motion else [])])
+        )
         typer.echo(f"figure: {folder / 'inspection.png'}")
     return record
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from stario.fusion.commands.common import Reading, print_json, progress_bar
+from stario.fusion.commands.common import print_json, progress_bar
+from stario.fusion.commands.options import Reading
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import Estimating, grouped
+from stario.fusion.commands.options import Estimating, grouped
 
 
 @grouped

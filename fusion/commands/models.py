@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import JsonOption, print_json, progress_bar
+from stario.fusion.commands.common import print_json, progress_bar
+from stario.fusion.commands.options import JsonOption
 
 
 def models(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
+from stario.fusion.commands.common import one_by_one, progress_bar, track_table
+from stario.fusion.commands.options import (
     Estimating,
     FixesOption,
     JsonOption,
@@ -17,12 +19,7 @@ from stario.fusion.commands.common import (
     Reading,
     ReportOption,
     grouped,
-    leave_with_skipped,
-    print_json,
-    progress_bar,
-    track_table,
 )
-from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.fixes import Fix
@@ -45,10 +42,8 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
-    from stario.fusion.evaluation.many import distinct_name
     from stario.fusion.fix_file import read_fixes
     from stario.fusion.navigator import Navigator
-    from stario.sequences.batch import Skipped, each
     from stario.sequences.readers.checked import optional_package
 
     if report:
@@ -57,27 +52,9 @@ def run(
         optional_package("rerun", "view")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     known = [] if fixes is None else read_fixes(fixes)
-    files, skipped = reading.recordings([path])
-    if fixes is not None and len(files) > 1:
-        raise InputError("--fixes", f"{len(files)} recordings", "one recording")
-    names: set[str] = set()
-
-    def fused(file: Path) -> dict[str, object]:
-        sequence = reading.read(file)
-        name = distinct_name(sequence.name, names)
-        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
-        shown = Shown(report, view, figures=not as_json)
-        return _run(navigator, sequence, known, folder, shown)
-
-    records: list[dict[str, object]] = []
-    for outcome in each(fused, files, jobs=1):
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            records.append(outcome)
-    if as_json and records:
-        print_json(records[0] if len(files) == 1 else records)
-    leave_with_skipped(skipped)
+    shown = Shown(report, view, figures=not as_json)
+    work = partial(_run, navigator=navigator, fixes=known, shown=shown)
+    one_by_one(reading, [path], out, work, as_json, single="--fixes" if fixes else "")
 
 
 @dataclass(frozen=True)
@@ -90,10 +67,10 @@ class Shown:
 
 
 def _run(
-    navigator: Navigator,
     sequence: ImuSequence,
-    fixes: Sequence[Fix],
     folder: Path,
+    navigator: Navigator,
+    fixes: Sequence[Fix],
     shown: Shown,
 ) -> dict[str, object]:
     """Write one recording's track, tell of it on stdout, return its record for programs."""
@@ -133,13 +110,16 @@ def _run(
     }
     if not shown.figures:
         return record
-    way = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
+    typer.echo(sequence.summary())
+    told = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    typer.echo(f"{way} travelled by the estimate, which ends {ends:.1f} m from its start")
+    typer.echo(f"{told} travelled by the estimate, which ends {ends:.1f} m from its start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     elif sequence.positions is not None:
-        typer.echo(f"truth: {sequence.truth_words()}")
+        from stario.fusion.evaluation.known_positions import position_error_words
+
+        typer.echo(position_error_words(track, sequence.positions))
     for line in track.health.lines() if track.health else []:
         typer.echo(line)
     typer.echo(f"{len(written)} files in {folder}")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import JsonOption, print_json
+from stario.fusion.commands.common import print_json
+from stario.fusion.commands.options import JsonOption
 from stario.sequences.errors import InputError
 
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
+from stario.fusion.commands.common import leave_with_skipped, progress_bar
+from stario.fusion.commands.options import (
     JobsOption,
     PathsArgument,
     Reading,
     grouped,
-    leave_with_skipped,
-    progress_bar,
+    recipe_values,
 )
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
@@ -53,12 +52,13 @@ def train(
             "the test recordings, choose and calibrate by those of its list `holdout`."
         ),
     ] = None,
-    few: Annotated[
-        bool,
+    learn_from: Annotated[
+        str,
         typer.Option(
-            "--few", help="With --data: the eight recordings of the paper's comparison alone."
+            help="With --data: all; open, those whose licence allows any use; or few, the eight "
+            "recordings of the paper's comparison."
         ),
-    ] = False,
+    ] = "all",
     leave_out: Annotated[
         str | None,
         typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
@@ -79,12 +79,12 @@ def train(
         str | None, typer.Option(help="Weights to start from: default, or a safetensors file.")
     ] = None,
     last_stage: Annotated[
-        bool,
+        str | None,
         typer.Option(
-            "--last-stage",
-            help="Learn from the validation recordings too, keep the calibration of --start-from.",
+            help="Learn from the validation recordings too; sigma is calibrated as that of these "
+            "weights, which left them out.",
         ),
-    ] = False,
+    ] = None,
     cache: Annotated[
         Path | None,
         typer.Option(
@@ -107,19 +107,17 @@ def train(
     from stario.sequences.stream_cache import cache_folder
 
     recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
-    if last_stage and start_from is None:
-        raise InputError("--last-stage", "no --start-from", "the weights whose calibration is kept")
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
-        reading, paths or [], validation or [], _lists(data, leave_out, few), streams_of
+        reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
     if recorded_only:
         captured, generated = None, 0
     material = gather(
-        recorded + held_out if last_stage else recorded,
+        recorded + held_out if last_stage is not None else recorded,
         _captured(captured, recipe, folder) if captured else [],
         _generated(generated, recipe.seed, recipe.attitude, folder),
         recipe.shares,
@@ -132,6 +130,7 @@ def train(
             "some to choose and calibrate by",
             "name them: --validation",
         )
+    calibrated_by = last_stage or (None if kept.streams else start_from)
     # Sigma needs windows with full truth; where nobody has any, those of generated walks.
     windows = kept.streams or _generated(10, recipe.seed + 1, recipe.attitude, folder)
     if leads():
@@ -147,12 +146,14 @@ def train(
             on_step=lambda step, error: progress(step / recipe.steps),
             on_epoch=lambda report: typer.echo(
                 f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
-                f"validation {report.validation_error:.4f} m^2",
+                f"validation {report.validation_error:.4f} m^2; "
+                f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
+                "time in drawing them",
                 err=True,
             ),
             trained_on=material.words,
             start_from=load_model(start_from) if start_from else None,
-            keep_calibration=last_stage or (start_from is not None and not kept.streams),
+            calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
             legs=material.legs,
             validation_legs=kept.legs,
         )
@@ -164,35 +165,33 @@ def train(
 def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
     from stario.network.training.config import training_config
 
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ConfigError(str(path), str(error), "a JSON file with settings") from error
-        if not isinstance(values, dict):
-            raise ConfigError(str(path), type(values).__name__, "a table of settings")
+    values = {} if path is None else recipe_values(path)
     return training_config(values | {k: v for k, v in over.items() if v is not None})
 
 
-def _lists(data: Path | None, group: str | None, few: bool) -> tuple[list[Path], list[Path]]:
+def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
     """Recordings to learn from and to be kept, of the lists in the package."""
-    from stario.network.training.splits import listed, split_paths
+    from stario.network.training.splits import listed
     from stario.sequences.splits import leave_out
 
     if data is None:
-        if group is not None:
-            raise InputError("--leave-out", "no --data", "the folder of the development recordings")
+        for option, given in (("--leave-out", group is not None), ("--learn-from", name != "all")):
+            if given:
+                raise InputError(option, "no --data", "the folder of the development recordings")
         return [], []
-    if few:
-        return split_paths(data, "training"), split_paths(data, "validation")
-    everything = listed("all", data)
+    if name not in ("all", "open", "few"):
+        raise InputError("--learn-from", repr(name), "all, open or few")
+    everything = (
+        listed("training", data) + listed("validation", data)
+        if name == "few"
+        else listed(name, data)
+    )
     if group is not None:
         outside, inside = leave_out(everything, group)
     else:
-        inside = listed("holdout", data)
-        kept = {one.path for one in inside}
-        outside = [one for one in everything if one.path not in kept]
+        held = {one.path for one in listed("holdout", data)}
+        outside = [one for one in everything if one.path not in held]
+        inside = [one for one in everything if one.path in held]
     return [one.path for one in outside], [one.path for one in inside]
 
 

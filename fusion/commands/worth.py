@@ -8,17 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    Estimating,
-    JsonOption,
-    Reading,
-    grouped,
-    leave_with_skipped,
-    print_json,
-    progress_bar,
-)
+from stario.fusion.commands.common import collected, leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.judging import check_by, labels
     from stario.fusion.evaluation.worth import Worth
 
 
@@ -36,28 +30,21 @@ def fusion(
     """Hold the filter's error against its network's, with NIS and honesty of the yaw, by group."""
     from stario.fusion.backends import BackendName
     from stario.fusion.evaluation.worth import worth_of, worth_table
-    from stario.sequences.batch import Skipped, each
-    from stario.sequences.readers.archive import split_name
+    from stario.sequences.batch import each
 
+    grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
     files, skipped = reading.recordings(paths)
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
 
     def judged(path: Path) -> Worth:
         sequence = reading.read(path)
-        file, member = split_name(path)
-        named = file.stem if member else path.parent.name
-        group = named if by == "set" else str(sequence.attributes.get(by) or "unknown")
+        group = labels(path, sequence.attributes)[grouping]
         return worth_of(model, sequence, settings, group, backends)
 
-    found: list[Worth] = []
     with progress_bar("check fusion") as progress:
-        for done, outcome in enumerate(each(judged, files, jobs=1), 1):
-            if isinstance(outcome, Skipped):
-                skipped.append(outcome)
-            else:
-                found.append(outcome)
-            progress(done / len(files))
+        outcomes = each(judged, files, jobs=1)
+        found = collected(outcomes, skipped, lambda done: progress(done / len(files)))
     if as_json:
         print_json([asdict(one) for one in found])
     elif found:

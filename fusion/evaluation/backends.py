@@ -19,11 +19,13 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track, track_from_states
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import evaluate_track, position_nees
+from stario.sequences.metrics import evaluate_track
+from stario.sequences.nees import position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.text_table import aligned
 
 ESTIMATORS = ("ekf", "graph", "fixed_lag")
 """The filter, the graph of the whole, and the newest states of the fixed-lag graph."""
@@ -111,27 +113,25 @@ def summary(scores: Sequence[Score]) -> dict[str, object]:
 def score_table(scores: Sequence[Score]) -> str:
     """The scores for a person."""
     titles = {"ekf": "EKF", "graph": "graph", "fixed_lag": "fixed-lag"}
-    groups = ("ATE [m]", "NEES", "s/min")
-    head = "".join(f"{titles[e]:>11}" for _ in groups for e in ESTIMATORS)
-    lines = [f"{'':<24}" + "".join(f"{g:>{11 * len(ESTIMATORS)}}" for g in groups)]
-    lines.append(f"{'':<24}{head}{'slowest [ms]':>14}")
+    head = [f"{titles[e]} {group}" for group in ("ATE [m]", "NEES", "s/min") for e in ESTIMATORS]
     tables = [
         _table(scores, by) for by in (lambda s: s.ate_m, lambda s: s.nees, lambda s: s.s_per_min)
     ]
     figures = np.hstack([*tables, [[score.slowest_ms] for score in scores]])
     rows = [(s.name, row) for s, row in zip(scores, figures, strict=True)]
-    for name, row in [*rows, ("median", np.median(figures, axis=0))]:
-        cells = "".join(f"{value:>11.3f}" for value in row[:-1])
-        lines.append(f"{name[:23]:<24}{cells}{row[-1]:>14.1f}")
+    rows.append(("median", np.median(figures, axis=0)))
+    cells = [[name, *(f"{v:.3f}" for v in row[:-1]), f"{row[-1]:.1f}"] for name, row in rows]
     medians, (each, error) = np.median(figures[:, :3], axis=0), _mean_ratios(figures[:, :3])
     ratio, speed = medians / medians[0], 60.0 / np.median(figures[:, 8])
-    lines += [
-        f"median ATE against the EKF's: graph {ratio[1]:.2f}, fixed-lag {ratio[2]:.2f}; geometric "
-        f"mean over recordings: graph {each[1]:.2f} +- {error[1]:.2f}, "
-        f"fixed-lag {each[2]:.2f} +- {error[2]:.2f}",
-        f"fixed-lag {speed:.0f} times real time, slowest update {figures[:, -1].max():.1f} ms",
-    ]
-    return "\n".join(lines)
+    return "\n".join(
+        [
+            *aligned([["", *head, "slowest [ms]"], *cells]),
+            f"median ATE against the EKF's: graph {ratio[1]:.2f}, fixed-lag {ratio[2]:.2f}; "
+            f"geometric mean over recordings: graph {each[1]:.2f} +- {error[1]:.2f}, "
+            f"fixed-lag {each[2]:.2f} +- {error[2]:.2f}",
+            f"fixed-lag {speed:.0f} times real time, slowest update {figures[:, -1].max():.1f} ms",
+        ]
+    )
 
 
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:

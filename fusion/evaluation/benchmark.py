@@ -15,6 +15,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import FloatArray
+from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 
@@ -105,7 +106,7 @@ class _SwayingDevice:
 
     def run(self, ekf: StateCloningEkf) -> None:
         zero = np.zeros(3)
-        ekf.initialise(0.0, np.eye(3), zero, zero, zero, zero, np.eye(CORE) * 1e-4)
+        ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, np.eye(CORE) * 1e-4))
         covariance = np.eye(3) * 0.01 * self.per_window
         held = [ekf.clone()]
         for k, displacement in enumerate(self.displacements):

@@ -14,10 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.ekf_state import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
@@ -26,6 +25,7 @@ from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray, exp_so3, log_se23, yaw_rotation
 from stario.sequences.errors import InputError
+from stario.sequences.nees import nees_bounds
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -113,13 +113,12 @@ def consistency(
         nis.append(run_nis)
         progress((k + 1) / runs)
     table = np.stack(tables)  # runs, seconds, (nees, yaw error^2, yaw variance)
-    low, high = (float(chi2.ppf(p, CORE * runs)) / runs for p in (0.025, 0.975))
     return Consistency(
         runs=runs,
         seconds=seconds,
         nees=float(table[:, :, 0].mean()),
         nees_end=float(table[:, -1, 0].mean()),
-        nees_bounds=(low, high),
+        nees_bounds=nees_bounds(CORE, runs),
         yaw=float((table[:, :, 1] / table[:, :, 2]).mean()),
         nis=float(np.mean(nis)),
         yaw_sigma=float(np.sqrt(table[:, -1, 2].mean())),
@@ -134,16 +133,16 @@ class AnalyticWalk:
     Attributes:
         time: (N,) [s].
         R_WB: (N, 3, 3).
-        v_W: (N, 3) [m/s].
-        p_W: (N, 3) [m].
+        velocity_W: (N, 3) [m/s].
+        position_W: (N, 3) [m].
         gyro: (N, 3) exact rate in B [rad/s].
         accel: (N, 3) exact specific force in B [m/s^2].
     """
 
     time: FloatArray
     R_WB: FloatArray
-    v_W: FloatArray
-    p_W: FloatArray
+    velocity_W: FloatArray
+    position_W: FloatArray
     gyro: FloatArray
     accel: FloatArray
 
@@ -226,8 +225,8 @@ def _first_errors(
     turn = exp_so3(-theta)
     prior = PriorPose(
         R_WB=turn @ walk.R_WB[0],
-        v_W=walk.v_W[0] - velocity * rng.normal(size=3),
-        p_W=walk.p_W[0] - position * rng.normal(size=3),
+        v_W=walk.velocity_W[0] - velocity * rng.normal(size=3),
+        p_W=walk.position_W[0] - position * rng.normal(size=3),
         tilt_sigma=tilt,
         yaw_sigma=yaw,
         velocity_sigma=velocity,
@@ -247,7 +246,7 @@ def _seen(
     stop = round(interval.stop * RATE)
     start = stop - round(WINDOW_SECONDS * RATE)
     d_N = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T).T @ (
-        walk.p_W[stop] - walk.p_W[start]
+        walk.position_W[stop] - walk.position_W[start]
     )
     # The filter takes overlapping windows for less certain than each one is.
     sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
@@ -259,6 +258,6 @@ def _errors(
 ) -> tuple[float, float, float]:
     X, P = now.X, now.P
     R = walk.R_WB[k] @ X[:, :3].T
-    pose = log_se23(R, walk.v_W[k] - R @ X[:, 3], walk.p_W[k] - R @ X[:, 4])
+    pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])
     error = np.concatenate([pose, b_g - now.b_g, b_a - now.b_a])
     return float(error @ np.linalg.solve(P, error)), float(error[2] ** 2), float(P[2, 2])

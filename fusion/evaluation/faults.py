@@ -29,6 +29,7 @@ from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.text_table import aligned
 from stario.sequences.windows import WINDOW_SECONDS
 
 WHITE_NOISE = 0.05
@@ -110,14 +111,13 @@ def run_faults(
 
 def fault_table(results: Sequence[FaultResult]) -> str:
     """The results for a person."""
-    head = f"{'fault':<32}{'back end':<10}{'without':>9}{'with':>9}{'end':>9}{'sigma':>9}  reported"
-    lines = [head, f"{'':<42}{'ATE [m]':>9}{'ATE [m]':>9}{'[m]':>9}{'[m]':>9}"]
+    rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
-        cells = "".join(f"{value:>9.3f}" for value in figures)
-        state = "" if r.finite else "NOT FINITE, "
-        lines.append(f"{r.fault:<32}{r.backend:<10}{cells}  {state}{r.reported}")
-    return "\n".join(lines)
+        rows.append([r.fault, r.backend, *(f"{value:.3f}" for value in figures)])
+    told = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
+    lines = zip(aligned(rows), ["reported", *told], strict=True)
+    return "\n".join(f"{line}   {words}" for line, words in lines)
 
 
 def reported(health: Health) -> str:

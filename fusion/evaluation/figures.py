@@ -28,6 +28,7 @@ _COLOURS = (
     "#999999", "#000000", "#8DB600",
 )  # fmt: skip
 _STYLES = ("-", "--", ":")
+_MARKERS = "osD^vP"
 _AGAINST = "R-ResNet"
 
 
@@ -69,19 +70,19 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     for k, (network, parameters) in enumerate(table.parameters.items()):
         mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
         axes.errorbar(
-            parameters / 1e6, mean, yerr=spread, fmt="o", ms=9, color=_colour(k), capsize=4
-        )
-        axes.annotate(
-            network, (parameters / 1e6, mean), (8, 6), textcoords="offset points", fontsize=9
-        )
+            parameters / 1e6, mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
+            color=_colour(k), label=network,
+        )  # fmt: skip
     axes.set(xlabel="parameters [millions], the paper's convention", ylabel="ATE [m]", xscale="log")
     ticks = [1, 2, 3, 5, 10, 15]
     axes.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
     axes.set_xticks([], minor=True)
     counts = [p / 1e6 for p in table.parameters.values()]
     axes.set_xlim(0.7 * min(counts), 1.9 * max(counts))
-    axes.set_ylim(bottom=0.0)
     axes.margins(y=0.15)
+    axes.set_ylim(bottom=0.0)
+    # Beside, not at the points: half of the networks have about as many parameters and errors.
+    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     _dress(axes)
     return fig
 
@@ -136,28 +137,28 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
         _draw_sample(axes, sample, colours)
     for axes in panels[len(samples) :]:
         axes.remove()
-    handles, labels = panels[0].get_legend_handles_labels()
-    fig.legend(
-        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=9
-    )
     return fig
 
 
 def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     path = sample.truth.position_W[sample.truth.valid]
-    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label="truth")
+    length = sample.truth.path_length()
+    axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label=f"truth, {length:.0f} m")
     names = list(sample.tracks)
     if _AGAINST in names:
         ours = [name for name in names if name.startswith("StarIO")]
         names = [_AGAINST, *(ours or [n for n in names if n != _AGAINST])]
     for name in names[:4]:
         track, colour = sample.tracks[name].position_W, colours[name]
-        axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=name)
+        ate, rte = sample.errors[name]
+        label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"
+        axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=label)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
     axes.plot(*path[0, :2], "o", mfc="white", mec=_INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     _dress(axes)
 
 

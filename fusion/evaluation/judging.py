@@ -104,12 +104,12 @@ def judge(
         if isinstance(prepared, Skipped):
             skipped.append(prepared)
         else:
-            labels = _labels(prepared, groups.get(prepared.path, ""))
+            named = labels(prepared.path, prepared.attributes, groups.get(prepared.path, ""))
             errors = {
-                name: _errors(model(labels["group"]), prepared, read)
+                name: _errors(model(named["group"]), prepared, read)
                 for name, model in models.items()
             }
-            judged.append(Judged(prepared.path, labels, errors))
+            judged.append(Judged(prepared.path, named, errors))
         progress(done)
     return judged, skipped
 
@@ -172,14 +172,18 @@ def _strata(
     return strata
 
 
-def _labels(prepared: Prepared, group: str) -> dict[str, str]:
-    file, member = split_name(prepared.path)
+def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
+    """What a recording is grouped by; its set is its archive's name, or that of its folder.
+
+    Args:
+        path: of the recording.
+        attributes: of the recording.
+        group: from a list; empty where none is named.
+    """
+    file, member = split_name(path)
     named = group.split(" ")[0] if group else file.stem if member else file.parent.name
-    attributes = {
-        key: prepared.attributes.get(key) or "unknown"
-        for key in ("person", "device", "place", "carry")
-    }
-    return {"set": named, "group": group or named, **attributes}
+    known = {key: str(attributes.get(key) or "unknown") for key in get_args(By)[2:]}
+    return {"set": named, "group": group or named, **known}
 
 
 def _median(values: Sequence[float]) -> float:

@@ -14,6 +14,7 @@ from stario.fusion.evaluation.judging import POOLED, Judged, Row
 from stario.fusion.evaluation.judging_figure import groups_figure
 from stario.sequences.files import atomic_write, write_json
 from stario.sequences.plots import save_figure
+from stario.sequences.text_table import aligned, figure
 
 _COLUMNS = {
     "ate_fit_m": ("fit [m]", ".2f"),
@@ -60,20 +61,20 @@ class Judgement:
 
 def judgement_text(found: Judgement) -> str:
     """The table for a person: theirs, ours and the ratio below each other for every group."""
-    width = max([14, *(len(row.name) + 2 for row in found.rows)])
-    titles = "".join(f"{title:>11}" for title, _ in _COLUMNS.values())
-    lines = [f"{'':<{width}}{'':<8}{'n':>5}{'km':>7}{titles}"]
+    known = {"theirs": found.theirs, "ours": found.ours}
+    labels = {label: name for label, name in known.items() if name is not None}
+    table = [["", "", "n", "km", *(title for title, _ in _COLUMNS.values())]]
     for row in found.rows:
-        told = f"{row.recordings:>5}{row.path_km:>7.2f}"
-        for label, name in (("theirs", found.theirs), ("ours", found.ours)):
-            if name is None:
-                continue
-            cells = "".join(_cell(row.medians[name][key], form) for key, (_, form) in
-                            _COLUMNS.items())  # fmt: skip
-            lines.append(f"{row.name:<{width}}{label:<8}{told}{cells}")
+        for label, name in labels.items():
+            cells = [figure(row.medians[name][key], form) for key, (_, form) in _COLUMNS.items()]
+            table.append([row.name, label, str(row.recordings), f"{row.path_km:.2f}", *cells])
+    head, *body = aligned(table)
+    lines = [head]
+    for k, row in enumerate(found.rows):
+        lines += body[k * len(labels) : (k + 1) * len(labels)]
         for key, interval in row.ratios.items():
             title = _COLUMNS[key][0].split(" [")[0]
-            lines.append(f"{'':<{width}}ratio over {title}: {_interval(interval)}")
+            lines.append(f"{row.name}: ratio over {title}: {_interval(interval)}")
     if told := verdict(found.rows):
         lines.append(told)
     names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
@@ -154,10 +155,6 @@ def _write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
     writer.writerows(rows)
     with atomic_write(path) as file:
         file.write(text.getvalue())
-
-
-def _cell(value: float, form: str) -> str:
-    return f"{'-' if value != value else format(value, form):>11}"
 
 
 def _interval(found: Interval) -> str:

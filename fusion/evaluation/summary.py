@@ -10,6 +10,7 @@ import numpy as np
 
 from stario.fusion.evaluation.compare import METRIC_WORDS, TRACKS, Comparison, Metrics, metric_words
 from stario.sequences.sequence import FloatArray
+from stario.sequences.text_table import aligned, figure
 
 _COLUMNS = (
     ("pdr", "ate_m", "steps (PDR)"),
@@ -63,14 +64,12 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 
 def summary_table(recordings: Sequence[Scores]) -> str:
     """The same for a person: horizontal ATE of each track, consistency of the EKF."""
-    width = max([24, *(len(r.name) + 2 for r in recordings)])
-    lines = [f"{'':<{width}}" + "".join(f"{title:>24}" for _, _, title in _COLUMNS)]
     rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
     known = [_known(recordings, track, metric) for track, metric, _ in _COLUMNS]
     for name, over in (("median", np.median), ("mean", np.mean)):
         rows.append((name, [float(over(values)) if len(values) else None for values in known]))
-    for name, row in rows:
-        lines.append(f"{name:<{width}}" + "".join(f"{_cell(value):>24}" for value in row))
+    cells = [[name, *(figure(value, ".2f") for value in row)] for name, row in rows]
+    lines = aligned([["", *(title for _, _, title in _COLUMNS)], *cells])
     lines.append(f"ATE in m: {METRIC_WORDS['ate_m']}; NIS: {METRIC_WORDS['nis']}; ")
     lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
     return "\n".join(lines)
@@ -85,7 +84,3 @@ def _value(scores: Scores, track: str, metric: str) -> float | None:
     """A figure, None where it is not known."""
     value = scores.metrics.get(track, {}).get(metric)
     return value if value is not None and math.isfinite(value) else None
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

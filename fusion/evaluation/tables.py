@@ -25,6 +25,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.text_table import aligned
 
 PROTOCOLS = {
     "network_true_attitude": "network, true attitude",
@@ -61,11 +62,19 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Tracks of one recording with the true attitude, aligned with the truth, for a figure."""
+    """Tracks of one recording with the true attitude, aligned with the truth, for a figure.
+
+    Attributes:
+        recording: its name.
+        truth: the true track.
+        tracks: by network.
+        errors: ATE and RTE [m] of each track.
+    """
 
     recording: str
     truth: Trajectory
     tracks: dict[str, Trajectory]
+    errors: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,20 +171,15 @@ def table_text(table: NetworkTable) -> str:
     """The table for a person: a block for each protocol and metric, recordings by networks."""
     networks = list(table.parameters)
     recordings = list(dict.fromkeys(e.recording for e in table.entries))
-    width = max([12, *(len(name) + 2 for name in networks)])
-    first = max([12, *(len(name) + 2 for name in recordings)])
     lines = []
     for protocol, words in PROTOCOLS.items():
         for metric, title in METRICS.items():
             lines.append(f"{words}: {title}")
-            lines.append(f"{'':<{first}}" + "".join(f"{name:>{width}}" for name in networks))
+            rows = [["", *networks]]
             for recording in [*recordings, ""]:
                 cells = [table.mean_and_spread(n, protocol, metric, recording) for n in networks]
-                lines.append(
-                    f"{recording or 'mean':<{first}}"
-                    + "".join(f"{_cell(*cell):>{width}}" for cell in cells)
-                )
-            lines.append("")
+                rows.append([recording or "mean", *(_cell(*cell) for cell in cells)])
+            lines += [*aligned(rows), ""]
     return "\n".join([*lines, *(f"{name}: {text}." for name, text in _words(table).items())])
 
 
@@ -230,6 +234,7 @@ def _tracks(
         raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
     entries: list[Entry] = []
     shown: dict[str, Trajectory] = {}
+    shown_errors: dict[str, tuple[float, float]] = {}
     for weights, model in models:
         for protocol, track in _of_protocols(model, sequence, config):
             found = evaluate_track(track, sequence.truth, convention=convention)
@@ -237,7 +242,8 @@ def _tracks(
             entries.append(Entry(sequence.name, model.name, weights, protocol, *errors))
             if protocol == "network_true_attitude":
                 shown.setdefault(model.name, align(track, sequence.truth, "first"))
-    return entries, Sample(sequence.name, sequence.truth, shown)
+                shown_errors.setdefault(model.name, (found.ate_m, found.rte_m))
+    return entries, Sample(sequence.name, sequence.truth, shown, shown_errors)
 
 
 def _of_protocols(

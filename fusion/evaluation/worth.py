@@ -15,6 +15,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.known_positions import position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -22,6 +23,7 @@ from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import evaluate_track, pose_errors
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.text_table import aligned
 
 LEAST_SIGMA = 3.0
 """Deviations that an honest yaw error stays within."""
@@ -83,46 +85,38 @@ def worth_of(
 def worth_table(found: Sequence[Worth]) -> str:
     """A row for each group: ratios to the network, NIS, and the yaw at the end."""
     names = list(found[0].fused_m) if found else []
-    head = f"{'group':<22}{'n':>4}{'network':>9}"
-    head += "".join(f"{name + ' mean':>12}{'p95':>6}{'worst':>7}" for name in names)
-    lines = [head + f"{'NIS':>6}{'yaw deg':>9}{'< 3 sigma':>11}"]
+    head = ["group", "n", "network"]
+    for name in names:
+        head += [f"{name} mean", "p95", "worst"]
+    rows = [[*head, "NIS", "yaw deg", "< 3 sigma"]]
     groups = list(dict.fromkeys(one.group for one in found))
     parts = [(group, [one for one in found if one.group == group]) for group in groups]
     for group, part in [*parts, ("all", list(found))] if len(groups) > 1 else parts:
-        lines.append(_row(group, part, names))
-    lines.append("network: median error [m]; ratios to it: geometric mean, 95th percentile, worst")
-    return "\n".join(lines)
+        rows.append(_row(group, part, names))
+    words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
+    return "\n".join([*aligned(rows), words])
 
 
-def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> str:
-    row = f"{group:<22}{len(part):>4}{np.median([one.network_m for one in part]):>9.2f}"
+def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
+    row = [group, str(len(part)), f"{np.median([one.network_m for one in part]):.2f}"]
     for name in names:
         ratio = np.log([one.fused_m[name] / one.network_m for one in part])
         figures = np.exp([ratio.mean(), np.quantile(ratio, 0.95), ratio.max()])
-        row += f"{figures[0]:>12.2f}{figures[1]:>6.2f}{figures[2]:>7.2f}"
-    row += f"{np.nanmean([one.nis for one in part]):>6.1f}"
+        row += [f"{value:.2f}" for value in figures]
+    row.append(f"{np.nanmean([one.nis for one in part]):.1f}")
     yaw = np.array([(one.yaw_error, one.yaw_sigma) for one in part])
     yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
     if len(yaw) == 0:
-        return row
+        return [*row, "-", "-"]
     covered = (yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]).mean()
-    return row + f"{np.degrees(np.median(yaw[:, 0])):>9.1f}{covered:>11.0%}"
+    return [*row, f"{np.degrees(np.median(yaw[:, 0])):.1f}", f"{covered:.0%}"]
 
 
 def _error(track: Track, known: Trajectory | PositionTrack) -> float:
     """Horizontal, after a fit of yaw and position [m]."""
     if isinstance(known, Trajectory):
         return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
-    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
-    time, truth = known.time[inside], known.position_W[inside]
-    ours = [np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1)]
-    return _fitted(ours[0] + 1j * ours[1], truth[:, 0] + 1j * truth[:, 1])
-
-
-def _fitted(ours: np.ndarray, theirs: np.ndarray) -> float:
-    ours, theirs = ours - ours.mean(), theirs - theirs.mean()
-    turn = np.vdot(ours, theirs)
-    return float(np.sqrt(np.mean(np.abs(ours * turn / max(abs(turn), 1e-12) - theirs) ** 2)))
+    return position_error(track, known)[0]
 
 
 def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:

@@ -33,6 +33,7 @@ from stario.fusion.filter.jacobians import (
 )
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray, exp_times, yaw_twist
+from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
@@ -60,9 +61,8 @@ class StateCloningEkf(ErrorStateEngine):
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
-        self.state = EkfState.initial(
-            math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)), slots
-        )
+        nothing = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
+        self.state = EkfState.initial(nothing, slots)
         super().__init__(CORE + CLONE * slots)
         self.gravity = gravity
         self.slots = slots
@@ -76,40 +76,23 @@ class StateCloningEkf(ErrorStateEngine):
     def P(self, value: FloatArray) -> None:
         self.state = replace(self.state, P=value)
 
-    def initialise(
-        self,
-        time: float,
-        R_WB: FloatArray,
-        v_W: FloatArray,
-        p_W: FloatArray,
-        b_g: FloatArray,
-        b_a: FloatArray,
-        covariance: FloatArray,
-    ) -> None:
-        """Set the state and forget every clone.
-
-        Args:
-            time: [s].
-            R_WB: (3, 3) attitude.
-            v_W: (3,) [m/s].
-            p_W: (3,) [m].
-            b_g: (3,) [rad/s].
-            b_a: (3,) [m/s^2].
-            covariance: (15, 15) of plain errors (`EkfState.plain_covariance`).
+    def initialise(self, state: NavState) -> None:
+        """Set the state, with plain errors as callers know them, and forget every clone.
 
         Raises:
             InputError: a shape is wrong, a value is not finite, `R_WB` is no rotation, or the
                 covariance is not symmetric and positive semi-definite.
         """
-        given = {"v_W": v_W, "p_W": p_W, "b_g": b_g, "b_a": b_a}
-        vectors = {name: checked(name, value, (3,)) for name, value in given.items()}
-        R = checked("R_WB", R_WB, (3, 3))
+        v, p, b_g, b_a = (
+            checked(name, getattr(state, name), (3,)) for name in ("v_W", "p_W", "b_g", "b_a")
+        )
+        R = checked("R_WB", state.R_WB, (3, 3))
+        covariance = checked("covariance", state.covariance, (CORE, CORE))
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
             raise InputError("R_WB", "a matrix that is no rotation", "R R^T = I with det R = 1")
-        covariance = checked("covariance", covariance, (CORE, CORE))
         check_covariance(covariance)
-        now = checked("time", time, ()).item()
-        self.state = EkfState.initial(now, R, **vectors, covariance=covariance, slots=self.slots)
+        now = checked("time", state.time, ()).item()
+        self.state = EkfState.initial(NavState(now, R, v, p, b_g, b_a, covariance), self.slots)
         self.x[:] = 0.0
 
     def propagate(self, segment: Segment) -> None:

@@ -1,19 +1,21 @@
 """What the filter knows at one time, as a value that is never changed in place.
 
 Error state, its order and meaning: README.md, "Error state". The poses lie on SE_2(3) (clones:
-SE(3)); the covariance is that of their right-invariant error.
+SE(3)); the covariance is that of their right-invariant error. Callers get plain errors; the
+estimates of a recording are turned into them all at its end.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.fusion.filter.estimate import Estimate
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.lie import FloatArray, skew
+from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.errors import InputError
 
 _CLONE_COLUMNS = [0, 1, 2, 4]
@@ -26,6 +28,35 @@ _FAR = 1e3
 """Farther from the origin than this [m] positions are counted from a point nearby: in the
 right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
 digits for centimetres."""
+
+_AT_ONCE = 2000
+"""Estimates that are turned at once: an hour's would take hundreds of megabytes besides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a filter knows of its newest state, or of a clone.
+
+    Attributes:
+        time: [s].
+        X: (3, 5) R_WB, v_W, p_W; of a clone (3, 4) R_WB, p_W. The position is counted from the
+            origin.
+        origin_W: (3,) [m].
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        P: (15, 15) of theta, rho_v, rho_p, d_bg, d_ba; of a clone (6, 6) of theta, rho_p.
+        in_gap: as in `NavState`.
+        map_frame: as in `NavState`.
+    """
+
+    time: float
+    X: FloatArray
+    origin_W: FloatArray
+    b_g: FloatArray
+    b_a: FloatArray
+    P: FloatArray
+    in_gap: bool = False
+    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,24 +102,14 @@ class EkfState:
     field: FieldState | None = None
 
     @classmethod
-    def initial(
-        cls,
-        time: float,
-        R_WB: FloatArray,
-        v_W: FloatArray,
-        p_W: FloatArray,
-        b_g: FloatArray,
-        b_a: FloatArray,
-        covariance: FloatArray,
-        slots: int,
-    ) -> EkfState:
-        """A state without clones; the covariance (15, 15) is that of `plain_covariance`."""
-        origin_W = p_W if np.linalg.norm(p_W) > _FAR else np.zeros(3)
+    def initial(cls, state: NavState, slots: int) -> EkfState:
+        """A state without clones, from one with plain errors."""
+        origin_W = state.p_W if np.linalg.norm(state.p_W) > _FAR else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
-        X[0, :, :3], X[0, :, 3], X[0, :, 4] = R_WB, v_W, p_W - origin_W
+        X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
         P = np.zeros((CORE + CLONE * slots,) * 2)
-        P[:CORE, :CORE] = plain_covariance(covariance, -X[0, :, 3:].T)
-        return cls(time, X, origin_W, b_g, b_a, P, (None,) * slots)
+        P[:CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
+        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
 
     @property
     def R_WB(self) -> FloatArray:
@@ -204,12 +225,6 @@ class EkfState:
             N[self.first_field, 0] = 1.0
         return replace(self, P=self.P + sigma**2 * (N @ N.T))
 
-    def with_gyro_bias_inflated(self, variance: float) -> EkfState:
-        """The gyroscope's bias less known, by a variance per axis [rad^2/s^2]."""
-        P = self.P.copy()
-        P[GYRO_BIAS, GYRO_BIAS] += variance * np.eye(3)
-        return replace(self, P=P)
-
     def with_position_inflated(self, sigma: float) -> EkfState:
         """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""
         N = np.zeros((len(self.P), 3))
@@ -226,3 +241,42 @@ class EkfState:
         """First rows of theta and rho_p of the current pose and of every clone."""
         taken = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
         return [(0, 6), *((first, first + 3) for first in taken)]
+
+
+def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
+    """(N, n, n) of errors about W's axes, each true minus estimate."""
+    P, X = (np.array([getattr(e, name) for e in estimates]) for name in ("P", "X"))
+    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
+
+
+def nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
+    """The newest states as callers get them."""
+    parts = range(0, len(estimates), _AT_ONCE)
+    return [state for k in parts for state in _nav_states(estimates[k : k + _AT_ONCE])]
+
+
+def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
+    return [
+        NavState(
+            e.time,
+            e.X[:, :3],
+            e.X[:, 3],
+            e.X[:, 4] + e.origin_W,
+            e.b_g,
+            e.b_a,
+            covariance,
+            e.in_gap,
+            e.map_frame,
+        )
+        for e, covariance in zip(estimates, plain_covariances(estimates), strict=True)
+    ]
+
+
+def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
+    """Clones as callers get them."""
+    if not clones:
+        return []
+    return [
+        SmoothedPose(e.time, e.X[:, :3], e.X[:, 3] + e.origin_W, covariance, e.map_frame)
+        for e, covariance in zip(clones, plain_covariances(clones), strict=True)
+    ]

@@ -11,12 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import GYRO_BIAS
-from stario.fusion.filter.estimate import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import GYRO_BIAS, Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
@@ -38,11 +36,11 @@ from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocit
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.segments import segment_of
+from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -104,6 +102,8 @@ class Estimator:
         self._history: tuple[Step, ...] = ()
         self.oldest: Estimate | None = None
         initialise(self.ekf, start, prior, config)
+        if f.adaptive:
+            self._exchange_gyro_bias_prior(self._bias_prior.before_gravity_tells())
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------

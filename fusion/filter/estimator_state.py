@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from stario.fusion.filter.accelerometer import AccelerometerWorth
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimate import Estimate
+from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference

@@ -9,11 +9,12 @@ wide where it is large, or where the data say clearly that it lies outside the p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stario.fusion.lie import FloatArray
+from stario.sequences.levelling import BIAS_SIGMA
 
 _CORRECTED = 0.01
 """Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
@@ -53,6 +54,10 @@ class GyroBiasPrior:
     def first(cls, sigma: float) -> GyroBiasPrior:
         """Before anything is known."""
         return cls(sigma, sigma**2)
+
+    def before_gravity_tells(self) -> GyroBiasPrior:
+        """As wide as while levelling knows nothing of the bias."""
+        return replace(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
 
     def wanted(
         self, levelled: float, levelled_sigma: float, b_g: FloatArray, P: FloatArray

@@ -12,6 +12,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import FloatArray, exp_so3, yaw_twist
+from stario.fusion.state import NavState
 
 STILL_TILT_SIGMA = 0.01
 """Of the first attitude when the device was at rest [rad]."""
@@ -58,7 +59,8 @@ def initialise(
     sigma += [pose.velocity_sigma] * 3 + [pose.position_sigma] * 3
     sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
     covariance = np.diag(np.square(np.maximum(sigma, SMALLEST_SIGMA)))
-    ekf.initialise(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
+    state = NavState(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
+    ekf.initialise(state)
 
 
 def reinitialise(
@@ -81,4 +83,5 @@ def reinitialise(
     covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
     yaw = yaw_twist(s.R_WB)
     turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
-    ekf.initialise(interval.stop, turn @ start.R_WB, np.zeros(3), s.p_W, s.b_g, s.b_a, covariance)
+    R_WB, v_W = turn @ start.R_WB, np.zeros(3)
+    ekf.initialise(NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance))

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.lie import FloatArray
+from stario.sequences.chi_square import chi2_quantile
 
 PERIOD = 0.5
 """Between two bearings [s]."""

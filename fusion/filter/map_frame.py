@@ -19,14 +19,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimate import nav_states
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import FloatArray, exp_so3, yaw_twist
 from stario.fusion.state import NavState
+from stario.sequences.chi_square import chi2_quantile
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 """Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""

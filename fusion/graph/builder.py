@@ -15,8 +15,7 @@ from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.segments import segment_of, segment_of_all
+from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
 from stario.fusion.lie import FloatArray, exp_so3, log_so3, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.windows import WINDOW_SECONDS
@@ -165,7 +164,7 @@ class GraphBuilder:
             ahead = segment.predict(R, v, p, b_g, b_a)
             if segment.stop > time:
                 share = (time - segment.start) / segment.duration
-                return _part_of_way((R, v, p), ahead, share, segment.duration)
+                return _pose_between((R, v, p), ahead, share, segment.duration)
             R, v, p = ahead
         return R, v, p
 
@@ -223,7 +222,7 @@ def _usable(value: FloatArray, covariance: FloatArray) -> bool:
     return finite and dpotrf(covariance, lower=1)[1] == 0
 
 
-def _part_of_way(start: Pose, end: Pose, share: float, duration: float) -> Pose:
+def _pose_between(start: Pose, end: Pose, share: float, duration: float) -> Pose:
     """Between two poses a tenth of a second apart, with constant rate and acceleration."""
     (R0, v0, p0), (R1, v1, _) = start, end
     v = v0 + share * (v1 - v0)

@@ -14,20 +14,21 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimate import nav_states
+from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
+from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health, NavState
 
-_SAME = 0.8
-"""Ratio of the variances of bias priors from which on a graph begins anew."""
+_WIDER, _NARROWER = 1.2, 0.99
+"""Ratios of variances from which on the gyroscope bias's prior is another: a graph begins anew
+with a wider one, and is told the difference to a narrower one."""
 
 _ROUNDS = 3
 """Of each optimisation: the next keyframe's goes on from there."""
@@ -43,7 +44,7 @@ class FixedLagState:
         ahead: the newest state, carried on by the IMU from the last keyframe.
         origin_W: (3,) of the graph's positions [m]: see `EkfState`.
         map_frame: frame transforms before the graph began.
-        bias_prior: variance of the gyroscope bias's prior when the graph began [rad^2/s^2].
+        bias_prior: variance of the gyroscope bias's prior as the graph has it [rad^2/s^2].
         fallbacks: how often the graph fell back to the filter, and why it last did.
     """
 
@@ -87,6 +88,7 @@ class FixedLagEstimator:
     ) -> None:
         """Move to the interval's end and take in what was measured; as `Estimator.step`."""
         taken = self._filter.step(interval, displacement, fixes)
+        self._narrow_bias_prior()
         if self._stale or interval.anew is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
@@ -151,8 +153,17 @@ class FixedLagEstimator:
     @property
     def _stale(self) -> bool:
         """Whether the filter knows by now that the graph began from something else."""
-        ratio = self._filter.bias_prior.variance / self._bias_prior
-        return self._filter.map_frame != self._map_frame or not _SAME < ratio < 1.0 / _SAME
+        wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
+        return wider or self._filter.map_frame != self._map_frame
+
+    def _narrow_bias_prior(self) -> None:
+        """As the filter did: what the narrower prior knows more, as a measurement of zero."""
+        variance = self._filter.bias_prior.variance
+        if variance < _NARROWER * self._bias_prior:
+            more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+            graph = self._builder.graph
+            graph.add(GyroBias(graph.last, np.zeros(3), more * np.eye(3)), gated=False)
+            self._bias_prior = variance
 
     def _near(self, accepted: Accepted) -> Fix:
         """A fix as the filter inflated it, from the graph's origin."""
@@ -183,4 +194,4 @@ class FixedLagEstimator:
             self._ahead.propagate(segment)
 
     def _restart_from(self, s: NavState) -> None:
-        self._ahead.initialise(s.time, s.R_WB, s.v_W, s.p_W, s.b_g, s.b_a, s.covariance)
+        self._ahead.initialise(s)

@@ -20,13 +20,13 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.graph.factors import KeyframeState, Prior, Term
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
+from stario.sequences.chi_square import chi2_quantile
 
 _MOVED = 1e-3
 """A round that moves no keyframe further [m] is the last."""

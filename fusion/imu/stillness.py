@@ -1,26 +1,16 @@
-"""Stillness: when little but a sensor's own noise is in a second of samples.
+"""A still second, found interval by interval by the test of `stario.sequences.stillness`.
 
-The scatter of both sensors over the last second is held against the white noise of a phone's IMU
-(`PHONE_NOISE`), which a hand's tremor or a trolley's wheels exceed. The filter's own densities are
-no measure here: they stand for errors of scale and alignment, which only motion brings. That an
-even glide looks still as well is left to the zero-velocity update's own chi-square test
-(README.md, "Zero velocity").
-
-Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
-sensors); the scatter about the mean replaces their known gravity and bias.
+A hand's tremor or a trolley's wheels exceed it. That an even glide looks still as well is left to
+the zero-velocity update's own chi-square test (README.md, "Zero velocity").
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.chi_square import chi2_quantile
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray
-from stario.sequences.noise import PHONE_NOISE
-
-_PROBABILITY = 0.999
-"""That a sensor at rest looks still."""
+from stario.sequences.stillness import looks_still, scatter_bound
 
 
 class StillnessDetector:
@@ -66,23 +56,16 @@ class StillnessDetector:
         count = len(accel)
         total = accel.sum(axis=0)
         scatter = float(np.vdot(accel, accel) - total @ total / count)
-        bound = self._bound(count * self._intervals, count / (interval.stop - interval.start))
-        return scatter > bound * PHONE_NOISE.accel_noise**2
+        seconds = (interval.stop - interval.start) * self._intervals
+        bound = scatter_bound(count * self._intervals, seconds, self._scale)
+        return not looks_still(0.0, scatter, bound)
 
     def _quiet(self, sums: FloatArray) -> bool:
         """Whether a second may scatter like this."""
         count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
-        bound = self._bound(count, count / float(sums[1]))
-        gyro, accel = float(scatter[:3].sum()), float(scatter[3:].sum())
-        return (
-            gyro <= bound * PHONE_NOISE.gyro_noise**2
-            and accel <= bound * PHONE_NOISE.accel_noise**2
-        )
-
-    def _bound(self, count: float, rate: float) -> float:
-        """Of the scatter of so many samples in three axes, over the density's square."""
-        return self._scale**2 * rate * chi2_quantile(_PROBABILITY, 3.0 * (count - 1.0))
+        bound = scatter_bound(count, float(sums[1]), self._scale)
+        return looks_still(float(scatter[:3].sum()), float(scatter[3:].sum()), bound)
 
 
 def _sums_of(interval: ImuInterval) -> FloatArray:

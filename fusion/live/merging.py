@@ -18,6 +18,7 @@ from stario.fusion.live.payload import (
     GYRO,
     GYRO_RAW,
     LINEAR,
+    MAG,
     ORIENTATION,
     TOTAL,
     Reading,
@@ -27,6 +28,9 @@ from stario.sequences.sequence import MAX_IMU_GAP, FloatArray
 
 Sample = tuple[int, Vector, Vector]
 """Time [ns], angular rate [rad/s], specific force [m/s^2]."""
+
+Field = tuple[int, Vector]
+"""Time [ns], magnetic flux density [uT]."""
 
 CHOOSING = 5 * 10**8
 """Time [ns] in which every sensor of a device shows up, before it is chosen among them."""
@@ -102,10 +106,13 @@ class Merger:
     Attributes:
         upward: cosine between the force and up as the device's own attitude has it; 0 where it
             does not tell.
+        magnetic: whether it has a magnetometer.
     """
 
     def __init__(self) -> None:
-        self.upward = 0.0
+        self.upward, self.magnetic = 0.0, False
+        self._fields: list[Field] = []
+        self._newest_field, self._field_late = -1, 0
         self._waiting: list[Reading] = []
         self._gyro = ""
         self._accel: tuple[str, ...] = ()
@@ -115,7 +122,7 @@ class Merger:
     def dropped(self) -> dict[str, int]:
         """Readings dropped so far, by reason; those with a count."""
         counts = {
-            "late": self._join.late + self._gravity.late,
+            "late": self._join.late + self._gravity.late + self._field_late,
             "without acceleration": self._join.alone,
         }
         return {reason: count for reason, count in counts.items() if count}
@@ -148,8 +155,19 @@ class Merger:
                 self._join.add(1, time, (x, y, z))
         return self._join.ready()
 
+    def fields(self) -> list[Field]:
+        """The magnetic fields since the last call, in the order of time."""
+        fields, self._fields = self._fields, []
+        return fields
+
     def _take(self, reading: Reading) -> None:
         sensor, time, value = reading.sensor, reading.time_ns, reading.value
+        if sensor == MAG and self.magnetic:
+            if time > self._newest_field:
+                self._newest_field = time
+                self._fields.append((time, value))
+            else:
+                self._field_late += 1
         if sensor == self._gyro:
             self._join.add(0, time, value)
         elif len(self._accel) == 2 and sensor in self._accel:
@@ -169,7 +187,7 @@ class Merger:
             newest = max(times)  # what waits must not grow
             self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
             return False
-        self._gyro, self._accel = gyro, accel
+        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in seen
         self.upward = _cosine(
             _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
             *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),

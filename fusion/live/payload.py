@@ -6,10 +6,11 @@ A push of the app Sensor Logger is a JSON object with a batch of samples of all 
         {"name": "gyroscope", "time": 1698501144401773000, "values": {"x": 0.1, "y": 0, "z": 0}}]}
 
 `time` is in nanoseconds, rates in rad/s, accelerations in m/s^2. "accelerometer" is without gravity
-and "gravity" a sensor of its own; "totalacceleration" (Android) holds both. Sensors that no track
-is made of are skipped.
+and "gravity" a sensor of its own; "totalacceleration" (Android) holds both; "magnetometer" is in
+uT. Sensors that no track is made of are skipped.
 
-A line of any other device is one sample; gyro [rad/s] and accel [m/s^2] come together or alone:
+A line of any other device is one sample; gyro [rad/s], accel [m/s^2] and, where there is one, mag
+[uT] come together or alone:
 
     {"device": "rig", "t": 12.345, "gyro": [0.1, 0, 0], "accel": [0, 0, 9.81]}
 
@@ -35,7 +36,7 @@ LONGEST_SPAN = 600 * 10**9
 """Time [ns] between a push's first and last sample: longer, and a stamp is wrong."""
 
 _LARGEST = 1e4
-"""No sensor reads more in rad/s or m/s^2."""
+"""No sensor reads more in rad/s, m/s^2 or uT."""
 
 _LATEST = 2**63
 _LONGEST_NAME = 80
@@ -44,7 +45,8 @@ _UNIT = 0.05
 GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
 TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
 ACCEL_RAW = "accelerometeruncalibrated"
-SENSORS = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW})
+MAG = "magnetometer"
+SENSORS = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW, MAG})
 ORIENTATION = "orientation"
 """The phone's own attitude, of which only the vertical is used."""
 
@@ -56,7 +58,7 @@ class Reading:
     Attributes:
         sensor: one of `SENSORS`, or `ORIENTATION`.
         time_ns: on the device's clock [ns].
-        value: [rad/s] or [m/s^2]; of an attitude the unit vector up, in B.
+        value: [rad/s], [m/s^2] or [uT]; of an attitude the unit vector up, in B.
     """
 
     sensor: str
@@ -121,11 +123,11 @@ def parse_line(line: bytes, sender: str) -> Batch:
         time_ns = _nanoseconds("t", 1e9 * _number("t", message.get("t")))
     readings = [
         Reading(sensor, time_ns, _three(key, message[key]))
-        for key, sensor in (("gyro", GYRO), ("accel", TOTAL))
+        for key, sensor in (("gyro", GYRO), ("accel", TOTAL), ("mag", MAG))
         if key in message
     ]
     if not readings:
-        raise InputError("line", "neither gyro nor accel", "at least one of them")
+        raise InputError("line", "none of gyro, accel and mag", "at least one of them")
     device = _name("device", message.get("device", sender))
     return Batch(device, _name("recording", message.get("recording", ""), needed=False), readings)
 
@@ -234,7 +236,7 @@ def _three(where: str, values: Any) -> Vector:
 def _reading(where: str, value: Any) -> float:
     number = _number(where, value)
     if abs(number) > _LARGEST:
-        raise InputError(where, f"{number:.3g}", f"at most {_LARGEST:g} rad/s or m/s^2")
+        raise InputError(where, f"{number:.3g}", f"at most {_LARGEST:g} rad/s, m/s^2 or uT")
     return number
 
 

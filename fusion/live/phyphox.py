@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.payload import GRAVITY, GYRO, LINEAR, TOTAL, Batch, Reading, json_from
+from stario.fusion.live.payload import GRAVITY, GYRO, LINEAR, MAG, TOTAL, Batch, Reading, json_from
 from stario.sequences.errors import InputError
 
 PERIOD = 0.2
@@ -24,6 +24,7 @@ PERIOD = 0.2
 _SENSORS = {
     "gyroscope": GYRO,
     "accelerometer": TOTAL,
+    "magnetic_field": MAG,
     "linear_acceleration": LINEAR,
     "gravity": GRAVITY,
 }

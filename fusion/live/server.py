@@ -159,8 +159,16 @@ def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
     """The batches of a body, all of them or none."""
     if not sender_of_lines:
         return [parse_push(body)]
-    lines = [line for line in body.splitlines() if line.strip()]
-    return joined(parse_line(line, sender_of_lines) for line in lines)
+    lines = [(k, line) for k, line in enumerate(body.splitlines(), 1) if line.strip()]
+    return joined(_parsed_line(k, line, sender_of_lines) for k, line in lines)
+
+
+def _parsed_line(number: int, line: bytes, sender: str) -> Batch:
+    try:
+        return parse_line(line, sender)
+    except InputError as error:
+        field = f"line {number}, {error.field}"
+        raise InputError(field, error.found, error.expected, error.fix) from None
 
 
 def _check_origin(request: Request) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from stario.fusion.fixes import position_fix
 from stario.fusion.live.drawn import Drawn
 from stario.fusion.live.merging import Merger
-from stario.fusion.live.payload import Batch
+from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import findings
@@ -90,12 +91,18 @@ class Session:
         ]
         if not samples:
             return 0
+        fields = self._merger.fields()
         if self._file is None:
-            self._file = LiveFile(self._folder, self.device)
+            self._file = LiveFile(self._folder, self.device, self._merger.magnetic)
             self._first_ns = samples[0][0]
-        self._file.append(samples, received)
+        self._file.append(samples, received, fields)
+        coming = deque(fields)
         for time_ns, gyro, accel in samples:
+            while coming and coming[0][0] <= time_ns:
+                self._push_field(*coming.popleft())
             self._push((time_ns - self._first_ns) / 1e9, gyro, accel)
+        for time_ns, field in coming:  # ahead of the samples, which wait for the accelerometer
+            self._push_field(time_ns, field)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
 
@@ -178,6 +185,9 @@ class Session:
         times = sorted(reading.time_ns for reading in batch.readings)
         jump = times[len(times) // 2] - self._newest_ns
         return not -BACKWARD < jump < FORWARD
+
+    def _push_field(self, time_ns: int, field: Vector) -> None:
+        self._navigator.push_magnetometer((time_ns - self._first_ns) / 1e9, field)
 
     def _push(self, time: float, gyro: Any, accel: Any) -> None:
         try:

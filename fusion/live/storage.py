@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 from stario.fusion.fixes import Fix
-from stario.fusion.live.merging import Sample
+from stario.fusion.live.merging import Field, Sample
 from stario.sequences.errors import InputError
 
 HEADER = (
     "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],received [unix s]\n"
 )
+MAGNETIC_HEADER = HEADER.replace("received", "mx [uT],my [uT],mz [uT],received")
+"""Of a device with a magnetometer, whose fields stand in rows of their own."""
+
 FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
 
@@ -30,6 +33,7 @@ class LiveFile:
     Args:
         folder: to write into; it is made where it is missing.
         device: part of the file's name.
+        magnetic: whether it has columns for a magnetic field.
 
     Attributes:
         path: of the recording.
@@ -39,7 +43,7 @@ class LiveFile:
         InputError: the folder or file cannot be made.
     """
 
-    def __init__(self, folder: Path, device: str) -> None:
+    def __init__(self, folder: Path, device: str, magnetic: bool = False) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self.path, self._file = _new_file(folder, device)
@@ -47,16 +51,20 @@ class LiveFile:
             found = f"{folder}: {error.strerror or error}"
             raise InputError("out", found, "a folder that can be written to") from error
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
-        self._file.write(HEADER.encode())
+        self._between = ",,,," if magnetic else ","
+        self._file.write((MAGNETIC_HEADER if magnetic else HEADER).encode())
 
-    def append(self, samples: Sequence[Sample], received: float) -> None:
-        """Add samples, received at a time [s since 1970]."""
-        self._file.write(
-            "".join(
-                f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},{received:.3f}\n"
-                for time, g, a in samples
-            ).encode()
-        )
+    def append(
+        self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
+    ) -> None:
+        """Add samples and magnetic fields, received at a time [s since 1970]."""
+        end = f"{received:.3f}\n"
+        rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
+        rows += [
+            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r}{self._between}{end}"
+            for time, g, a in samples
+        ]
+        self._file.write("".join(rows).encode())
 
     def append_fix(self, fix: Fix) -> None:
         """Add a position fix as `stario run --fixes` reads it, its time since the first sample."""

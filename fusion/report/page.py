@@ -119,6 +119,7 @@ def report_html(
     return _filled(
         {
             "TITLE": html.escape(sequence.name),
+            "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
             "FACTS": _facts(sequence, tracks[main], series[main]),
             "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
             "HEALTH": "" if health is None else _health(findings(health)),

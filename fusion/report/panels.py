@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.stats import chi2
 
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
+from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.plots import TRACK_STYLES
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -111,7 +111,7 @@ def innovation_panels(
         traces += _dots(time, residual, gated, unit)
         title = f"Innovation {axis} [{unit}], band 3 sigma"
         panels.append(Panel(title, traces, {"range": _limits(traces)}))
-    limit = float(chi2.ppf(gate, 3))
+    limit = chi2_quantile(gate, 3)
     nis = np.maximum(innovations.nis[rows], 1e-2)
     ends = time[[0, -1]]
     traces = _dots(time, nis, gated, "")

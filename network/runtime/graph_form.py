@@ -11,15 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.fast_stario import (
-    Depthwise,
-    FastStarIO,
-    Gate,
-    Product,
-    Stage,
-    Star,
-    Wings,
-)
+from stario.network.runtime.fast_stario import FastStarIO, Stage
+from stario.network.runtime.folded_layers import Depthwise, Gate, Product, Star, Wings
 from stario.network.runtime.folding import folded
 from stario.network.stario import EPSILON, StarIO
 

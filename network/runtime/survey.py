@@ -23,6 +23,7 @@ from stario.network.runtime.inference import inference_form
 from stario.network.runtime.memory import peak_bytes
 from stario.network.runtime.timing import seconds_in_turn
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.text_table import aligned, figure
 from stario.sequences.windows import WINDOW_SAMPLES
 
 BATCHES = (1, 64)
@@ -79,13 +80,16 @@ def measured() -> dict[str, str]:
 
 
 def survey(
-    names: Sequence[str], cache: Path, progress: Callable[[float], None] = lambda share: None
+    names: Sequence[str],
+    cache: Path | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> list[ModelRow]:
     """Count, time and weigh networks.
 
     Args:
         names: of architectures.
-        cache: folder that keeps exported graphs, which take up to half a minute each to make.
+        cache: folder that keeps exported graphs, which take up to half a minute each to make; None
+            leaves ONNX Runtime out.
         progress: called with the share of the work done.
 
     Raises:
@@ -97,7 +101,9 @@ def survey(
         "torch": [TorchEngine(model.training_form) for model in models],
         "onnxruntime": None,
     }
-    if all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")):
+    if cache is not None and all(
+        importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")
+    ):
         graphs: list[Engine] = []
         for done, model in enumerate(models, 1):
             graphs.append(_graph_engine(model, cache))
@@ -129,8 +135,7 @@ def survey_table(rows: Sequence[ModelRow]) -> str:
     """The same for a person, the paper's figures beside ours."""
     columns = "parameters (paper),FLOPs (paper),numel,torch 1,torch 64,onnx 1,onnx 64,peak MB"
     titles = columns.split(",")
-    widths = [max(11, len(column) + 3) for column in titles]
-    lines = [f"{'':<22}" + "".join(f"{c:>{w}}" for c, w in zip(titles, widths, strict=True))]
+    table = [["", *titles]]
     for row in rows:
         published = ARCHITECTURES[row.name]
         cells = [
@@ -140,12 +145,9 @@ def survey_table(rows: Sequence[ModelRow]) -> str:
         ]
         for engine in ("torch", "onnxruntime"):
             found = row.milliseconds[engine]
-            cells += ["-" if found is None else f"{found[str(b)]:.3f}" for b in BATCHES]
-        cells.append(f"{row.peak_memory_mb:.1f}")
-        lines.append(
-            f"{row.name:<22}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))
-        )
-    return "\n".join([*lines, *(f"{name}: {text}." for name, text in measured().items())])
+            cells += [figure(None if found is None else found[str(b)]) for b in BATCHES]
+        table.append([row.name, *cells, f"{row.peak_memory_mb:.1f}"])
+    return "\n".join([*aligned(table), *(f"{name}: {text}." for name, text in measured().items())])
 
 
 def _model(name: str) -> DisplacementModel:

@@ -21,12 +21,13 @@ from torch import Tensor
 from stario.network.architectures import ARCHITECTURES
 from stario.network.training.augment import Augmentation
 from stario.sequences.errors import ConfigError
-from stario.sequences.settings import with_settings
+from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
     # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 walks of ten seconds.
-    "RNIN": {"successive": 10, "batch": 250},
+    # Stretches of weak truth are as many windows in a row, or twice as many.
+    "RNIN": {"successive": 10, "batch": 250, "track_seconds": 10},
 }
 """Settings that a network's own paper asks for, over the recipe's defaults."""
 
@@ -85,7 +86,8 @@ class TrainingConfig:
         track_stretches: the same of stretches along a track of positions without attitude.
         track_seconds: windows in each; short, as heads and phones drift apart in yaw.
         shares: of the windows that each source makes up, by a part of its recordings' path;
-            those that none names are drawn by their length and liveliness.
+            those that none names are drawn by their length and liveliness. "simulated" is the
+            share of simulated walks among all windows.
         compiled: compile the network for training (torch.compile; needs a C++ compiler on CPUs,
             which saves a third of the time).
         augmentation: how windows are varied.
@@ -125,9 +127,7 @@ class TrainingConfig:
             if not (isinstance(value, int) and value >= 1):
                 raise ConfigError(name, repr(value), "a count of at least 1")
         for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and low <= value <= high):
-                raise ConfigError(name, repr(value), f"a number from {low} to {high}")
+            check_number(self, name, low, high)
         if self.architecture not in ARCHITECTURES:
             known = f"one of {', '.join(ARCHITECTURES)}"
             raise ConfigError("architecture", repr(self.architecture), known)

@@ -21,8 +21,11 @@ from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_s
 
 log = logging.getLogger(__name__)
 
-KIND_SHARES = (0.6, 0.28, 0.12)
-"""Of the windows: recordings, simulated along captured walks, simulated along generated walks."""
+SIMULATED = "simulated"
+"""What a recipe's shares call the simulated walks."""
+
+_SIMULATED_SHARE, _CAPTURED_SHARE = 0.4, 0.7
+"""Of all windows, the simulated ones' where none is said; of those, along captured walks."""
 
 _SHORTEST = 400
 """Samples of the shortest stretch that is kept, 2 s."""
@@ -70,17 +73,22 @@ def gather(
         captured: simulated along captured walks.
         generated: simulated along generated walks.
         shares: of the sources among the recordings' windows, by a part of their path; recordings
-            that none names make up what is left of 1.
+            that none names make up what is left of 1. `SIMULATED` is that of the simulated walks
+            among all windows.
 
     Raises:
         ConfigError: nothing is left for them.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []
-    sources = [(f"recorded, {name}", KIND_SHARES[0] * share, members)
+    simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
+    along_captured = _CAPTURED_SHARE if captured and generated else 1.0 if captured else 0.0
+    sources = [(f"recorded, {name}", (1.0 - simulated) * share, members)
                for name, share, members in _sources(recorded, shares)]  # fmt: skip
-    sources.append(("simulated along captured walks", KIND_SHARES[1], list(captured)))
-    sources.append(("simulated along generated walks", KIND_SHARES[2], list(generated)))
+    sources.append(("simulated along captured walks", simulated * along_captured, list(captured)))
+    sources.append(
+        ("simulated along generated walks", simulated * (1.0 - along_captured), list(generated))
+    )
     words = []
     for name, share, members in sources:
         if not members:
@@ -114,6 +122,7 @@ def _sources(
     recorded: Sequence[Recorded], shares: Mapping[str, float]
 ) -> list[tuple[str, float, list[WorldStream]]]:
     """Name, share and streams of each source among the recordings with full truth."""
+    shares = {name: share for name, share in shares.items() if name != SIMULATED}
     members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
     for one in recorded:
         source = next((name for name in shares if name in str(one.path)), "")

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -40,12 +41,23 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What one epoch ended with; errors are mean squared displacement errors [m^2]."""
+    """What one epoch ended with; errors are mean squared displacement errors [m^2].
+
+    Attributes:
+        epoch: its number, from 1.
+        training_error: of its augmented windows.
+        validation_error: mean over recordings and kinds of weak truth.
+        validation_by_recording: of each of them.
+        windows_per_second: learned from, of this process, with and without full truth.
+        drawing_share: of the time that went into drawing them, the network waiting.
+    """
 
     epoch: int
     training_error: float
     validation_error: float
     validation_by_recording: dict[str, float]
+    windows_per_second: float = 0.0
+    drawing_share: float = 0.0
 
 
 def train(
@@ -58,7 +70,7 @@ def train(
     on_epoch: Callable[[EpochReport], None] = lambda report: None,
     trained_on: Sequence[str] = (),
     start_from: DisplacementModel | None = None,
-    keep_calibration: bool = False,
+    calibration: Calibration | None = None,
     legs: Sequence[LegStream] = (),
     validation_legs: Sequence[LegStream] = (),
 ) -> Path:
@@ -74,8 +86,8 @@ def train(
         on_epoch: called after each validation.
         trained_on: words for the card.
         start_from: a model whose weights are the first ones.
-        keep_calibration: keep that model's calibration, for a last stage that learns from the
-            validation recordings as well: their errors then say nothing any more.
+        calibration: of other weights, taken over where errors of `validation` say nothing:
+            a last stage learns from it as well, and weak truth alone has no windows to tell by.
         legs: stretches of weak truth, positions or waypoints, to learn from besides.
         validation_legs: some that choose the weights besides.
 
@@ -105,7 +117,6 @@ def train(
             run.record(report)
             if these.leads:
                 on_epoch(report)
-        calibration = start_from.card.calibration if start_from and keep_calibration else None
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 
@@ -141,6 +152,7 @@ class _Run:
         if not workers.leads:
             torch.manual_seed(config.seed + workers.rank)  # dropout of its own
         self.step = 0
+        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         self.history: list[EpochReport] = []
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -162,6 +174,7 @@ class _Run:
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
         """One epoch; returns the mean squared error on its (augmented) windows."""
         self.network.train()
+        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         errors = []
         for _ in range(self.config.steps_per_epoch):
             errors.append(self._one_step())
@@ -171,9 +184,11 @@ class _Run:
     def _one_step(self) -> float:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
+        begin = perf_counter()
         drawn = self.sampler.batch(self.config.batch // self.config.successive)
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
         legs = [sampler.batch(size).to(self.device) for sampler, size in self.legs]
+        ready = perf_counter()
         loss, error = self._loss(windows, target, legs)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
@@ -182,6 +197,10 @@ class _Run:
         self.optimiser.step()
         self.step += 1
         self._average()
+        self._drawing_s += ready - begin
+        self._learning_s += perf_counter() - ready
+        parts = [windows, *(part.windows for part in legs)]
+        self._windows += sum(part[..., 0, 0].numel() for part in parts)
         return error
 
     def _loss(
@@ -193,10 +212,11 @@ class _Run:
         """
         if not self.network.remembers:
             windows = windows.flatten(0, -3)
-        whole = torch.cat([windows, *(part.windows.flatten(0, 1) for part in legs)])
+        stretches = [self._in_rows(part.windows) for part in legs]
+        whole = torch.cat([windows, *stretches])
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
             mean, log_sigma = self._shared(whole)
-        sizes = [len(windows), *(part.known.shape[0] * part.share.shape[2] for part in legs)]
+        sizes = [len(windows), *map(len, stretches)]
         means, log_sigmas = mean.split(sizes), log_sigma.split(sizes)
         squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
         if self.step >= self.config.likelihood_from * self.config.steps:
@@ -207,6 +227,11 @@ class _Run:
             shape = (len(part.known), -1, 3)
             loss = loss + leg_loss(told.view(shape), sigma.view(shape), part)[0]
         return loss, float(squared.detach().sum(1).mean())
+
+    def _in_rows(self, stretches: Tensor) -> Tensor:
+        """Windows (S, K, 6, 200) one by one, or as many in a row as a network remembers."""
+        windows, successive = stretches.flatten(0, 1), self.config.successive
+        return windows.view(-1, successive, *windows.shape[1:]) if successive > 1 else windows
 
     def _check_finite(self, loss: float, norm: float) -> None:
         """Stop before a step that would spoil every weight.
@@ -253,6 +278,8 @@ class _Run:
             training_error=training_error,
             validation_error=self.workers.agreed(float(np.mean(list(errors.values()) or [0.0]))),
             validation_by_recording=errors,
+            windows_per_second=self._windows / (self._drawing_s + self._learning_s),
+            drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
         )
 
     def record(self, report: EpochReport) -> None:
@@ -322,12 +349,13 @@ class _Run:
         if not self.workers.leads:
             return path
         self.averaged.load_state_dict(self.best)
+        residuals, log_sigma = held_out.residuals(self.averaged)
         card = Card(
             architecture=self.config.architecture,
-            calibration=kept or calibrate(*held_out.residuals(self.averaged)),
+            calibration=kept or calibrate(residuals, log_sigma),
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
-            figures={"validation_mse_m2": held_out.errors(self.averaged)},
+            figures={"validation_mse_m2": held_out.errors(self.averaged, residuals)},
             known_motion=known,
         )
         save_model(path, self.averaged, card)

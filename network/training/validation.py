@@ -82,16 +82,25 @@ class ValidationSet:
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
 
-    def errors(self, network: DisplacementNetwork) -> dict[str, float]:
-        """Mean squared error by recording [m^2], and of legs by their kind [m^2/s]."""
-        squared = (self.residuals(network)[0] ** 2).sum(axis=1)
-        found = {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
-        return found | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
+    def errors(
+        self, network: DisplacementNetwork, residuals: np.ndarray | None = None
+    ) -> dict[str, float]:
+        """Mean squared error by recording [m^2], and of legs by their kind [m^2/s].
+
+        Args:
+            network: is left in evaluation mode.
+            residuals: (M, 3) [m], where they are known already.
+        """
+        found = self.residuals(network)[0] if residuals is None else residuals
+        squared = (found**2).sum(axis=1)
+        means = {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
+        return means | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
 
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
         batch = batch.to(self.device)
-        mean, log_sigma = network(batch.windows.flatten(0, 1))
+        windows = batch.windows if network.remembers else batch.windows.flatten(0, 1)
+        mean, log_sigma = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
 

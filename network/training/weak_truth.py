@@ -161,13 +161,16 @@ def leg_samplers(
 
     Raises:
         InputError: a kind has no stretch that is long enough.
-        ConfigError: the network remembers earlier windows, which this does not serve.
+        ConfigError: a stretch is no whole number of the rows of windows that a step draws.
     """
-    if streams and config.successive > 1:
-        raise ConfigError("successive", str(config.successive), "1 beside positions or waypoints")
+    kinds = by_kind(streams, config)
+    for kind, _, seconds, _ in kinds:
+        if seconds % config.successive:
+            expected = f"a multiple of successive={config.successive}"
+            raise ConfigError(f"seconds in a stretch with {kind}", str(seconds), expected)
     return [
         (LegSampler(members, seconds, config.augmentation, beside.generator), stretches)
-        for _, members, seconds, stretches in by_kind(streams, config)
+        for _, members, seconds, stretches in kinds
     ]
 
 

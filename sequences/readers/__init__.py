@@ -23,6 +23,7 @@ from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.euroc import is_euroc, read_euroc
 from stario.sequences.readers.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.imunet import is_imunet, read_imunet
+from stario.sequences.readers.json_export import is_json_export, laid_out
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv
 from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
@@ -48,11 +49,13 @@ class Format:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
         read: reads it, or raises ReadError.
+        words: what it is called before a person, where the reader knows no better.
         options: names of what else `read` takes, all text.
     """
 
     recognises: Callable[[Path], bool]
     read: Callable[..., ImuSequence]
+    words: str
     options: tuple[str, ...] = ()
 
 
@@ -63,41 +66,68 @@ def _is_archive_or_member(path: Path) -> bool:
 def _read_zip(path: Path) -> ImuSequence:
     """Read the one recording in a zip; its errors name the zip and the file in it."""
     with unpacked(path) as folder:
-        try:
-            found = find_recordings(folder)
-            if len(found) > 1:
-                names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
-                expected = "one recording in a zip"
-                raise ReadError(path, "zip", f"{len(found)}, {names}", expected, "unpack it")
-            sequence = read_recording(found[0])
-        except ReadError as error:
-            field = error.field.replace(str(folder), str(path))
-            raise ReadError(path, field, error.found, error.expected, error.fix) from None
-    return replace(sequence, name=path.stem) if found[0] == folder else sequence
+        found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
+        if len(found) > 1:
+            names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
+            raise ReadError(
+                path, "content", f"{len(found)} recordings, {names}", "one", "unpack it"
+            )
+        return _read_unpacked(path, folder, found[0] if found else folder)
+
+
+def _read_json(path: Path) -> ImuSequence:
+    with laid_out(path) as folder:
+        return _read_unpacked(path, folder, folder)
+
+
+def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
+    """Read what was unpacked from `path`; errors name `path` instead of the folder."""
+    try:
+        sequence = read_recording(inside)
+    except ReadError as error:
+        file = str(error.path).replace(str(folder), str(path))
+        field = error.field.removeprefix(f"{error.path}: ")
+        found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
+        raise ReadError(file, field, found, error.expected, fix) from None
+    return replace(sequence, name=path.stem) if inside == folder else sequence
 
 
 FORMATS: dict[str, Format] = {
-    "archive": Format(_is_archive_or_member, read_archive),
-    "ronin": Format(is_ronin, read_ronin),
-    "ridi": Format(is_ridi, read_ridi),
-    "imunet": Format(is_imunet, read_imunet),
-    "rnin": Format(is_rnin, read_rnin),
-    "tlio": Format(is_tlio, read_tlio),
-    "bag": Format(is_bag, read_bag, options=("imu_topic", "truth_topic")),
-    "euroc": Format(is_euroc, read_euroc),
-    "oxiod": Format(is_oxiod, read_oxiod),
-    "advio": Format(is_advio, read_advio),
-    "phone": Format(is_phone, read_phone),
-    "wide": Format(is_wide, read_wide),
-    "events": Format(is_event_lines, read_event_lines),
-    "zip": Format(is_zip, _read_zip),
-    "csv": Format(is_own_csv, read_own_csv),
+    "archive": Format(_is_archive_or_member, read_archive, "archive"),
+    "ronin": Format(is_ronin, read_ronin, "RoNIN"),
+    "ridi": Format(is_ridi, read_ridi, "RIDI"),
+    "imunet": Format(is_imunet, read_imunet, "IMUNet's recorder"),
+    "rnin": Format(is_rnin, read_rnin, "RNIN"),
+    "tlio": Format(is_tlio, read_tlio, "TLIO"),
+    "bag": Format(is_bag, read_bag, "ROS bag", options=("imu_topic", "truth_topic")),
+    "euroc": Format(is_euroc, read_euroc, "EuRoC layout"),
+    "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
+    "advio": Format(is_advio, read_advio, "ADVIO"),
+    "phone": Format(is_phone, read_phone, "phone"),
+    "wide": Format(is_wide, read_wide, "phone"),
+    "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
+    "zip": Format(is_zip, _read_zip, "zip"),
+    "json": Format(is_json_export, _read_json, "Sensor Logger"),
+    "csv": Format(is_own_csv, read_own_csv, "CSV of one's own"),
 }
 """Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
 well, `ridi` that of IMUNet's processed recordings."""
 
-_SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".bag", ".mcap", ".db3", ".hdf5", ".h5", ".zip")
+_SUFFIXES = (
+    *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
+    *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
+)
 """Files that may be a recording by themselves."""
+
+_CONTAINERS = (
+    (b"SQLite format 3", "an SQLite database"),
+    (b"PK\x03\x04", "a zip without text files, as a spreadsheet is"),
+    (b"\xd0\xcf\x11\xe0", "a spreadsheet"),
+    (b"\x1f\x8b", "a file compressed with gzip"),
+    (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
+    (b"MATLAB", "a MATLAB file"),
+)
+"""How files begin that may hold a recording but are not unpacked."""
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -124,7 +154,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
             raise InputError(option, f"an option of a {name} recording", known)
-    return FORMATS[name].read(path, **options)
+    sequence = FORMATS[name].read(path, **options)
+    return sequence if sequence.source else replace(sequence, source=FORMATS[name].words)
 
 
 def find_recordings(
@@ -266,6 +297,8 @@ def _unknown(path: Path) -> ReadError:
         there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
+    elif kind := next((words for start, words in _CONTAINERS if magic(path).startswith(start)), ""):
+        found, fix = kind, "export as CSV, or as the zip or folder that the app writes"
     elif magic(path, 2)[:1] == b"\x80":
         found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     elif (line := first_line(path)) is None:

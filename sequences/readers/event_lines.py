@@ -5,32 +5,45 @@ Indoor Location's traces (blank-free words between tabs): time [ms since 1970], 
 `TYPE_WAYPOINT` and x, y [m] on a floor plan, tapped by a surveyor. Some lines lack the break before
 them. GetSensorData's logfiles (IPIN's competitions; semicolons, `%` comments): `ACCE`, `GYRO` or
 `MAGN`, the app's and the sensor's time [s] and xyz; `POSI`, the app's time, a count, latitude and
-longitude [deg] of a reference point. Positions come as waypoints, horizontal and in metres.
+longitude [deg] of a reference point. Positions come as waypoints, horizontal and in metres. The
+device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last three of `AHRS`: x,
+y and z of a quaternion whose w is not negative.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer
 from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.phone_attitude import agreeing_attitude
+from stario.sequences.readers.sensor_table import Samples
 from stario.sequences.readers.text import IntArray, head_lines, read_lines, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import (
+    DeviceAttitude,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+)
 from stario.sequences.time_order import advancing
+
+_log = logging.getLogger(__name__)
 
 _TRACE = re.compile(r"\d{10,}\tTYPE_\w+")
 _GLUED = re.compile(r"(?<=[^\n])(\d{13}\tTYPE_)")
 _TYPES = {"accel": "TYPE_ACCELEROMETER", "gyro": "TYPE_GYROSCOPE", "mag": "TYPE_MAGNETIC_FIELD"}
-_WAYPOINT = "TYPE_WAYPOINT"
+_WAYPOINT, _ROTATION = "TYPE_WAYPOINT", "TYPE_ROTATION_VECTOR"
 
 _EVENT = re.compile(r"(ACCE|GYRO|MAGN);\s*-?\d")
 _CODES = {"accel": "ACCE", "gyro": "GYRO", "mag": "MAGN"}
-_POINT = "POSI"
+_POINT, _AHRS = "POSI", "AHRS"
 _EARTH_M = 6_371_000.0
 
 Rows = tuple[IntArray, FloatArray]
@@ -51,6 +64,7 @@ def read_event_lines(path: Path) -> ImuSequence:
             raise ReadError(path, "events", f"of {seen}", "of gyroscope and accelerometer")
     stamps, gyro, accel = on_one_clock(path, *sensors["gyro"], *sensors["accel"])
     field = sensors.get("mag")
+    attitude = _attitude(sensors)
     return ImuSequence(
         name=path.stem,
         time=seconds(stamps, stamps[0]),
@@ -59,6 +73,9 @@ def read_event_lines(path: Path) -> ImuSequence:
         magnetometer=None
         if field is None
         else magnetometer(seconds(field[0], stamps[0]), field[1]),
+        device_attitude=None
+        if attitude is None
+        else DeviceAttitude(seconds(attitude[0], stamps[0]), attitude[1]),
         positions=None if points is None else _waypoints(points, stamps[0]),
     )
 
@@ -68,6 +85,30 @@ def is_event_lines(path: Path) -> bool:
     if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
         return False
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
+
+
+def _add_attitude(
+    sensors: dict[str, Rows],
+    path: Path,
+    kind: str,
+    rows: list[list[str]],
+    unit_ns: int,
+    used: slice,
+) -> None:
+    try:
+        if rows:
+            sensors["attitude"] = _rows(path, kind, rows, unit_ns, used)
+    except ReadError as error:  # a recording does without
+        _log.info("attitude left out: %s", error)
+
+
+def _attitude(sensors: dict[str, Rows]) -> tuple[IntArray, Rotation] | None:
+    """The device's own attitude, where it was logged and the gyroscope agrees with it."""
+    if "attitude" not in sensors:
+        return None
+    stamps, xyz = sensors["attitude"]
+    w = np.sqrt(np.clip(1.0 - np.sum(xyz**2, axis=1), 0.0, None))
+    return agreeing_attitude(stamps, np.column_stack([xyz, w]), Samples(*sensors["gyro"]))
 
 
 def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
@@ -92,6 +133,7 @@ def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
         elif raw is not None:
             stamps, values = _rows(path, kind, raw, 10**6, slice(1, 7))
             sensors[sensor] = stamps, values[:, :3] - values[:, 3:]
+    _add_attitude(sensors, path, _ROTATION, events.get(_ROTATION, []), 10**6, slice(1, 4))
     taps = events.get(_WAYPOINT)
     return sensors, None if taps is None else _rows(path, _WAYPOINT, taps, 10**6, slice(1, 3))
 
@@ -100,13 +142,16 @@ def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
     events: dict[str, list[list[str]]] = {}
     for line in read_lines(path):
         cells = line.strip().split(";")
-        if cells[0] in (*_CODES.values(), _POINT):
+        if cells[0] in (*_CODES.values(), _POINT, _AHRS):
             events.setdefault(cells[0], []).append(cells[1:])
     sensors = {
         sensor: _rows(path, code, [[row[1], *row[2:]] for row in events[code]], 10**9, slice(1, 4))
         for sensor, code in _CODES.items()
         if code in events
     }
+    _add_attitude(
+        sensors, path, _AHRS, [row[1:] for row in events.get(_AHRS, [])], 10**9, slice(4, 7)
+    )
     if _POINT not in events or "ACCE" not in events:
         return sensors, None
     apart = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock is another

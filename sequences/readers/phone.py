@@ -27,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.apps import app_of
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import on_one_clock
 from stario.sequences.readers.own_csv import is_own_csv
@@ -160,6 +161,7 @@ def assembled(
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0]),
         device_attitude=_device_attitude(attitude, stamps[0]),
+        source="" if core_motion else app_of(files),
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -213,12 +215,13 @@ def _force(
     """Specific force, and whether its unit or sign were converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity = _gravity(files)
-    whole = next((one for one in candidates if _has_gravity(one, gravity is None)), None)
+    whole = _with_gravity(candidates, or_g=gravity is None)
     linear = files.first("linear")
     if whole is None and not candidates and linear is not None:
         candidates = [_read(linear, "linear")]
     accel = whole or candidates[0]
-    if whole is None and gravity is not None:
+    apart = whole is None and gravity is not None
+    if apart and gravity is not None:
         folder = gyro_folder(files)
         stamps, force, gravity_B = on_one_clock(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
@@ -227,7 +230,7 @@ def _force(
         _log.info("%s: gravity added from its own file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
-    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude)
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, apart)
     in_g &= sign < 0
     if sign < 0:
         converted |= {"accel"}
@@ -240,10 +243,15 @@ def gyro_folder(files: PhoneFiles) -> Path:
     return files.gyro.parent
 
 
-def _has_gravity(accel: Samples, or_g: bool) -> bool:
-    """Whether samples hold gravity, in m/s^2 or perhaps in g."""
-    size = float(np.median(np.linalg.norm(accel.values, axis=1)))
-    return size >= _GRAVITY_REMOVED or (or_g and is_in_g(accel.values))
+def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
+    """The first that holds gravity in m/s^2, or else the steadiest that may hold it in g."""
+    sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
+    for one, size in zip(candidates, sizes, strict=True):
+        if float(np.median(size)) >= _GRAVITY_REMOVED:
+            return one
+    shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
+    maybe = [k for k, one in enumerate(candidates) if or_g and is_in_g(one.values)]
+    return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
 
 
 def _gravity(files: PhoneFiles) -> Samples | None:

@@ -36,13 +36,30 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
         stamps, quaternion = read_quaternion(table)
     except ReadError:  # a recording does without
         return None
+    return agreeing_attitude(stamps, quaternion, gyro, table.quaternion[0].title != "")
+
+
+def agreeing_attitude(
+    stamps: IntArray, quaternion: FloatArray, gyro: Samples, named: bool = True
+) -> tuple[IntArray, Rotation] | None:
+    """Those of the ways to read an attitude that the gyroscope agrees with, the best; else None.
+
+    Args:
+        stamps: (N,) [ns].
+        quaternion: (N, 4), x, y, z and w; rows that are no unit quaternion are left out.
+        gyro: its samples, of the same clock.
+        named: whether the order is known, or it may as well be w, x, y and z.
+
+    Returns:
+        Time stamps (K,) [ns] and K rotations, body to a world with z up.
+    """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]
     kept = advancing(stamps.astype(np.float64)) if len(stamps) else np.empty(0, dtype=np.int64)
     if len(kept) < 2:
         return None
     stamps, quaternion = stamps[kept], quaternion[kept]
-    orders = _ORDERS[:1] if table.quaternion[0].title else _ORDERS
+    orders = _ORDERS[:1] if named else _ORDERS
     ways = [Rotation.from_quat(quaternion[:, order]) for order in orders]
     ways += [way.inv() for way in ways]
     shares = [_explained(stamps, way, gyro) for way in ways]

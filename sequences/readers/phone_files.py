@@ -20,6 +20,9 @@ from stario.sequences.readers.sensor_words import (
 )
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
+_MOTION = {"mot", "motion", "full"}
+"""Words of files that come from Apple's Core Motion, `MotMagnFull.txt`: no recording's name."""
+
 _NEEDED: tuple[Sensor, ...] = ("accel", "linear")
 
 
@@ -45,11 +48,11 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if _may_hold(file)]
     groups: dict[str, PhoneFiles] = {}
     for file, words in sorted(named, key=lambda item: _preference(*item)):
-        sensor = sensor_of(words)
+        sensor = _sensor_of(words)
         table = sensor_table(file) if sensor else None
         if sensor is None or table is None:
             continue
-        key = " ".join(word for word in words if not is_sensor_word(word))
+        key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
         group.tables.setdefault(sensor, []).append(table)
     whole = [group for group in groups.values() if _is_whole(group)]
@@ -84,9 +87,15 @@ def _may_hold(file: Path) -> bool:
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
 
 
+def _sensor_of(words: list[str]) -> Sensor | None:
+    """The sensor of a file's name; iOS Logger's `Motion.txt` is an attitude."""
+    return "attitude" if words == ["motion"] else sensor_of(words)
+
+
 def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
     """A total force comes before others, what is calibrated before what is raw."""
-    return is_uncalibrated(words), "total" not in words, "calibrated" not in words, file
+    calibrated = {"calibrated", "mot"} & set(words)
+    return is_uncalibrated(words), "total" not in words, not calibrated, file
 
 
 def _is_whole(group: PhoneFiles) -> bool:

@@ -7,6 +7,7 @@ specific force points up.
 
 from __future__ import annotations
 
+import csv
 import logging
 from pathlib import Path
 
@@ -24,6 +25,9 @@ _G_RANGE = (0.7, 1.4)
 _STEADY = 0.4
 """Gravity keeps a tenth of the samples from falling below this share of their median."""
 
+_CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
+"""How files begin that only loggers on iOS write."""
+
 _SURE = 0.7
 """Mean cosine between an attitude's vertical and the force from which it decides."""
 
@@ -39,6 +43,7 @@ def accel_sign(
     files: PhoneFiles,
     accel: Samples,
     attitude: tuple[IntArray, Rotation] | None,
+    gravity_apart: bool = False,
 ) -> float:
     """1.0, or -1.0 where the accelerometer has Apple's sign.
 
@@ -46,32 +51,53 @@ def accel_sign(
         files: the recording's.
         accel: its accelerometer's samples.
         attitude: the phone's own, as `logged_attitude` returns it.
+        gravity_apart: whether gravity was added from a file of its own.
     """
     folder = files.gyro.parent
+    in_g = is_in_g(accel.values)
     sign = _by_attitude(attitude, accel)
     if sign is None:
-        sign = _by_system(folder)
+        sign = _by_system(folder, in_g)
     if sign is None and accel.unit == "g" and _has_core_motion(files):
         sign = -1.0
-    if sign is None and is_in_g(accel.values) and not accel.unit:
+    if sign is None and in_g and not accel.unit:
         _log.warning(
-            "%s: an accelerometer in g: if an iPhone wrote it, pass "
-            "`--accel-unit g --accel-sign apple`", folder,
+            "%s: an accelerometer in g: pass `--accel-unit g`, and if an iPhone wrote it "
+            "`--accel-sign apple` as well", folder,
+        )  # fmt: skip
+    elif sign is None and gravity_apart:
+        _log.warning(
+            "%s: gravity stands in a file of its own, as Sensor Logger writes it on iPhones, whose "
+            "sign is the opposite: if one wrote it, pass `--accel-sign apple`", folder,
         )  # fmt: skip
     if sign == -1.0:
         _log.info("%s: the accelerometer has Apple's sign, turned over", folder)
     return sign or 1.0
 
 
-def _by_system(folder: Path) -> float | None:
-    """By Sensor Logger's `Metadata.csv`; iOS has Apple's sign unless the app standardised it."""
-    file = next((p for p in folder.glob("*") if p.name.lower() == "metadata.csv"), None)
-    if file is None:
-        return None
+def _by_system(folder: Path, in_g: bool) -> float | None:
+    """By the system that an app names, or that its files show it ran on; None where neither does.
+
+    Sensor Logger's `Metadata.csv` names it: iOS has Apple's sign unless the app standardised it.
+    SensLogs writes `record.properties` on Android, `description.txt` on iOS; files of ARKit and of
+    Core Motion come from iOS, their numbers as Apple has them where they are in g.
+    """
+    names = {file.name.lower(): file for file in sorted(folder.glob("*"))}
+    if "metadata.csv" in names:
+        return _by_metadata(names["metadata.csv"])
+    if "record.properties" in names:
+        return 1.0
+    if "BootTime" in "".join(head_lines(names.get("description.txt", folder))):
+        return -1.0
+    apples = any(name.startswith(_CORE_MOTION) for name in names)
+    return -1.0 if apples and in_g else None
+
+
+def _by_metadata(file: Path) -> float | None:
     lines = [line for line in head_lines(file) if line.strip()][:2]
     if len(lines) < 2:
         return None
-    titles, cells = ([c.strip(" \"'").lower() for c in line.split(",")] for line in lines)
+    titles, cells = ([c.strip().lower() for c in row] for row in csv.reader(lines))
     told = dict(zip(titles, cells, strict=False))
     system = told.get("platform", "") or told.get("device name", "")
     if not any(word in system for word in ("ios", "iphone", "ipad")):

@@ -32,8 +32,8 @@ from stario.sequences.readers.checked import (
 )
 from stario.sequences.readers.json_fields import JsonFields
 from stario.sequences.readers.text import magic
+from stario.sequences.rotations import cumulative_rotations
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.truth.alignment import cumulative_rotations
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _FIELDS = {

@@ -17,6 +17,8 @@ Sensor = Literal["accel", "gyro", "mag", "gravity", "linear", "attitude"]
 
 _WORD = re.compile(r"[A-Z]{2,}(?![a-z])|[A-Z]?[a-z]+|[A-Z]|\d+|[^\W\d_]+")
 _G_FORCE = re.compile(r"(?<![a-z])g[-_ ]?f(orce)?(?=[\W_xyz]|$)", flags=re.IGNORECASE)
+_WITH_G = re.compile(r"\bwith[-_ ]g\b", flags=re.IGNORECASE)
+_WITHOUT_G = re.compile(r"\bwithout[-_ ]g\b", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
 _BEGINNINGS: tuple[tuple[str, Sensor], ...] = (
@@ -67,6 +69,7 @@ _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
 def words_of(name: str) -> list[str]:
     """The words of a name in lower case, brackets left out."""
     plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", name))
+    plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain))
     return [word.lower() for word in _WORD.findall(plain)]
 
 
@@ -124,6 +127,13 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
     if match is None or (match["stem"] and _sensor(match["stem"]) is None):
         return None
     return match["axis"], (*words[:-1], match["stem"])
+
+
+def bias_axis_of(name: str) -> str | None:
+    """The axis along which a column says how far a raw sensor is off; None for another column."""
+    words = words_of(name)
+    alone = [word for word in words if word in ("x", "y", "z")]
+    return alone[0] if len(alone) == 1 and {"bias", "drift", "offset"} & set(words) else None
 
 
 def quaternion_of(name: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import logging
 import warnings
@@ -129,27 +130,32 @@ class Table:
         self.path, self.values, self.first_row = path, values, first_row
         self._cells, self.numbers = cells, numbers
 
-    def stamps_ns(self, column: int = 0, per_second: int = 10**9) -> IntArray:
+    def stamps_ns(
+        self, column: int = 0, per_second: int = 10**9, rows: IntArray | None = None
+    ) -> IntArray:
         """A column of times as whole nanoseconds (N,), exact: float64 cannot hold those of today.
 
         Args:
             column: which one, counted in the file.
             per_second: how many of the column's units make a second.
+            rows: those whose times are wanted; all if None.
 
         Raises:
             ReadError: a cell is no time.
         """
         unit_ns = 10**9 // per_second
+        rows = np.arange(len(self.values)) if rows is None else rows
         numbers = self.numbers(column)
+        numbers = None if numbers is None else numbers[rows]
         if numbers is not None and numbers.dtype.kind == "i":
             return np.asarray(numbers.astype(np.int64) * unit_ns, dtype=np.int64)
         if numbers is not None and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
             return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
         cells = self._cells(column)
         try:
-            stamps = [int(cell) * unit_ns for cell in cells]
+            stamps = [int(cells[k]) * unit_ns for k in rows]
         except ValueError:
-            stamps = [self._stamp(k, cell, unit_ns) for k, cell in enumerate(cells)]
+            stamps = [self._stamp(k, cells[k], unit_ns) for k in rows.tolist()]
         try:
             return np.array(stamps, dtype=np.int64)
         except OverflowError:
@@ -244,7 +250,7 @@ def _read_carefully(
     decimal: str = ".",
     killed: bool = False,
 ) -> Table:
-    lines = read_lines(path)
+    lines = [_unquoted(line, delimiter) for line in read_lines(path)]
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
     numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
@@ -271,6 +277,16 @@ def _read_carefully(
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
     """Seconds since an origin."""
     return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
+
+
+def _unquoted(line: str, delimiter: str | None) -> str:
+    """A line without the quotes around its cells; a delimiter within a cell becomes a blank."""
+    if '"' not in line:
+        return line
+    if delimiter is None:
+        return line.replace('"', " ")
+    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
 
 
 def _is_row(line: str) -> bool:

@@ -1,4 +1,4 @@
-"""Recordings as apps export them: a zip of the files that would be in a folder."""
+"""Recordings as apps export them: a zip of the files that would be in a folder, or of such zips."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import magic
 
-_SUFFIXES = (".csv", ".txt", ".tsv", ".json", ".properties")
+_SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _LARGEST = 4 * 2**30
 """More text [bytes] than any recording has: a zip that unpacks to it is a trap."""
 
@@ -36,17 +36,33 @@ def unpacked(path: Path) -> Iterator[Path]:
     """
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         try:
-            with zipfile.ZipFile(path) as file:
-                wanted = [info for info in file.infolist() if _is_wanted(info)]
-                size = sum(info.file_size for info in wanted)
-                if size > _LARGEST:
-                    raise ReadError(path, "zip", f"{size / 2**30:.0f} GiB of text", "a recording")
-                for info in wanted:
-                    file.extract(info, folder)
+            size = _extract(path, Path(folder), _LARGEST)
+            for inner in sorted(Path(folder).rglob("*.zip")):
+                size += _extract(inner, inner.with_suffix(""), _LARGEST - size)
+                inner.unlink()
         except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
             found = " ".join(str(error).split())
             raise ReadError(path, "zip", found, "a whole zip", "is it complete?") from None
+        except _TooLargeError:
+            found = f"more than {_LARGEST / 2**30:.0f} GiB of text"
+            raise ReadError(path, "zip", found, "a recording") from None
         yield Path(folder)
+
+
+class _TooLargeError(Exception):
+    """A zip that unpacks to more than is allowed."""
+
+
+def _extract(path: Path, folder: Path, most: int) -> int:
+    """Unpack what is wanted of a zip; its size [bytes]."""
+    with zipfile.ZipFile(path) as file:
+        wanted = [info for info in file.infolist() if _is_wanted(info)]
+        size = sum(info.file_size for info in wanted)
+        if size > most:
+            raise _TooLargeError
+        for info in wanted:
+            file.extract(info, folder)
+    return size
 
 
 def _is_wanted(info: zipfile.ZipInfo) -> bool:

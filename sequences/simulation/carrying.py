@@ -233,7 +233,7 @@ CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
     "trolley": _trolley,
     "rig": _rig,
 }
-"""Every way to carry, by name."""
+"""Every carrying mode, by name."""
 
 
 def _looks(gait: Gait, spread: FloatArray) -> FloatArray:

@@ -27,6 +27,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
+from stario.sequences.settings import check_number
 from stario.sequences.simulation.magnetometer import MagneticField, simulate_magnetometer
 
 _MIN_POSES = 6
@@ -66,12 +67,10 @@ class ImuErrors:
 
     def __post_init__(self) -> None:
         for item in fields(self)[1:]:
-            value = getattr(self, item.name)
-            if item.name.endswith("_range"):
-                if not value > 0:
-                    raise InputError(item.name, repr(value), "a range > 0, inf for none")
-            elif not (math.isfinite(value) and value >= 0):
-                raise InputError(item.name, repr(value), "a finite deviation >= 0")
+            if not item.name.endswith("_range"):
+                check_number(self, item.name)
+            elif not getattr(self, item.name) > 0:
+                raise InputError(item.name, repr(getattr(self, item.name)), "above 0, inf for none")
 
 
 PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
@@ -102,21 +101,6 @@ GOOD_IMU = ImuErrors(
 """A calibrated industrial unit."""
 
 
-@dataclass(frozen=True, eq=False)
-class Simulation:
-    """A simulated recording with what only a simulation knows.
-
-    Attributes:
-        sequence: the recording, its truth sampled at the IMU's times.
-        b_g: (N, 3) the gyroscope's bias at each sample [rad/s].
-        b_a: (N, 3) the accelerometer's bias at each sample [m/s^2].
-    """
-
-    sequence: ImuSequence
-    b_g: FloatArray
-    b_a: FloatArray
-
-
 def simulate_imu(
     trajectory: Trajectory,
     rate: float = 200.0,
@@ -126,19 +110,6 @@ def simulate_imu(
     name: str = "simulated",
     magnetic_field: MagneticField | None = None,
 ) -> ImuSequence:
-    """The recording of `simulate`, without its biases. Arguments and errors are the same."""
-    return simulate(trajectory, rate, errors, seed, gravity, name, magnetic_field).sequence
-
-
-def simulate(
-    trajectory: Trajectory,
-    rate: float = 200.0,
-    errors: ImuErrors = PHONE_IMU,
-    seed: int = 0,
-    gravity: float = STANDARD_GRAVITY,
-    name: str = "simulated",
-    magnetic_field: MagneticField | None = None,
-) -> Simulation:
     """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
 
     Args:
@@ -161,11 +132,11 @@ def simulate(
     accel = truth.attitude_WB.apply(acceleration_W + up, inverse=True)
     rng = np.random.default_rng(seed)
     noise = errors.noise
-    gyro, b_g = _measured(
+    gyro = _measured(
         gyro, rate, rng, (noise.gyro_noise, noise.gyro_walk), errors.gyro_turn_on,
         errors.gyro_scale, errors.misalignment, errors.gyro_range,
     )  # fmt: skip
-    accel, b_a = _measured(
+    accel = _measured(
         accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
         errors.accel_scale, errors.misalignment, errors.accel_range,
     )  # fmt: skip
@@ -173,7 +144,7 @@ def simulate(
     if magnetic_field is not None:
         measured = simulate_magnetometer(truth, magnetic_field, seed)
         sequence = replace(sequence, magnetometer=measured)
-    return Simulation(sequence, b_g, b_a)
+    return sequence
 
 
 def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:
@@ -239,8 +210,8 @@ def _measured(
     scale: float,
     misalignment: float,
     limit: float,
-) -> tuple[FloatArray, FloatArray]:
-    """What a sensor shows for `true` (N, 3), and its bias (N, 3)."""
+) -> FloatArray:
+    """What a sensor shows for `true` (N, 3)."""
     white, walk = densities
     axes = Rotation.from_rotvec(misalignment * rng.standard_normal(3)).as_matrix()
     scales = 1.0 + scale * rng.standard_normal(3)
@@ -248,4 +219,5 @@ def _measured(
     steps[0] = turn_on * rng.standard_normal(3)
     bias = np.cumsum(steps, axis=0)
     noise = white * math.sqrt(rate) * rng.standard_normal(true.shape)
-    return np.clip(true @ axes.T * scales + bias + noise, -limit, limit), bias
+    shown: FloatArray = np.clip(true @ axes.T * scales + bias + noise, -limit, limit)
+    return shown

@@ -1,7 +1,7 @@
 """Generated walks of a person with a device, to drive the simulator; every walk from a seed.
 
-A walk is a route (where the person goes), a gait tied to its speed, and a way to carry the device
-(how it moves against the person). Speed v, step length L and step rate f hang together as in
+A walk is a route (where the person goes), a gait tied to its speed, and a carrying mode (how the
+device moves against the person). Speed v, step length L and step rate f hang together as in
 people: L grows in proportion to f, so v = f L = k h f^2 with the height h, and one of them
 follows from another.
 """
@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.settings import check_number
 from stario.sequences.simulation.carrying import CARRIES, CarryMotion, Gait
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
 
-CARRY_WAYS = tuple(CARRIES)
-"""Names of the ways to carry a device."""
+CARRYING_MODES = tuple(CARRIES)
+"""Names of the carrying modes."""
 
 _SLOWEST_STEP_RATE = 0.8
 """Steps per second of a person who barely moves [Hz]."""
@@ -30,7 +31,7 @@ _BRISK = 1.4
 """Speed [m/s] at which the gait has its full strength."""
 
 _CHANGE = 0.6
-"""Deviation of the Gaussian step from one way to carry to the next [s]."""
+"""Deviation of the Gaussian step from one carrying mode to the next [s]."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class WalkStyle:
     """Who walks, and how the device is carried.
 
     Attributes:
-        carry: one of `CARRY_WAYS`.
-        next_carry: the way to carry after a change within the walk; empty for none.
+        carry: one of `CARRYING_MODES`.
+        next_carry: the carrying mode after a change within the walk; empty for none.
         height: of the person [m].
         step_constant: k of speed = k height step_rate^2 [s]: who takes long steps has a large k.
         preferred_speed: [m/s].
@@ -47,7 +48,7 @@ class WalkStyle:
         mount_rotvec: rotation of the device against its neutral attitude [rad], any.
 
     Raises:
-        InputError: a way to carry is unknown or a value is out of range.
+        InputError: a carrying mode is unknown or a value is out of range.
     """
 
     carry: str = "handheld"
@@ -59,22 +60,22 @@ class WalkStyle:
     mount_rotvec: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, known in (("carry", CARRY_WAYS), ("next_carry", (*CARRY_WAYS, ""))):
+        for name, known in (("carry", CARRYING_MODES), ("next_carry", (*CARRYING_MODES, ""))):
             if getattr(self, name) not in known:
-                raise InputError(name, repr(getattr(self, name)), f"one of {', '.join(CARRY_WAYS)}")
+                raise InputError(
+                    name, repr(getattr(self, name)), f"one of {', '.join(CARRYING_MODES)}"
+                )
         for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InputError(name, repr(value), f"a value from {low} to {high}")
+            check_number(self, name, low, high)
         if len(self.mount_rotvec) != 3 or not all(map(math.isfinite, self.mount_rotvec)):
             raise InputError("mount_rotvec", repr(self.mount_rotvec), "three finite angles [rad]")
 
     @staticmethod
     def random(rng: np.random.Generator) -> WalkStyle:
-        """Draw a person, a way to carry (every third walk changes it) and a mount."""
-        carry = str(rng.choice(CARRY_WAYS, p=_ODDS))
+        """Draw a person, a carrying mode (every third walk changes it) and a mount."""
+        carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
         # Nobody puts the device onto wheels, or off them, within a step or two.
-        others = [way for way in CARRY_WAYS if way not in (carry, "trolley")]
+        others = [way for way in CARRYING_MODES if way not in (carry, "trolley")]
         changes = carry != "trolley" and rng.random() < 1.0 / 3.0
         x, y, z = Rotation.random(rng=rng).as_rotvec()
         return WalkStyle(
@@ -96,7 +97,7 @@ _RANGES = (
 )
 
 _ODDS = (0.28, 0.09, 0.15, 0.14, 0.1, 0.1, 0.14)
-"""How often each way to carry is drawn, in the order of `CARRY_WAYS`."""
+"""How often each carrying mode is drawn, in the order of `CARRYING_MODES`."""
 
 
 def generate_walk(

@@ -14,7 +14,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import align
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.walks import CARRY_WAYS
+from stario.sequences.simulation.walks import CARRYING_MODES
 
 Make = Callable[..., Any]
 
@@ -186,7 +186,7 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
     )
 
 
-@pytest.mark.parametrize("carry", CARRY_WAYS)
+@pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_a_stream_in_degrees_is_refused_once_the_device_turns(
     make_walk: Make, still_model: Any, carry: str
 ) -> None:

@@ -12,7 +12,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.units import with_units
 
 DATA = Path(
@@ -44,7 +44,7 @@ def refused(sequence: ImuSequence) -> str:
     return text
 
 
-@pytest.mark.parametrize("carry", CARRY_WAYS)
+@pytest.mark.parametrize("carry", CARRYING_MODES)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
     """Swinging arms and pockets turn fast and press the device outward: still rad/s and m/s^2."""

@@ -13,7 +13,7 @@ from stario.sequences.levelling import (
 )
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
-from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -42,7 +42,7 @@ def test_a_device_at_rest_starts_level_to_its_noise(mount: tuple[float, ...]) ->
     assert abs(yaw_free[2]) < 1e-9  # the turn's axis is horizontal
 
 
-@pytest.mark.parametrize("carry", CARRY_WAYS)
+@pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_a_walker_starts_level_within_the_sigma_stated(carry: str) -> None:
     errors = []
     for seed in range(6):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
     ImuSequence,
@@ -18,9 +19,12 @@ from stario.sequences import (
     read_recording,
     simulate_imu,
 )
+from stario.sequences.levelling import levelled_attitudes
 from stario.sequences.magnetic import judge_magnetometer
+from stario.sequences.rotations import yaw_of
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.windows import clean_samples
 
 DATA = Path(os.environ.get("STARIO_DATA", "../shared/data"))
 IRON = (15.0, -6.0, 9.0)
@@ -42,7 +46,7 @@ def test_size_dip_lag_iron_and_drift_come_back() -> None:
     assert found is not None
     assert found.verdict == "good"
     assert found.correlation is not None
-    assert found.correlation > 0.85
+    assert found.correlation > 0.89  # the sensor's own noise and its lag leave 0.90
     assert found.lag_s == pytest.approx(0.04, abs=0.01)
     np.testing.assert_allclose(found.hard_iron_uT, IRON, atol=3.0)
     assert found.dip_rad == pytest.approx(math.radians(63.0), abs=0.1)
@@ -82,12 +86,32 @@ def test_inspection_tells_of_a_good_magnetometer_and_of_none() -> None:
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
-def test_recorded_magnetometers_know_the_gyroscopes_drift() -> None:
-    """0.64 deg/s, by the true attitude; and magnets beside a phone are not trusted."""
-    found = judge_magnetometer(read_recording(DATA / "oxiod/handheld/data1/syn/imu2.csv"))
+@pytest.mark.parametrize(
+    ("name", "verdict", "sure"),
+    [
+        ("imu3", "good", 0.06),
+        # The bearing is unsteady by 18 deg: its slope over a minute is known to no better.
+        ("imu2", "coarse", 0.15),
+    ],
+)
+def test_recorded_magnetometers_know_the_gyroscopes_drift(
+    name: str, verdict: str, sure: float
+) -> None:
+    """With its sign, against how the yaw by the gyroscope leaves the true one [deg/s]."""
+    recording = read_recording(DATA / f"oxiod/handheld/data1/syn/{name}.csv")
+    time, gyro, accel = clean_samples(recording)
+    levelled = Rotation.from_matrix(levelled_attitudes(time, gyro, accel))
+    known = recording.truth.covers(time)
+    off = np.unwrap(yaw_of(levelled * recording.truth.at(time).attitude_WB.inv())[known])
+    drift = np.polyfit(time[known], off, 1)[0]
+    found = judge_magnetometer(recording)
     assert found is not None
-    assert found.verdict == "coarse"
-    assert abs(math.degrees(found.drift_rad_s)) == pytest.approx(0.64, abs=0.2)
+    assert found.verdict == verdict
+    assert math.degrees(found.drift_rad_s) == pytest.approx(math.degrees(drift), abs=sure)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
+def test_magnets_beside_a_phone_are_not_trusted() -> None:
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = judge_magnetometer(read_recording(DATA / name))
     assert magnets is not None

@@ -15,11 +15,9 @@ from stario.sequences.metrics import (
     TrackMetrics,
     align,
     evaluate_track,
-    nees,
-    nees_bounds,
     pose_errors,
-    position_nees,
 )
+from stario.sequences.nees import nees, nees_bounds, position_nees
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import Trajectory
 

@@ -162,6 +162,8 @@ def test_the_packages_lists_hold_groups_apart() -> None:
     held = set(names["holdout"])
     assert held < set(names["all"])
     assert not held & set(names["training"])
+    assert set(names["open"]) < set(names["all"])
+    assert not any(word in name for name in names["open"] for word in ("ridi", "kipd", "rocip"))
     kept = {group for name, group in names["all"].items() if name not in held}
     for group in ("tyrex Thibaud", "ridi dan", "ridi huayi", "kipd yk", "ilc site2 F1"):
         assert group in names["holdout"].values()

@@ -2,7 +2,7 @@
 
 `test` and `validation` are of the development recordings; `training` are the 36 minutes of the
 first weights; `holdout` are the people, devices and places that judge weights trained on the rest
-of `all`.
+of `all`; `open` are those of `all` whose licence allows any use.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from stario.sequences.errors import InputError
 from stario.sequences.splits import Listed, read_list
 
-NAMES = ("test", "validation", "training", "holdout", "all")
+NAMES = ("test", "validation", "training", "holdout", "all", "open")
 
 
 def listed(name: str, data: Path) -> list[Listed]:

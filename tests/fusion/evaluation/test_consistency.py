@@ -59,14 +59,14 @@ def test_nees_of_half_an_hour_with_a_phone_is_within_its_bounds() -> None:
 
 def test_the_analytic_walk_is_its_own_dead_reckoning() -> None:
     walk = analytic_walk(5.0, np.random.default_rng(0), STANDARD_GRAVITY)
-    R, v, p, zero = walk.R_WB[0], walk.v_W[0], walk.p_W[0], np.zeros(3)
+    R, v, p, zero = walk.R_WB[0], walk.velocity_W[0], walk.position_W[0], np.zeros(3)
     for k in range(0, len(walk.time) - 1, 20):
         part = slice(k, k + 21)
         samples = walk.time[part], walk.gyro[part], walk.accel[part]
         segment = preintegrate(*samples, zero, zero, ImuNoise(), STANDARD_GRAVITY)
         R, v, p = segment.predict(R, v, p, zero, zero)
-    np.testing.assert_allclose(p, walk.p_W[-1], atol=2e-3)
-    np.testing.assert_allclose(v, walk.v_W[-1], atol=2e-3)
+    np.testing.assert_allclose(p, walk.position_W[-1], atol=2e-3)
+    np.testing.assert_allclose(v, walk.velocity_W[-1], atol=2e-3)
     np.testing.assert_allclose(R, walk.R_WB[-1], atol=1e-3)
     np.testing.assert_allclose(exp_so3(zero), np.eye(3))
 

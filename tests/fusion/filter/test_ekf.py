@@ -3,10 +3,11 @@ import pytest
 
 from stario.fusion.evaluation.benchmark import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimate import plain_covariances
+from stario.fusion.filter.ekf_state import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.lie import exp_se23, exp_so3, log_so3, skew
+from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -18,7 +19,7 @@ YAW = np.array([0.0, 0.0, 1.0])
 def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> StateCloningEkf:
     sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
     ekf = engine(slots)
-    ekf.initialise(
+    state = NavState(
         10.0,
         exp_so3(np.array([0.5, -0.7, 2.0])),
         np.array([1.0, -0.5, 0.1]),
@@ -27,6 +28,7 @@ def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> 
         np.array([0.02, -0.01, 0.03]),
         np.diag(sigma**2),
     )
+    ekf.initialise(state)
     return ekf
 
 
@@ -305,15 +307,9 @@ def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
     yaw = 1.1
     Z = exp_so3(yaw * YAW)
     ekf, turned = initialised(6), initialised(6)
-    turned.initialise(
-        10.0,
-        Z @ ekf.state.R_WB,
-        Z @ ekf.state.v_W,
-        Z @ ekf.state.p_W,
-        ekf.state.b_g,
-        ekf.state.b_a,
-        ekf.state.plain_covariance,
-    )
+    s = ekf.state
+    R_WB, v_W, p_W = Z @ s.R_WB, Z @ s.v_W, Z @ s.p_W
+    turned.initialise(NavState(10.0, R_WB, v_W, p_W, s.b_g, s.b_a, s.plain_covariance))
     rng = np.random.default_rng(2)
     slots = [(ekf.clone(), turned.clone())]
     for segment in segments(60):
@@ -369,9 +365,8 @@ def test_covariance_is_given_and_read_plain_covariance() -> None:
     ekf = initialised(0)
     A = np.random.default_rng(0).normal(size=(15, 15))
     covariance = A @ A.T
-    ekf.initialise(
-        0.0, ekf.state.R_WB, ekf.state.v_W, ekf.state.p_W, ekf.state.b_g, ekf.state.b_a, covariance
-    )
+    s = ekf.state
+    ekf.initialise(NavState(0.0, s.R_WB, s.v_W, s.p_W, s.b_g, s.b_a, covariance))
     np.testing.assert_allclose(ekf.state.plain_covariance, covariance, rtol=1e-9, atol=1e-9)
 
 
@@ -437,10 +432,10 @@ def test_initial_values_that_do_not_fit_are_named() -> None:
     zero, eye = np.zeros(3), np.eye(3)
     ekf = StateCloningEkf(2)
     with pytest.raises(InputError, match="R_WB"):
-        ekf.initialise(0.0, 2 * eye, zero, zero, zero, zero, np.eye(15))
+        ekf.initialise(NavState(0.0, 2 * eye, zero, zero, zero, zero, np.eye(15)))
     with pytest.raises(InputError, match="v_W"):
-        ekf.initialise(0.0, eye, np.full(3, np.nan), zero, zero, zero, np.eye(15))
+        ekf.initialise(NavState(0.0, eye, np.full(3, np.nan), zero, zero, zero, np.eye(15)))
     with pytest.raises(InputError, match="covariance"):
-        ekf.initialise(0.0, eye, zero, zero, zero, zero, -np.eye(15))
+        ekf.initialise(NavState(0.0, eye, zero, zero, zero, zero, -np.eye(15)))
     with pytest.raises(InputError, match="slots"):
         StateCloningEkf(-1)

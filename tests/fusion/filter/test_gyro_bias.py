@@ -7,6 +7,7 @@ import pytest
 
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.state import NavState
 
 
 def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
@@ -14,7 +15,7 @@ def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
     ekf = StateCloningEkf(slots=1)
     zero = np.zeros(3)
     variances = np.repeat([1e-2, 0.5, 1.0, sigma**2, 1e-2], 3)
-    ekf.initialise(0.0, np.eye(3), zero, zero, zero, zero, np.diag(variances))
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, np.diag(variances)))
     ekf.clone()
     for value, share in (([2e-3, -1e-3, 4e-3], 0.1), ([1e-3, 2e-3, -3e-3], 0.4)):
         blocks = [(9, np.eye(3)), (12, share * np.eye(3))]

@@ -46,7 +46,8 @@ def state() -> EkfState:
     ekf = StateCloningEkf(2)
     zero = np.zeros(3)
     R_WB = exp_so3(np.array([0.3, -0.5, 1.2]))
-    ekf.initialise(0.0, R_WB, zero, np.array([3.0, 1.0, 0.0]), zero, zero, 0.01 * np.eye(15))
+    p_W = np.array([3.0, 1.0, 0.0])
+    ekf.initialise(NavState(0.0, R_WB, zero, p_W, zero, zero, 0.01 * np.eye(15)))
     return first_field(ekf.state, R_WB.T @ FIELD_W)
 
 

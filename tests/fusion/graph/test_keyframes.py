@@ -22,7 +22,7 @@ from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.state import NavState
 from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.metrics import position_nees
+from stario.sequences.nees import position_nees
 from stario.sequences.noise import ImuNoise
 from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence

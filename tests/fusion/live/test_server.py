@@ -326,3 +326,41 @@ def test_lines_may_be_posted_and_are_taken_all_or_none(client, hub, walk):
     assert (broken.status_code, hub.sessions) == (400, {})
     assert client.post("/data", content="\n".join(lines), headers=ndjson).json() == {"samples": 150}
     assert hub.refused["http"] == 1
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator, walk, lag):
+    """Its samples may come a little after those of the gyroscope, as with real phones."""
+    turned = walk.truth.at(walk.time).attitude_WB
+    field = turned.apply([18.0, 5.0, -43.0], inverse=True)
+    entries = [
+        {"name": "magnetometer", "time": 10**18 + round(t * 1e9)}
+        | {"values": dict(zip("xyz", value, strict=True))}
+        for t, value in zip(walk.time.tolist(), field.tolist(), strict=True)
+    ]
+    for k, body in enumerate(pushes()):
+        message = json.loads(body)
+        message["payload"] += entries[max(0, 20 * k - lag) : 20 * (k + 1) - lag]
+        assert client.post("/data", json=message).status_code == 200
+    session = hub.sessions["phone"]
+    recording = read_recording(session.path)
+    np.testing.assert_array_equal(recording.gyro, walk.gyro)
+    np.testing.assert_array_equal(
+        recording.magnetometer.field, field[: len(recording.magnetometer)]
+    )
+    assert len(walk) - len(recording.magnetometer) <= lag + 1
+    bearings = session._navigator.health.bearings
+    assert bearings["applied"] > 10
+    track = rerun(session, new_navigator)
+    np.testing.assert_allclose(
+        session.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-2 if lag else 1e-5
+    )
+
+
+def test_a_line_that_is_wrong_is_told_by_its_number(client):
+    lines = [{"device": "rig", "t": t, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for t in (1, 2)]
+    lines[1]["gyro"] = [0, 0]
+    body = "\n".join(map(json.dumps, lines))
+    answer = client.post("/data", content=body, headers={"content-type": "application/x-ndjson"})
+    assert answer.status_code == 400
+    assert answer.json()["error"].startswith("line 2, gyro: found a list")

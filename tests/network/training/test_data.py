@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stario.network.training.data import (
-    KIND_SHARES,
+    SIMULATED,
     Recorded,
     gather,
     generated_streams,
@@ -41,9 +41,11 @@ def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
 
 def test_kinds_of_streams_make_up_their_shares() -> None:
     recorded = of([stream("a", 3000), stream("a", 1000)])
-    material = gather(recorded, [stream("b", 500)], [])
-    drawn = np.array([len(s) for s in material.streams]) * material.weights
-    np.testing.assert_allclose(drawn[2] / drawn[:2].sum(), KIND_SHARES[1] / KIND_SHARES[0])
+    captured, generated = [stream("b", 500)], [stream("c", 700)]
+    for simulated in ([captured, []], [[], generated], [captured, generated]):
+        material = gather(recorded, *simulated, {SIMULATED: 0.05})
+        drawn = np.array([len(s) for s in material.streams]) * material.weights
+        assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
     assert material.words[0].startswith("recorded")
 
 

@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 
 from stario.network.architectures import build_network
-from stario.network.card import card_path
+from stario.network.card import Calibration, card_path
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
@@ -87,6 +87,16 @@ def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
     assert list(reports[-1].validation_by_recording) == ["c", "d"]
 
 
+def test_an_epoch_tells_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that goes on by a second whenever it is read."""
+    clock = count()
+    monkeypatch.setattr("stario.network.training.train.perf_counter", lambda: float(next(clock)))
+    reports: list[EpochReport] = []
+    run(tmp_path, replace(TINY, epochs=1), on_epoch=reports.append)
+    assert reports[0].windows_per_second == TINY.batch / 2
+    assert reports[0].drawing_share == 0.5
+
+
 def test_the_model_predicts_what_it_was_validated_on(
     finished: tuple[Path, list[EpochReport]],
 ) -> None:
@@ -151,8 +161,8 @@ def test_an_epoch_without_a_finite_error_is_never_the_best(
     """The likelihood begins with epoch 3; with nothing of its own it keeps what was before."""
     whole, epoch = ValidationSet.errors, count(1)
 
-    def errors(self: ValidationSet, network: DisplacementNetwork) -> dict[str, float]:
-        found = whole(self, network)
+    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+        found = whole(self, *arguments)
         return found | {"c": math.nan} if next(epoch) in spoilt else found
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
@@ -419,13 +429,14 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
     assert found.get(change, "Missing") in refused(model)
 
 
-def test_a_last_stage_starts_from_weights_and_keeps_their_calibration(
+def test_a_last_stage_starts_from_weights_and_takes_a_calibration_over(
     model: Path, tmp_path: Path
 ) -> None:
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1)
-    last = load_model(run(tmp_path / "last", slow, start_from=first, keep_calibration=True))
-    assert last.card.calibration == first.card.calibration
+    other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
+    last = load_model(run(tmp_path / "last", slow, start_from=first, calibration=other))
+    assert last.card.calibration == other
     before = dict(first.training_form.named_parameters())
     for name, value in last.training_form.named_parameters():
         torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import Augmentation
-from stario.network.training.config import TrainingConfig
+from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.train import train
 from stario.network.training.weak_truth import (
     LegBatch,
@@ -19,7 +21,7 @@ from stario.network.training.weak_truth import (
     leg_loss,
     leg_residuals,
 )
-from stario.sequences.errors import InputError
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
@@ -179,3 +181,25 @@ def test_a_network_learns_its_scale_from_positions_alone(tmp_path: Path) -> None
     )  # fmt: skip
     assert reports[-1]["positions"] < 0.9 * reports[0]["positions"]
     assert (tmp_path / "checkpoint.safetensors").exists()
+
+
+def test_a_network_that_remembers_learns_from_stretches_in_rows(tmp_path: Path) -> None:
+    """Its memory runs through a stretch; one that is no whole number of rows is refused."""
+    [legs] = leg_streams(known("positions", 0.1))
+    streams = world_streams(WALK)
+    values = {"architecture": "RNIN", "epochs": 1, "batch": 20, "epoch_windows": 20}
+    config = training_config({**values, "track_stretches": 1, "likelihood_from": 0.0})
+    weights, shown = [1.0] * len(streams), []
+    run = partial(train, config, streams, weights, streams, legs=[legs], validation_legs=[legs])
+    with pytest.MonkeyPatch.context() as patch:
+        whole = DisplacementNetwork.forward
+        patch.setattr(
+            DisplacementNetwork,
+            "forward",
+            lambda self, windows: shown.append(tuple(windows.shape)) or whole(self, windows),
+        )
+        run(tmp_path / "rows")
+    assert shown[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
+    assert (48, 10, 6, 200) in shown
+    with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
+        train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])

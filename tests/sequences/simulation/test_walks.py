@@ -9,10 +9,10 @@ from stario.sequences.rotations import about_z
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.routes import band_noise, drift, random_route
-from stario.sequences.simulation.walks import CARRY_WAYS, WalkStyle, generate_walk, step_rate
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk, step_rate
 
 
-@pytest.mark.parametrize("carry", CARRY_WAYS)
+@pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_every_way_to_carry_is_plausible(carry: str) -> None:
     for seed in range(3):
         style = replace(WalkStyle.random(np.random.default_rng(seed)), carry=carry, next_carry="")
@@ -28,7 +28,7 @@ def test_every_way_to_carry_is_plausible(carry: str) -> None:
 
 def test_a_hundred_walks_are_plausible_and_cover_the_styles() -> None:
     styles = [WalkStyle.random(np.random.default_rng(seed)) for seed in range(100)]
-    assert {style.carry for style in styles} == set(CARRY_WAYS)
+    assert {style.carry for style in styles} == set(CARRYING_MODES)
     assert 10 < sum(bool(style.next_carry) for style in styles) < 60
     for seed in range(40):
         imu = simulate_imu(generate_walk(seed, 20.0), errors=PERFECT_IMU)
@@ -134,7 +134,7 @@ def test_a_rig_is_turned_fast() -> None:
 
 def test_walks_are_smooth_enough_for_the_spline() -> None:
     """The same walk drawn from every second pose gives nearly the same accelerations."""
-    for carry in CARRY_WAYS:
+    for carry in CARRYING_MODES:
         fine = generate_walk(9, 20.0, rate=200.0, style=WalkStyle(carry=carry))
         coarse = Trajectory(fine.time[::2], fine.position_W[::2], fine.attitude_WB[::2])
         a = simulate_imu(fine, errors=PERFECT_IMU)

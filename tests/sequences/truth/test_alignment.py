@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.rotations import cumulative_rotations
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.truth.alignment import align_tracked_body, cumulative_rotations
+from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
 from stario.sequences.truth.mount_heading import heading_turn
 

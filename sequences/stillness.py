@@ -1,7 +1,16 @@
-"""Stretches in which a device lies still, and what its sensors say there: noise and bias.
+"""Stillness: stretches in which a device lies still, and what its sensors say there.
+
+One test for all who ask, each with the factor that its question needs: the scatter of both sensors
+about their means against the white noise of a phone's IMU (`PHONE_NOISE`), by chi-square. The
+filter's own densities are no measure here: they stand for errors of scale and alignment, which only
+motion brings. (Whether a start's mean force shows the vertical is another question: a hand may
+tremble, but a trolley may not gain speed; `levelling`.)
 
 Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
 rate and whatever filter the sensor has above 10 Hz (IEEE Std 952, annex C).
+
+Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
+sensors); the scatter about the mean replaces their known gravity and bias.
 """
 
 from __future__ import annotations
@@ -10,18 +19,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
 
-_BIN_S = 0.05
-_BLOCK_BINS = 10
-_QUIET_GYRO, _QUIET_ACCEL = 0.02, 0.1
-"""Scatter over half a second of 0.05 s means, as a norm [rad/s, m/s^2], that is a sensor's own."""
+_LYING = 6.0
+"""Of a sensor that lies, which may be noisier than a phone's: what inspection measures noise by."""
 
 _SLOW = 0.06
 """Mean rate [rad/s] that may be bias: 3.4 degrees per second."""
 
+_PROBABILITY = 0.999
+"""That a sensor at rest looks still."""
+
+_BIN_S = 0.05
+_BLOCK_BINS = 10
 _SHORTEST_S = 1.0
+
+
+def scatter_bound(count: float, seconds: float, factor: float) -> float:
+    """Largest sum of squares about the mean of white noise of density 1, times factor^2.
+
+    Args:
+        count: samples, each in three axes.
+        seconds: that they fill.
+        factor: on the noise's density.
+    """
+    return factor**2 * count / seconds * chi2_quantile(_PROBABILITY, 3.0 * (count - 1.0))
+
+
+def looks_still(gyro: float, accel: float, bound: float) -> bool:
+    """Whether sums of squares [rad^2/s^2], [m^2/s^4] are within a `scatter_bound`."""
+    noise = PHONE_NOISE
+    return gyro <= bound * noise.gyro_noise**2 and accel <= bound * noise.accel_noise**2
+
+
+def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float) -> bool:
+    """Whether samples (n, 3) [rad/s], [m/s^2] over some seconds are those of no motion.
+
+    A steady turn does not scatter: the mean rate must be one that may be bias, too.
+    """
+    if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _SLOW:
+        return False
+    rates, forces = (float(np.square(x - x.mean(axis=0)).sum()) for x in (gyro, accel))
+    return looks_still(rates, forces, scatter_bound(len(gyro), seconds, factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +110,8 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
     rates, forces = (
         x[:used].reshape(blocks, _BLOCK_BINS, per_bin, 3).mean(2) for x in (gyro, accel)
     )
-    quiet = np.linalg.norm(rates.std(axis=1), axis=1) < _QUIET_GYRO
-    quiet &= np.linalg.norm(forces.std(axis=1), axis=1) < _QUIET_ACCEL
-    quiet &= np.linalg.norm(rates.mean(axis=1), axis=1) < _SLOW
+    pairs = zip(rates, forces, strict=True)
+    quiet = np.array([is_still(w, f, _BLOCK_BINS * _BIN_S, _LYING) for w, f in pairs])
     joined = unbroken & quiet
     spans = [(a, b) for a, b in runs(joined) if stop[b - 1] - start[a] >= _SHORTEST_S]
     if not spans:

@@ -1,4 +1,4 @@
-"""Gates: quantiles of the chi-square distribution."""
+"""Quantiles of the chi-square distribution: gates and bounds, without the cost of `scipy.stats`."""
 
 from __future__ import annotations
 

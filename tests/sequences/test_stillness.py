@@ -7,7 +7,7 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.still import find_rest
+from stario.sequences.stillness import find_rest
 
 NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
 BIAS = np.array([0.01, -0.02, 0.005])

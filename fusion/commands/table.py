@@ -1,0 +1,135 @@
+"""`stario check table`: the paper's table, every network trained and tested on every data set."""
+
+from __future__ import annotations
+
+import importlib.resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stario.fusion.commands.common import leave_with_skipped
+from stario.fusion.commands.options import Reading as ReadingOptions
+from stario.fusion.commands.options import recipe_values
+from stario.sequences.errors import InputError
+
+if TYPE_CHECKING:
+    from stario.fusion.table.cells import Cell
+    from stario.fusion.table.sets import DataSet
+
+
+def table(
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder that keeps every finished cell; goes on there.")
+    ],
+    data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
+    sets: Annotated[
+        str | None,
+        typer.Option(help="Of --data: oxiod,ridi,all,tyrex,kipd,ilc; all of them without it."),
+    ] = None,
+    published: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="A data set as published, NAME=FOLDER, such as ronin=/data/RoNIN; often."
+        ),
+    ] = None,
+    networks: Annotated[
+        str | None, typer.Option(help="Names of `stario check models`, with commas; else all.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps of every training, over the recipe's.")
+    ] = None,
+    seeds: Annotated[
+        int,
+        typer.Option(min=1, help="Of StarIO with and without MSGCU, R-ResNet and DeepILS."),
+    ] = 3,
+    split_seed: Annotated[int, typer.Option(min=0, help="Of the split of recordings.")] = 0,
+    per_group: Annotated[
+        int, typer.Option(min=1, help="Of the set all: most recordings of a group that test.")
+    ] = 2,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="JSON file with the recipe; else the package's."),
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that keeps windows for the next cell; else STARIO_CACHE or ~/.cache."
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", help="Cells at once; -1 for as many as there is room for."),
+    ] = None,
+    backend: Annotated[
+        str, typer.Option(help="Where cells are filled: loky (this machine), dask or ray.")
+    ] = "loky",
+) -> None:
+    """Train and test every network on every data set; a killed run goes on, what is new fills in.
+
+    The paper's protocol: 8:1:1 by recordings, true attitude, one recipe, as many steps for all.
+    """
+    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.table.files import known_costs, write_results
+    from stario.fusion.table.filling import backend as on_backend
+    from stario.fusion.table.filling import fill, table_cells
+    from stario.fusion.table.sets import learned_from
+    from stario.fusion.table.training import Reading
+    from stario.sequences.batch import Skipped
+    from stario.sequences.stream_cache import cache_folder
+
+    known = _data_sets(data, sets, published or [], split_seed, per_group)
+    chosen = None if networks is None else [name.strip() for name in networks.split(",")]
+    cells = table_cells(known, _recipe(config), steps, chosen, seeds)
+    make_folder(out)
+    costs = known_costs(_trained(cells), out)
+    learned = {} if data is None else learned_from(data)
+    options = ReadingOptions()
+    reading = Reading(options.read, options.as_read(), cache or cache_folder())
+    skipped = []
+    with on_backend(backend):
+        if jobs is None and backend != "loky":
+            jobs = -1
+        for done, outcome in enumerate(fill(cells, out, reading, jobs), 1):
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+            words = "not filled" if isinstance(outcome, Skipped) else "done"
+            named = outcome.item if isinstance(outcome, Skipped) else outcome
+            typer.echo(f"{done} of {len(cells)}: {named}: {words}", err=True)
+            write_results(cells, out, costs, learned, drawn=False)
+    typer.echo(write_results(cells, out, costs, learned), nl=False)
+    leave_with_skipped(skipped)
+
+
+def _data_sets(
+    data: Path | None, sets: str | None, published: list[str], seed: int, per_group: int
+) -> list[DataSet]:
+    from stario.fusion.table.sets import development_sets, folder_set
+
+    if data is None and not published:
+        raise InputError("data", "none", "recordings", "name --data, or --set NAME=FOLDER")
+    known: list[DataSet] = []
+    if data is not None:
+        names = None if sets is None else [name.strip() for name in sets.split(",")]
+        known += development_sets(data, seed, per_group, names)
+    for word in published:
+        name, equals, folder = word.partition("=")
+        if not (name and equals and folder):
+            raise InputError("--set", repr(word), "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        if name in {one.name for one in known}:
+            raise InputError("--set", repr(name), "a name of its own", f"leave {name} out: --sets")
+        known.append(folder_set(name, Path(folder), seed))
+    return known
+
+
+def _recipe(path: Path | None) -> dict[str, Any]:
+    packaged = importlib.resources.files("stario.network.weights").joinpath("recipe-table.json")
+    return recipe_values(Path(str(packaged)) if path is None else path)
+
+
+def _trained(cells: list[Cell]) -> list[str]:
+    """Networks of the cells, in the order of the paper's table."""
+    from stario.network.architectures import ARCHITECTURES
+
+    asked = {cell.network for cell in cells}
+    return [name for name in ARCHITECTURES if name in asked]

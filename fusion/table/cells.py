@@ -1,0 +1,169 @@
+"""One cell of the table, a network on a data set with a seed: filled once, kept as files.
+
+`<out>/<set>/<network>/<n>-steps/seed-<n>/` holds `trained.json` with the model, once the training
+is done, then `errors.json` and `tracks.npz`. A cell that is asked for again does what is missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.fusion.table.errors import Model, Shown, test_errors
+from stario.fusion.table.sets import ALL, DataSet
+from stario.fusion.table.training import SPARE, Reading, recipe_digest, train_cell
+from stario.network.architectures import ARCHITECTURES
+from stario.network.model import load_model
+from stario.network.training.config import TrainingConfig
+from stario.sequences.errors import ConfigError, ReadError
+from stario.sequences.files import write_json, write_npz
+
+LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
+"""Networks that come first, and with several seeds."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What fills it, as plain values that travel to any machine.
+
+    Attributes:
+        dataset: with the recordings of each part.
+        network: an architecture, which is trained; else `pdr` or weights as `load_model` takes.
+        seed: of the training.
+        recipe: of the training; None where nothing is trained.
+    """
+
+    dataset: DataSet
+    network: str
+    seed: int
+    recipe: TrainingConfig | None
+
+    def __str__(self) -> str:
+        return f"{self.dataset.name}, {self.network}, seed {self.seed}"
+
+    def folder(self, out: Path) -> Path:
+        """Its folder below that of all results; runs of more or fewer steps have others."""
+        above = out / self.dataset.name / self.network.replace("/", "_")
+        if self.recipe is None:
+            return above
+        return above / f"{self.recipe.steps}-steps" / f"seed-{self.seed}"
+
+    @property
+    def digest(self) -> str:
+        """Of what its figures depend on besides the code."""
+        test = [str(one.path) for one in self.dataset.test]
+        trained = "" if self.recipe is None else recipe_digest(self.recipe, self.dataset)
+        return hashlib.sha256(json.dumps([self.network, trained, test]).encode()).hexdigest()
+
+
+def reference_rows(dataset: DataSet) -> tuple[str, ...]:
+    """What stands beside the networks that are trained on a set.
+
+    The default weights have learned from the groups that `ALL` leaves out; those before them,
+    of the same form, have not.
+    """
+    return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
+
+
+def fill_cell(cell: Cell, out: Path, reading: Reading) -> Cell:
+    """Train and evaluate what of a cell is not done yet.
+
+    Raises:
+        ConfigError: what is there was made with another recipe or other recordings.
+        InputError: nothing can be learned or tested.
+    """
+    folder = cell.folder(out)
+    if not _is_done(cell, folder / "errors.json"):
+        folder.mkdir(parents=True, exist_ok=True)
+        if cell.recipe is not None and not _is_done(cell, folder / "trained.json"):
+            _train(cell, cell.recipe, folder, reading)
+        _evaluate(cell, folder, reading)
+    return cell
+
+
+def read_cell(cell: Cell, out: Path) -> dict[str, object] | None:
+    """The content of a cell's `errors.json` and `trained.json`; None where it is not filled.
+
+    Raises:
+        ConfigError: it was filled with another recipe or other recordings.
+    """
+    folder = cell.folder(out)
+    if not _is_done(cell, folder / "errors.json"):
+        return None
+    content: dict[str, object] = _read(folder / "errors.json")
+    return content | ({} if cell.recipe is None else {"trained": _read(folder / "trained.json")})
+
+
+def read_tracks(cell: Cell, out: Path) -> dict[str, Shown]:
+    """Tracks of some recordings, by their names."""
+    path = cell.folder(out) / "tracks.npz"
+    if not path.exists():
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        names = list(dict.fromkeys(key.rsplit("|", 1)[0] for key in arrays.files))
+        return {name: Shown(*(arrays[f"{name}|{part}"] for part in _PARTS)) for name in names}
+
+
+_PARTS = ("time", "position_W", "truth_W")
+
+
+def _train(cell: Cell, recipe: TrainingConfig, folder: Path, reading: Reading) -> None:
+    content = train_cell(cell.dataset, recipe, folder, reading)
+    write_json(folder / "trained.json", {"cell": cell.digest, **content})
+    for spare in SPARE:
+        (folder / spare).unlink(missing_ok=True)
+
+
+def _evaluate(cell: Cell, folder: Path, reading: Reading) -> None:
+    began = process_time()
+    model = _model(cell, folder)
+    found, shown, skipped = test_errors(model, cell.dataset.test, reading)
+    arrays = {f"{name}|{part}": getattr(t, part) for name, t in shown.items() for part in _PARTS}
+    if arrays:
+        write_npz(folder / "tracks.npz", **arrays)
+    content = {
+        "cell": cell.digest,
+        "network": cell.network,
+        "seed": cell.seed,
+        "seconds": process_time() - began,
+        "recordings": found,
+        "skipped": [asdict(one) for one in skipped],
+    }
+    write_json(folder / "errors.json", content)
+
+
+def _model(cell: Cell, folder: Path) -> Model:
+    if cell.network == PDR:
+        return PedestrianDeadReckoning()
+    if cell.network in ARCHITECTURES:
+        return load_model(folder / "model.safetensors")
+    return load_model(cell.network)
+
+
+def _is_done(cell: Cell, path: Path) -> bool:
+    if not path.exists():
+        return False
+    if _read(path).get("cell") != cell.digest:
+        raise ConfigError(
+            str(path),
+            "made with another recipe or other recordings",
+            "those of this table",
+            "give the settings it was made with, or another folder: --out",
+        )
+    return True
+
+
+def _read(path: Path) -> dict[str, object]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ReadError(path, "file", str(error), "a whole JSON file") from error
+    assert isinstance(content, dict)  # nobody else writes it
+    return content

@@ -1,0 +1,141 @@
+"""Errors of a network on the recordings that test it, whatever kind of truth they have.
+
+With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
+own attitude, by `stario.fusion.evaluation.displacement_error`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, recording_errors
+from stario.fusion.evaluation.network_alone import answers
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
+from stario.fusion.evaluation.prepared import Prepared, prepared_recordings
+from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
+from stario.fusion.navigator import Navigator
+from stario.fusion.table.training import Reading
+from stario.network.model import DisplacementModel
+from stario.sequences.batch import Skipped
+from stario.sequences.errors import StarioError
+from stario.sequences.metrics import Convention, align, evaluate_track, pose_errors
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.splits import Listed
+
+TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
+"""Tracks of a recording with poses, as everywhere."""
+
+CONVENTION: Convention = "ronin"
+"""Of averaging errors: the paper's."""
+
+_SHOWN = 4
+"""Recordings of a cell whose tracks are kept for figures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A track with true attitude for a figure: time (N,) [s], horizontal positions (N, 2) [m]."""
+
+    time: FloatArray
+    position_W: FloatArray
+    truth_W: FloatArray
+
+
+Model = DisplacementModel | PedestrianDeadReckoning
+
+
+def test_errors(
+    model: Model, test: Sequence[Listed], reading: Reading
+) -> tuple[list[dict[str, object]], dict[str, Shown], list[Skipped]]:
+    """Errors on every recording, tracks of the first ones, and what could not be used.
+
+    Returns:
+        of each recording plain values: `recording`, `path`, `group`, `kind` of truth, `path_m`;
+        `tracks` with ATE, RTE and PDE by track; `figures` as of `displacement_error.FIGURES`;
+        `blocks` [sum of squares, count] of 30 s, of the position error under the paper's protocol
+        ("ate") and of displacements over 10 s ("10").
+    """
+    found: list[dict[str, object]] = []
+    shown: dict[str, Shown] = {}
+    skipped: list[Skipped] = []
+    paths = [one.path for one in test]
+    outcomes = prepared_recordings(paths, reading.read, reading.options, reading.cache, 1)
+    for one, outcome in zip(test, outcomes, strict=True):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+            continue
+        try:
+            row, track = _recording(model, outcome, reading)
+        except StarioError as error:
+            skipped.append(Skipped(str(one.path), str(error)))
+            continue
+        found.append({"path": str(one.path), "group": one.group, **row})
+        if track is not None and len(shown) < _SHOWN:
+            shown[outcome.name] = track
+    return found, shown, skipped
+
+
+def _recording(
+    model: Model, prepared: Prepared, reading: Reading
+) -> tuple[dict[str, object], Shown | None]:
+    alone = recording_errors(prepared, answers(model, prepared))
+    blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
+    row: dict[str, object] = {
+        "recording": prepared.name,
+        "kind": prepared.kind,
+        "path_m": alone.path_m,
+        "figures": alone.figures,
+        "blocks": blocks,
+        "tracks": {},
+    }
+    if prepared.kind != "poses":
+        return row, None
+    sequence = reading.read(prepared.path)
+    assert sequence.truth is not None  # its kind says so
+    tracks = _tracks(model, sequence)
+    row["tracks"] = {name: _errors(track, sequence.truth) for name, track in tracks.items()}
+    known = tracks.get(TRUE_ATTITUDE)
+    if known is None:
+        return row, None
+    blocks["ate"] = _blocks(known, sequence.truth)
+    return row, _shown(known, sequence.truth)
+
+
+def _tracks(model: Model, sequence: ImuSequence) -> dict[str, Trajectory]:
+    if isinstance(model, PedestrianDeadReckoning):
+        return {OWN_ATTITUDE: pedestrian_track(sequence).trajectory}
+    settings = NavigatorConfig()
+    navigator = Navigator(model, settings)
+    preprocessed = navigator.observe(sequence)
+    true = network_track_true_attitude(model, sequence, settings)
+    return {
+        TRUE_ATTITUDE: true.trajectory,
+        OWN_ATTITUDE: network_track(preprocessed).trajectory,
+        EKF: navigator.track(preprocessed).trajectory,
+    }
+
+
+def _errors(track: Trajectory, truth: Trajectory) -> dict[str, float]:
+    found = evaluate_track(track, truth, convention=CONVENTION)
+    return {"ate_m": found.ate_m, "rte_m": found.rte_m, "pde": found.pde}
+
+
+def _blocks(track: Trajectory, truth: Trajectory) -> list[list[float]]:
+    """Sums of squared horizontal position errors, first pose aligned, and their counts."""
+    errors = pose_errors(align(track, truth, "first"), truth)
+    squares = (errors.position_W[:, :2] ** 2).sum(axis=1)
+    time = errors.estimate.time
+    block = np.floor((time - time[0]) / BLOCK_SECONDS).astype(int)
+    rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
+    kept: list[list[float]] = rows[rows[:, 1] > 0].tolist()
+    return kept
+
+
+def _shown(track: Trajectory, truth: Trajectory) -> Shown:
+    errors = pose_errors(align(track, truth, "first"), truth)
+    positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
+    return Shown(errors.estimate.time, *positions)

@@ -1,0 +1,140 @@
+"""What a filling leaves in its folder besides the cells: tables and figures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.evaluation.figures import write_table
+from stario.fusion.evaluation.tables import METRICS, Entry, NetworkTable, Sample
+from stario.fusion.table.cells import Cell, read_tracks
+from stario.fusion.table.errors import CONVENTION, TRUE_ATTITUDE
+from stario.fusion.table.summary import (
+    COLUMNS,
+    Filled,
+    SetTable,
+    filled_cells,
+    seconds_by_network,
+    set_table,
+)
+from stario.fusion.table.text import table_dict, table_text
+from stario.network.architectures import ARCHITECTURES
+from stario.network.runtime.cost import table_cost
+from stario.network.runtime.survey import ModelRow, survey
+from stario.sequences.files import atomic_write, write_json
+from stario.sequences.sequence import FloatArray, Trajectory
+
+
+def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
+    """Parameters, FLOPs, memory and time, measured once for a folder; a new network fills in."""
+    path = out / "costs.json"
+    known = {}
+    if path.exists():
+        rows = [ModelRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+        known = {row.name: row for row in rows}
+    missing = [name for name in names if name not in known]
+    if missing:
+        known |= {row.name: row for row in survey(missing)}
+        write_json(path, [row.as_dict() for row in known.values()])
+    return [known[name] for name in names]
+
+
+def write_results(
+    cells: Sequence[Cell],
+    out: Path,
+    costs: Sequence[ModelRow],
+    learned: Mapping[str, frozenset[Path]],
+    drawn: bool = True,
+) -> str:
+    """Write `table.md`, `table.json`, `table.csv` and the figures of each set; returns the text.
+
+    Args:
+        cells: that the table has, filled or not.
+        out: folder of all results.
+        costs: of the networks.
+        learned: recordings that weights of the package have learned from, by their name.
+        drawn: figures as well.
+    """
+    filled = filled_cells(cells, out)
+    datasets = {cell.dataset.name: cell.dataset for cell in cells}
+    tables = [set_table(datasets[name], found, learned) for name, found in filled.items()]
+    recipe = next(cell.recipe for cell in cells if cell.recipe is not None)
+    work = seconds_by_network(filled.values())
+    text = table_text(tables, costs, work, recipe)
+    with atomic_write(out / "table.md") as file:
+        file.write(text)
+    write_json(out / "table.json", table_dict(tables, costs, work, recipe))
+    with atomic_write(out / "table.csv") as file:
+        file.write(_csv(tables))
+    for name, found in filled.items() if drawn else ():
+        samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
+        table = _network_table(found, samples)
+        if table.entries:
+            folder = out / name / "figures"
+            folder.mkdir(parents=True, exist_ok=True)
+            write_table(folder, table)
+    return text
+
+
+def _csv(tables: Sequence[SetTable]) -> str:
+    """A line for each network on each set: means over seeds."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["set", "network", "seeds", *COLUMNS, "rank"])
+    for table in tables:
+        for row in table.rows:
+            values = [row.figures[key].value if key in row.figures else "" for key in COLUMNS]
+            place = "" if row.rank is None else row.rank.rank
+            writer.writerow([table.dataset.name, row.network, len(row.seeds), *values, place])
+    return text.getvalue()
+
+
+def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
+    """The networks' errors on recordings with poses, for the figures."""
+    names = [name for name in ARCHITECTURES if name in filled]
+    table = NetworkTable(
+        CONVENTION, {name: table_cost(name).parameters for name in names}, samples=samples
+    )
+    for name in names:
+        for seed, content in filled[name].items():
+            for one in content["recordings"]:
+                for protocol, errors in one["tracks"].items():
+                    values = (_number(errors[metric]) for metric in METRICS)
+                    table.entries.append(
+                        Entry(one["recording"], name, f"seed {seed}", protocol, *values)
+                    )
+    return table
+
+
+def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
+    """Tracks of some recordings, each network's of its first seed."""
+    samples: dict[str, Sample] = {}
+    for cell in cells:
+        content = filled.get(cell.network, {}).get(cell.seed)
+        if cell.recipe is None or cell.seed != 0 or content is None:
+            continue
+        found = {one["recording"]: one["tracks"] for one in content["recordings"]}
+        for name, shown in read_tracks(cell, out).items():
+            track = _level(shown.time, shown.position_W)
+            truth = _level(shown.time, shown.truth_W)
+            errors = found[name][TRUE_ATTITUDE]
+            sample = samples.setdefault(name, Sample(name, truth, {}, {}))
+            sample.tracks[cell.network] = track
+            sample.errors[cell.network] = _number(errors["ate_m"]), _number(errors["rte_m"])
+    return list(samples.values())
+
+
+def _number(value: float | None) -> float:
+    """JSON has no nan."""
+    return float("nan") if value is None else value
+
+
+def _level(time: FloatArray, xy: FloatArray) -> Trajectory:
+    flat = np.column_stack([xy, np.zeros(len(xy))])
+    return Trajectory(time, flat, Rotation.identity(len(time)))

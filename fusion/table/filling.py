@@ -1,0 +1,115 @@
+"""Which cells the table has, in the order of what matters, and filling them in parallel."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+
+from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
+from stario.fusion.table.sets import FIRST, DataSet
+from stario.fusion.table.training import Reading, cell_recipe
+from stario.network.architectures import ARCHITECTURES, architecture
+from stario.sequences.batch import Skipped, each
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.readers.checked import optional_package
+
+
+def table_cells(
+    sets: Sequence[DataSet],
+    recipe: dict[str, object],
+    steps: int | None = None,
+    networks: Sequence[str] | None = None,
+    seeds: int = 3,
+) -> list[Cell]:
+    """The cells: the sets of `FIRST` with one seed, then the other seeds, then the other sets.
+
+    Args:
+        sets: of recordings.
+        recipe: settings of the training that all have in common.
+        steps: of every training; None for the recipe's.
+        networks: to train; all of the paper's table if None.
+        seeds: of the networks of `LEADING`; the others have one.
+
+    Raises:
+        InputError: a network is unknown.
+        ConfigError: the recipe does not fit.
+    """
+    names = list(networks or [*LEADING, *(n for n in ARCHITECTURES if n not in LEADING)])
+    for name in names:
+        architecture(name)
+
+    def filled(dataset: DataSet, members: Sequence[str], seed: int) -> list[Cell]:
+        return [Cell(dataset, n, seed, cell_recipe(recipe, n, seed, steps)) for n in members]
+
+    first = [one for one in sets if one.name in FIRST]
+    others = [one for one in sets if one.name not in FIRST]
+    leading = [name for name in names if name in LEADING]
+    cells = []
+    for part in (first, others):
+        for dataset in part:
+            cells += [Cell(dataset, name, 0, None) for name in reference_rows(dataset)]
+            cells += filled(dataset, names, 0)
+        for seed in range(1, seeds):
+            for dataset in part:
+                cells += filled(dataset, leading, seed)
+    return cells
+
+
+def fill(
+    cells: Sequence[Cell], out: Path, reading: Reading, jobs: int | None = 1
+) -> Iterator[Cell | Skipped]:
+    """Fill what is missing; each cell comes as soon as it is filled, or with why it is not.
+
+    Args:
+        cells: in the order in which they are begun.
+        out: folder of all results, which every process that takes part can write to.
+        reading: how recordings are read.
+        jobs: processes, as for `stario.sequences.batch.each`.
+    """
+    yield from each(partial(fill_cell, out=out, reading=reading), cells, jobs)
+
+
+def backend(name: str) -> AbstractContextManager[object]:
+    """Joblib's backend within a block: "loky", processes of this machine; "dask" or "ray".
+
+    Dask's scheduler is the one that its configuration names (`DASK_SCHEDULER_ADDRESS`), Ray's
+    cluster the one of `RAY_ADDRESS`; without them both start on this machine.
+
+    Raises:
+        ConfigError: another name.
+        InputError: its package is not installed.
+    """
+    known: dict[str, Callable[[], AbstractContextManager[object]]] = {
+        "loky": nullcontext,
+        "dask": _dask,
+        "ray": _ray,
+    }
+    if name not in known:
+        raise ConfigError("--backend", repr(name), f"one of {', '.join(known)}")
+    return known[name]()
+
+
+@contextmanager
+def _dask() -> Iterator[None]:
+    from joblib import parallel_config
+
+    distributed = optional_package("distributed", "cluster")
+    logging.getLogger("distributed").setLevel(logging.WARNING)
+    with distributed.Client(), parallel_config("dask"):
+        yield
+
+
+@contextmanager
+def _ray() -> Iterator[None]:
+    from joblib import parallel_config
+
+    try:
+        importlib.import_module("ray.util.joblib").register_ray()
+    except ImportError as error:
+        raise InputError("--backend", "ray, not installed", "ray", "pip install ray") from error
+    with parallel_config("ray"):
+        yield

@@ -1,0 +1,187 @@
+"""The data sets of the table, and which of their recordings train, validate and test."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stario.network.training.splits import listed
+from stario.sequences.errors import InputError
+from stario.sequences.readers import find_recordings
+from stario.sequences.splits import Listed, random_split
+
+_MEMBERS = {
+    "oxiod": ("oxiod",),
+    "ridi": ("ridi",),
+    "tyrex": ("tyrex",),
+    "kipd": ("kipd", "rfbr"),
+    "ilc": ("ilc",),
+}
+"""Sets among the development recordings, and the first words of their recordings' groups."""
+
+ALL = "all"
+"""All development recordings together, the groups of the package's list `holdout` left out."""
+
+FIRST = ("oxiod", "ridi", ALL)
+"""The sets that are filled first."""
+
+TITLES = {
+    "oxiod": "OxIOD",
+    "ridi": "RIDI",
+    "tyrex": "tyrex",
+    "kipd": "KIPD and rfbr",
+    "ilc": "Indoor Location",
+    ALL: "All together, left out by group",
+}
+
+_VALIDATION_SHARE = 0.05
+"""Of each set's recordings outside the groups that are left out."""
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """One set of the table.
+
+    Attributes:
+        name: short, a folder's name.
+        training: recordings that networks learn from.
+        validation: recordings that choose among a run's epochs and calibrate sigma.
+        test: recordings that the table tells of, with the group of each; a network's errors in
+            different groups count alike where there are several.
+        words: how they were split.
+    """
+
+    name: str
+    training: tuple[Path, ...]
+    validation: tuple[Path, ...]
+    test: tuple[Listed, ...]
+    words: str
+
+    @property
+    def title(self) -> str:
+        """What a person calls it."""
+        return TITLES.get(self.name, self.name)
+
+
+def development_sets(
+    data: Path, seed: int, per_group: int, chosen: Sequence[str] | None = None
+) -> list[DataSet]:
+    """The sets among the development recordings, those that matter most first.
+
+    Args:
+        data: folder of the development recordings.
+        seed: of the splits.
+        per_group: of `ALL`, most recordings of a group that test.
+        chosen: names; all if None.
+
+    Raises:
+        InputError: a name is unknown, or a recording of the package's lists is not there.
+    """
+    known = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
+    for name in chosen or ():
+        if name not in known:
+            raise InputError("--sets", repr(name), f"one of {', '.join(known)}")
+    recordings = listed("all", data) + listed("test", data)
+    return [
+        _together(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
+        for name in known
+        if chosen is None or name in chosen
+    ]
+
+
+def folder_set(name: str, folder: Path, seed: int) -> DataSet:
+    """A published data set as it lies in a folder, split 8:1:1.
+
+    Raises:
+        InputError: there are fewer than three recordings in it.
+        ReadError: it cannot be read.
+    """
+    return _split(name, [Listed(path, name) for path in find_recordings(folder)], seed)
+
+
+def _single(name: str, recordings: Iterable[Listed], seed: int) -> DataSet:
+    return _split(name, [one for one in recordings if _set_of(one) in _MEMBERS[name]], seed)
+
+
+def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
+    """The paper's split, by walks: two phones on one walk stay together."""
+    walks: dict[Path, list[Listed]] = {}
+    for one in recordings:
+        walks.setdefault(one.path.with_name(_walk(one.path.name)), []).append(one)
+    split = random_split(walks, seed)
+
+    def members(part: tuple[Path, ...]) -> list[Listed]:
+        return [one for walk in part for one in walks[walk]]
+
+    return DataSet(
+        name,
+        tuple(one.path for one in members(split.training)),
+        tuple(one.path for one in members(split.validation)),
+        tuple(Listed(one.path, _set_of(one)) for one in members(split.test)),
+        f"8:1:1 at random by recordings, seed {seed}",
+    )
+
+
+def _walk(name: str) -> str:
+    """KIPD's S9 and S20 recordings of one name are two phones on one walk."""
+    return re.sub(r"(?<=\w)S(9|20)$", "", name)
+
+
+def _together(data: Path, seed: int, per_group: int) -> DataSet:
+    """All sets, tested on people, devices and places that no network of the cell has met."""
+    held_out = listed("holdout", data)
+    held = {one.path for one in held_out}
+    outside = [one for one in listed("all", data) if one.path not in held]
+    rng = np.random.default_rng(seed)
+    validation = {
+        members[k].path
+        for members in _by(outside, _set_of).values()
+        for k in rng.permutation(len(members))[: max(1, round(_VALIDATION_SHARE * len(members)))]
+    }
+    test = [
+        Listed(one.path, name)
+        for name, members in _by(held_out, lambda one: one.group).items()
+        for one in _spread(members, per_group)
+    ]
+    return DataSet(
+        ALL,
+        tuple(one.path for one in outside if one.path not in validation),
+        tuple(one.path for one in outside if one.path in validation),
+        tuple(Listed(one.path, _set_of(one)) for one in test),
+        f"people, devices and places of the list `holdout` test, at most {per_group} recordings "
+        f"of each; of the others {_VALIDATION_SHARE:.0%} of each set at random, seed {seed}, "
+        "validate",
+    )
+
+
+def _set_of(one: Listed) -> str:
+    return one.group.split(" ")[0]
+
+
+def _by(recordings: Iterable[Listed], key: Callable[[Listed], str]) -> dict[str, list[Listed]]:
+    parts: dict[str, list[Listed]] = {}
+    for one in recordings:
+        parts.setdefault(key(one), []).append(one)
+    return parts
+
+
+def _spread(members: Sequence[Listed], most: int) -> list[Listed]:
+    """At most so many of them, evenly from the first to the last."""
+    count = min(most, len(members))
+    at = np.linspace(0, len(members) - 1, count).round().astype(int)
+    return [members[k] for k in at]
+
+
+def learned_from(data: Path) -> dict[str, frozenset[Path]]:
+    """Recordings that the weights in the package have learned from, by the weights' name.
+
+    Raises:
+        InputError: a recording of the package's lists is not there.
+    """
+    known = frozenset(one.path for one in listed("all", data))
+    held = frozenset(one.path for one in listed("holdout", data))
+    return {"default": known, "first-stage": known - held}

@@ -1,0 +1,174 @@
+"""The table for a person, as Markdown, and as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.table.published import published
+from stario.fusion.table.ranks import Rank
+from stario.fusion.table.summary import AGAINST, COLUMNS, Mean, Row, SetTable
+from stario.network.architectures import ARCHITECTURES
+from stario.network.runtime.survey import BATCHES, ModelRow
+from stario.network.training.config import TrainingConfig
+from stario.sequences.metrics import CONVENTIONS
+
+Work = Mapping[str, tuple[float, float, float]]
+"""As `stario.fusion.table.summary.seconds_by_network` gives it."""
+
+
+def table_text(
+    tables: Sequence[SetTable], costs: Sequence[ModelRow], work: Work, recipe: TrainingConfig
+) -> str:
+    """Every set's table, the costs, and what was done for them.
+
+    Args:
+        tables: of the sets.
+        costs: of the networks.
+        work: computing time.
+        recipe: of the training, but for network and seed.
+    """
+    parts = [_recipe_words(recipe)]
+    parts += [_set_text(table) for table in tables if table.rows]
+    parts.append(_cost_text(costs, work))
+    parts.append(_words())
+    return "\n\n".join(parts) + "\n"
+
+
+def table_dict(
+    tables: Sequence[SetTable], costs: Sequence[ModelRow], work: Work, recipe: TrainingConfig
+) -> dict[str, object]:
+    """The same as plain values."""
+    return {
+        "recipe": asdict(recipe),
+        "sets": {
+            table.dataset.name: {
+                "split": table.dataset.words,
+                "training": len(table.dataset.training),
+                "validation": len(table.dataset.validation),
+                "tested": table.tested,
+                "path_m": table.path_m,
+                "ranks_by": table.measure,
+                "rows": [asdict(row) for row in table.rows],
+                "skipped": table.skipped,
+            }
+            for table in tables
+        },
+        "costs": [row.as_dict() for row in costs],
+        "work": {name: dict(zip(_WORK, times, strict=True)) for name, times in work.items()},
+        "conventions": _words(),
+    }
+
+
+_WORK = ("training_s", "evaluation_s", "windows_per_s")
+
+
+def _recipe_words(recipe: TrainingConfig) -> str:
+    return (
+        f"Every network: steps of the training {recipe.steps}, windows in each {recipe.batch}, "
+        f"peak rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. Where a set "
+        f"has any, each step learns from stretches besides, of {recipe.waypoint_seconds} s between "
+        f"waypoints {recipe.waypoint_stretches} and of {recipe.track_seconds} s along positions "
+        f"{recipe.track_stretches}."
+    )
+
+
+def _set_text(table: SetTable) -> str:
+    dataset = table.dataset
+    lines = [
+        f"### {dataset.title}",
+        "",
+        f"{len(dataset.training)} recordings train, {len(dataset.validation)} validate, "
+        f"{table.tested} test ({table.path_m:.0f} m); {dataset.words}. Ranks and ratios by "
+        f"{table.measure}, geometric mean over recordings.",
+        "",
+    ]
+    keys = [key for key in COLUMNS if any(key in row.figures for row in table.rows)]
+    paper = any(published(dataset.name, row.network) for row in table.rows)
+    titles = ["network", "seeds", *(COLUMNS[key].title for key in keys)]
+    titles += ["rank", f"error / {AGAINST}'s", "training error", "validation error"]
+    titles += ["paper: ATE, RTE [m]"] if paper else []
+    lines += _markdown_head(titles)
+    for row in table.rows:
+        cells = [_title(row, table.tested), str(len(row.seeds))]
+        cells += [_cell(row.figures.get(key)) for key in keys]
+        cells += [*_rank(row.rank), _cell(row.training_error), _cell(row.validation_error)]
+        if paper:
+            known = published(dataset.name, row.network)
+            cells.append("" if known is None else f"{known[0]:.3f}, {known[1]:.3f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    if table.skipped:
+        lines += ["", f"Left out: {len(table.skipped)} recordings, named in `table.json`."]
+    return "\n".join(lines)
+
+
+def _title(row: Row, tested: int) -> str:
+    if row.network == PDR:
+        return "steps alone (`pdr`)"
+    if row.network in ARCHITECTURES:
+        return row.network
+    known = f", learned from {row.learned} of these {tested}" if row.learned else ""
+    return f"weights `{row.network}`{known}"
+
+
+def _rank(rank: Rank | None) -> tuple[str, str]:
+    if rank is None:
+        return "", ""
+    place = f"{rank.rank} [{rank.low}, {rank.high}]"
+    if rank.ratio is None:
+        return place, ""
+    return place, f"{rank.ratio.ratio:.2f} [{rank.ratio.low:.2f}, {rank.ratio.high:.2f}]"
+
+
+def _cell(mean: Mean | None) -> str:
+    if mean is None:
+        return ""
+    return f"{mean.value:.3f}" if mean.error is None else f"{mean.value:.3f} +- {mean.error:.3f}"
+
+
+def _cost_text(costs: Sequence[ModelRow], work: Work) -> str:
+    times = [f"ms per window, batch {batch}" for batch in BATCHES]
+    titles = ["network", "parameters [10^6] (paper)", "FLOPs [10^6] (paper)", "memory [MB]", *times]
+    lines = ["### Costs", "", *_markdown_head([*titles, "core hours", "training windows / s"])]
+    for row in costs:
+        published_row = ARCHITECTURES[row.name]
+        milliseconds = row.milliseconds["torch"] or {}
+        training, testing, speed = work.get(row.name, (0.0, 0.0, float("nan")))
+        cells = [
+            row.name,
+            f"{row.parameters / 1e6:.3f} ({published_row.parameters:.3f})",
+            f"{row.flops / 1e6:.3f} ({published_row.flops:.3f})",
+            f"{row.peak_memory_mb:.1f}",
+            *(f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES),
+            f"{(training + testing) / 3600.0:.2f}",
+            "" if speed != speed else f"{speed:.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    whole = [sum(times[k] for times in work.values()) / 3600.0 for k in (0, 1)]
+    lines += [
+        "",
+        f"In all {sum(whole):.2f} core hours: {whole[0]:.2f} of training, {whole[1]:.2f} of "
+        "evaluation. Time per window on this machine, one thread per core that PyTorch uses; "
+        "memory is that of weights and of an inference's results (`stario check models`).",
+    ]
+    return "\n".join(lines)
+
+
+def _markdown_head(titles: Sequence[str]) -> list[str]:
+    return [f"| {' | '.join(titles)} |", f"|{'---|' * len(titles)}"]
+
+
+def _words() -> str:
+    return (
+        "ATE, RTE and PDE: horizontal, means over recordings, yaw and position of the first pose; "
+        f"{CONVENTIONS['ate_m']}; {CONVENTIONS['rte_m']}; {CONVENTIONS['pde']}. "
+        "Squares are averaged over coordinates too, as in RoNIN's code and the paper: times "
+        "sqrt(2) for the norm's. The first three columns are the paper's protocol, windows turned "
+        "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
+        "of the path, and the track's length over the truth's. Positions: error within 20 s, each "
+        "fitted, in % of the path. Training and validation error: mean squared displacement error "
+        "of windows in the last epoch [m^2] (of validation, legs count as m^2/s). +-: standard "
+        "error over seeds of the training; the split is one. Intervals (95 %): bootstrap over "
+        "recordings and blocks of 30 s, alike for all networks; seeds are averaged."
+    )

@@ -1,0 +1,65 @@
+"""Sensor Logger's JSON export: one array, an object for each sample with its sensor's name.
+
+    [{"sensor": "Gyroscope", "time": "1698501144401773000", "z": "0.1", "y": "0.2", "x": "0.3"}, ...
+
+It holds what the app's folder of CSV files does, so it is laid out as that and read as a folder.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import head_lines
+
+_FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
+_NAME = re.compile(r"\w+")
+
+
+def is_json_export(path: Path) -> bool:
+    """Whether a file begins as such an array; never raises."""
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    return _FIRST.match("\n".join(head_lines(path))) is not None
+
+
+@contextmanager
+def laid_out(path: Path) -> Iterator[Path]:
+    """A temporary folder with a file for each sensor, gone after the block.
+
+    Raises:
+        ReadError: the file is no JSON array of objects.
+    """
+    sensors: dict[str, list[dict[str, Any]]] = {}
+    for row in _rows(path):
+        name = row.get("sensor")
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ReadError(path, "sensor", repr(name)[:40], "a sensor's name in each object")
+        sensors.setdefault(name, []).append(row)
+    with tempfile.TemporaryDirectory(prefix="stario-") as folder:
+        for name, rows in sensors.items():
+            titles = [title for title in rows[0] if title != "sensor"]
+            file = Path(folder) / f"{name}.csv"
+            with file.open("w", newline="", encoding="utf-8") as text:
+                writer = csv.DictWriter(text, titles, extrasaction="ignore")
+                writer.writeheader()
+                writer.writerows(rows)
+        yield Path(folder)
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        found = " ".join(str(error).split())
+        raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ReadError(path, "file", "other JSON", "an array of objects, one for each sample")
+    return rows

@@ -1,0 +1,23 @@
+"""Tables of figures for a person, as lines of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+_APART = 3
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """A line for each row of cells: the first column to the left, the others to the right."""
+    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return [
+        f"{name:<{first}}"
+        + "".join(f"{cell:>{_APART + width}}" for cell, width in zip(cells, others, strict=True))
+        for name, *cells in rows
+    ]
+
+
+def figure(value: float | None, form: str = ".3f") -> str:
+    """A number in a table, "-" where there is none."""
+    return "-" if value is None or math.isnan(value) else format(value, form)

@@ -1,0 +1,41 @@
+"""The error at waypoints does not see a turn or a shift, and sees everything else."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.evaluation.known_positions import position_error, position_error_words
+from stario.sequences import PositionTrack, Trajectory
+
+TIME = np.linspace(0.0, 20.0, 201)
+PATH = np.column_stack([TIME, np.sin(0.3 * TIME), 0.0 * TIME])
+
+
+def track(path):
+    trajectory = Trajectory(TIME, path, Rotation.identity(len(TIME)))
+    return SimpleNamespace(time=TIME, trajectory=trajectory)
+
+
+def waypoints(path, every=40, later=0.0):
+    return PositionTrack(TIME[::every] + later, path[::every, :2], "waypoints")
+
+
+def test_a_turned_and_shifted_track_has_no_error():
+    turned = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH)
+    turned += np.array([7.0, -3.0, 1.0])
+    assert position_error(track(turned), waypoints(PATH)) == (pytest.approx(0.0, abs=1e-9), 6)
+
+
+def test_a_track_that_is_too_long_is_off_by_its_excess():
+    line = np.column_stack([TIME, 0.0 * TIME, 0.0 * TIME])
+    error, _ = position_error(track(1.1 * line), waypoints(line))
+    assert error == pytest.approx(0.1 * np.std(TIME[::40]))
+
+
+def test_waypoints_beyond_the_track_are_left_out():
+    words = position_error_words(track(PATH), waypoints(PATH, later=19.0))
+    assert words == "1 of 6 waypoints lie within the track: too few to compare with"
+    words = position_error_words(track(PATH), waypoints(PATH))
+    assert words.startswith("6 of 6 waypoints lie within the track: 0.00 m rms")

@@ -1,0 +1,200 @@
+"""Cells of the table: filled once, gone on with after a kill, filled in where something is new."""
+
+from __future__ import annotations
+
+import csv
+import json
+import pickle
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from stario.fusion.commands.cli import app
+from stario.fusion.table import cells as cells_module
+from stario.fusion.table import training
+from stario.fusion.table.cells import LEADING, Cell, fill_cell
+from stario.fusion.table.filling import backend, fill, table_cells
+from stario.fusion.table.sets import DataSet, folder_set
+from stario.fusion.table.summary import filled_cells, set_table
+from stario.fusion.table.training import Reading, cell_recipe
+from stario.network.architectures import ARCHITECTURES
+from stario.sequences.batch import Skipped
+from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.readers import read_recording
+from stario.sequences.readers.csv_writer import write_csv
+
+RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
+
+
+@pytest.fixture(scope="module")
+def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+    folder = tmp_path_factory.mktemp("walks")
+    for seed in range(4):
+        write_csv(folder / f"walk{seed}.csv", make_walk(seed=seed, seconds=8.0))
+    return folder_set("own", folder, seed=0)
+
+
+@pytest.fixture(scope="module")
+def reading(tmp_path_factory: pytest.TempPathFactory) -> Reading:
+    return Reading(read_recording, {}, tmp_path_factory.mktemp("cache"))
+
+
+def cell(dataset: DataSet, network: str = "DeepILS", seed: int = 0, steps: int = 4) -> Cell:
+    return Cell(dataset, network, seed, cell_recipe(RECIPE, network, seed, steps))
+
+
+def test_a_cell_leaves_model_errors_and_tracks(
+    dataset: DataSet, reading: Reading, tmp_path: Path
+) -> None:
+    done = cell(dataset, steps=2)
+    fill_cell(done, tmp_path, reading)
+    folder = tmp_path / "own/DeepILS/2-steps/seed-0"
+    names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
+    assert {path.name for path in folder.iterdir()} == {*names, "trained.json"}
+    trained = json.loads((folder / "trained.json").read_text())
+    assert (trained["steps"], trained["windows"]) == (2, 6)
+    assert 0.0 < trained["step_seconds"] < trained["seconds"]
+    assert trained["seconds"] > 0.0
+    [one] = json.loads((folder / "errors.json").read_text())["recordings"]
+    assert set(one["tracks"]) == {"network_true_attitude", "network", "ekf"}
+    total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
+    assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
+        (total / count / 2) ** 0.5
+    )
+
+
+def test_a_killed_cell_goes_on_and_ends_the_same(
+    dataset: DataSet, reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
+    whole, killed = cell(dataset), cell(dataset)
+    fill_cell(whole, tmp_path / "whole", reading)
+    with monkeypatch.context() as during:
+
+        def kill(clock: object) -> None:
+            raise KeyboardInterrupt
+
+        during.setattr(training._Clock, "keep", kill)
+        with pytest.raises(KeyboardInterrupt):
+            fill_cell(killed, tmp_path / "killed", reading)
+    folder = killed.folder(tmp_path / "killed")
+    assert (folder / "checkpoint.safetensors").exists()
+    assert not (folder / "trained.json").exists()
+    fill_cell(killed, tmp_path / "killed", reading)
+    model = whole.folder(tmp_path / "whole") / "model.safetensors"
+    assert (folder / "model.safetensors").read_bytes() == model.read_bytes()
+    assert len(json.loads((folder / "log.json").read_text())) == 2
+
+
+def test_what_is_filled_is_kept_and_a_new_network_or_seed_fills_in(
+    dataset: DataSet, reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[str] = []
+    whole = cells_module.train_cell
+
+    def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
+        trained.append(f"{recipe.architecture} {recipe.seed}")
+        return whole(dataset, recipe, *rest)
+
+    monkeypatch.setattr(cells_module, "train_cell", counted)
+    first = [cell(dataset, steps=1), Cell(dataset, "pdr", 0, None)]
+    assert list(fill(first, tmp_path, reading)) == first
+    errors = first[0].folder(tmp_path) / "errors.json"
+    written = errors.stat().st_mtime_ns
+    more = [*first, cell(dataset, "I-MobileNet", steps=1), cell(dataset, seed=1, steps=1)]
+    assert list(fill(more, tmp_path, reading)) == more
+    assert trained == ["DeepILS 0", "I-MobileNet 0", "DeepILS 1"]
+    assert errors.stat().st_mtime_ns == written
+    table = set_table(dataset, filled_cells(more, tmp_path)["own"], {})
+    assert [row.network for row in table.rows] == ["pdr", "I-MobileNet", "DeepILS"]
+    mean = table.rows[2].figures["ate"]
+    values = [
+        json.loads((one.folder(tmp_path) / "errors.json").read_text())["recordings"][0]
+        ["tracks"]["network_true_attitude"]["ate_m"]
+        for one in (more[0], more[3])
+    ]  # fmt: skip
+    assert mean.value == pytest.approx(sum(values) / 2)
+    assert mean.error == pytest.approx(abs(values[0] - values[1]) / 2)  # deviation / sqrt(2)
+    assert table.rows[1].figures["ate"].error is None
+    assert "ate" not in table.rows[0].figures
+    assert "own_ate" in table.rows[0].figures
+    assert sorted(row.rank.rank for row in table.rows if row.rank) == [1, 2]
+
+
+def test_cells_of_another_recipe_are_refused_and_other_steps_stand_beside(
+    dataset: DataSet, reading: Reading, tmp_path: Path
+) -> None:
+    done = cell(dataset, steps=1)
+    fill_cell(done, tmp_path, reading)
+    other = Cell(dataset, "DeepILS", 0, cell_recipe({**RECIPE, "rate": 1e-2}, "DeepILS", 0, 1))
+    with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
+        fill_cell(other, tmp_path, reading)
+    [outcome] = fill([other], tmp_path, reading)
+    assert isinstance(outcome, Skipped)
+    assert filled_cells([cell(dataset, steps=2)], tmp_path) == {}
+
+
+def test_the_order_is_what_matters_first_and_steps_are_equal(dataset: DataSet) -> None:
+    names = ("tyrex", "oxiod", "all")
+    sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
+    cells = table_cells(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
+    order = [(c.dataset.name, c.seed) for c in cells if c.recipe]
+    assert list(dict.fromkeys(order)) == [
+        ("oxiod", 0), ("all", 0), ("oxiod", 1), ("all", 1), ("tyrex", 0), ("tyrex", 1),
+    ]  # fmt: skip
+    assert order.count(("all", 0)) == len(ARCHITECTURES)
+    assert [c.network for c in cells if (c.dataset.name, c.seed) == ("all", 1)] == list(LEADING)
+    recipes = [c.recipe for c in cells if c.recipe]
+    assert {(r.steps, r.batch, r.patience >= r.epochs) for r in recipes} == {(600, 10, True)}
+    assert [c.network for c in cells[:2]] == ["pdr", "default"]
+    with pytest.raises(InputError, match="Nobody"):
+        table_cells(sets, RECIPE, networks=["Nobody"])
+
+
+def test_a_cell_travels_to_other_machines(dataset: DataSet, reading: Reading) -> None:
+    work = partial(fill_cell, out=Path("out"), reading=reading)
+    sent = pickle.loads(pickle.dumps((work, cell(dataset))))
+    assert sent[1] == cell(dataset)
+    assert sent[1].digest == cell(dataset).digest
+
+
+def test_an_unknown_backend_is_refused() -> None:
+    with pytest.raises(ConfigError, match="--backend"):
+        backend("mpi")
+
+
+def test_the_command_leaves_tables_and_figures(
+    dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = dataset.training[0].parent
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
+    out = tmp_path / "out"
+    arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]
+    arguments += ["--networks", "DeepILS,R-ResNet", "--config", str(tmp_path / "recipe.json")]
+    done = CliRunner().invoke(app, ["check", "table", *arguments])
+    assert done.exit_code == 0, done.output
+    text = (out / "table.md").read_text()
+    assert text in done.output
+    for words in (
+        "steps of the training 1, windows in each 6",
+        "| R-ResNet |",
+        "`pdr`",
+        "4.165, 3.724",
+        "core hours",
+    ):
+        assert words in text
+    with (out / "table.csv").open() as file:
+        assert [row["network"] for row in csv.DictReader(file)] == [
+            "pdr", "R-ResNet", "DeepILS", "default",
+        ]  # fmt: skip
+    content = json.loads((out / "table.json").read_text())["sets"]["ronin"]
+    assert (content["training"], content["validation"], content["tested"]) == (2, 1, 1)
+    figures = {path.name for path in (out / "ronin/figures").glob("*.png")}
+    assert figures == {"ate_parameters.png", "distributions.png", "pde.png", "trajectories.png"}
+    clash = ["check", "table", "--out", str(out), "--set", f"a={folder}", "--set", f"a={folder}"]
+    with pytest.raises(InputError, match="a name of its own"):
+        CliRunner().invoke(app, clash, catch_exceptions=False)

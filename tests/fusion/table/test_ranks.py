@@ -1,0 +1,52 @@
+"""Ranks and ratios of networks whose errors are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stario.fusion.table.published import published
+from stario.fusion.table.ranks import ranks
+
+
+def errors(scale: float, own: float = 0.0, seed: int = 0) -> list[tuple[str, str, np.ndarray]]:
+    """Twelve recordings of two sets, hard and easy ones, with noise of a network's own."""
+    common, rng = np.random.default_rng(9), np.random.default_rng(seed)
+    found = []
+    for k in range(12):
+        sums = common.lognormal(0.0, 1.5, 6) * scale**2 * np.exp(own * rng.standard_normal(6))
+        found.append((f"set {k % 2}", str(k), np.stack([sums, np.full(6, 1.0)], axis=1)))
+    return found
+
+
+def test_a_network_twice_as_wrong_is_surely_so_however_hard_recordings_differ() -> None:
+    found = ranks({"StarIO": [errors(1.0)], "worse": [errors(2.0)]}, "StarIO")
+    assert found["StarIO"].ratio is None
+    ratio = found["worse"].ratio
+    assert ratio is not None
+    assert (ratio.ratio, ratio.low, ratio.high) == pytest.approx((2.0, 2.0, 2.0))
+    assert [(found[n].rank, found[n].low, found[n].high) for n in found] == [(1, 1, 1), (2, 2, 2)]
+
+
+def test_what_differs_by_chance_alone_may_have_either_rank() -> None:
+    runs = {name: [errors(1.0, 0.7, seed)] for seed, name in enumerate(["StarIO", "a", "b"])}
+    found = ranks(runs, "StarIO")
+    assert all(rank.low < rank.high for rank in found.values())
+    assert all(r.ratio.low < 1.0 < r.ratio.high for r in found.values() if r.ratio is not None)
+    assert ranks(runs, "StarIO") == found
+
+
+def test_seeds_are_averaged_and_only_recordings_in_common_count() -> None:
+    half = errors(2.0)[:6]
+    found = ranks({"StarIO": [errors(1.0)], "two": [errors(1.0)[:6], half]}, "StarIO")
+    ratio = found["two"].ratio
+    assert ratio is not None
+    assert ratio.ratio == pytest.approx(np.sqrt(2.0))
+    assert ranks({"a": [errors(1.0)], "b": [[]]}, "a") == {}
+
+
+def test_the_papers_figures_are_found_by_network() -> None:
+    assert published("ridi", "StarIO") == (2.033, 2.274)
+    assert published("oxiod", "R-ResNet") == (4.336, 1.595)
+    assert published("ridi", "pdr") is None
+    assert published("tyrex", "StarIO") is None

@@ -1,0 +1,67 @@
+"""Which recordings train, validate and test."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from stario.fusion.table import sets
+from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
+from stario.sequences.errors import InputError
+from stario.sequences.splits import Listed
+
+DATA = Path(os.environ.get("STARIO_DATA", "../shared/data"))
+needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
+
+
+def test_a_set_is_split_once_and_the_same_by_a_seed() -> None:
+    recordings = [Listed(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
+    first, again, other = (sets._split("a", recordings, seed) for seed in (3, 3, 4))
+    assert first == again
+    assert first.test != other.test
+    parts = [set(first.training), set(first.validation), {one.path for one in first.test}]
+    assert [len(part) for part in parts] == [32, 4, 4]
+    assert set.union(*parts) == {one.path for one in recordings}
+    assert "seed 3" in first.words
+
+
+def test_two_phones_on_one_walk_stay_together() -> None:
+    recordings = [
+        Listed(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
+    ]
+    for seed in range(5):
+        split = sets._split("kipd", recordings, seed)
+        for part in (split.training, split.validation, [one.path for one in split.test]):
+            walks = [path.name.removesuffix("S9").removesuffix("S20") for path in part]
+            assert all(walks.count(walk) == 2 for walk in walks)
+
+
+@needs_data
+def test_sets_that_matter_come_first_and_no_part_meets_another() -> None:
+    found = development_sets(DATA, 0, 2)
+    assert tuple(one.name for one in found[:3]) == FIRST
+    assert {one.name for one in found} == {*FIRST, "tyrex", "kipd", "ilc"}
+    for one in found:
+        test = {listed.path for listed in one.test}
+        assert not test & set(one.training)
+        assert not test & set(one.validation)
+        assert not set(one.training) & set(one.validation)
+        assert all((one.training, one.validation, test))
+    with pytest.raises(InputError, match="'ronin'"):
+        development_sets(DATA, 0, 2, ["ronin"])
+
+
+@needs_data
+def test_all_together_tests_people_and_places_that_it_has_not_met() -> None:
+    [together] = development_sets(DATA, 0, 2, [ALL])
+    learned = [*together.training, *together.validation]
+    assert not any("Thibaud" in str(path) or ":dan_" in str(path) for path in learned)
+    assert not any("site2" in str(path) for path in learned)
+    tested = [one.group for one in together.test]
+    assert {"tyrex", "ridi", "kipd", "ilc", "rocip", "oxiod"} <= set(tested)
+    assert tested.count("tyrex") == 2  # at most so many of Thibaud's 41
+    known = learned_from(DATA)
+    assert not known["first-stage"] & {one.path for one in together.test}
+    assert known["default"] >= {one.path for one in together.test}

@@ -1,0 +1,396 @@
+"""The same apps with other settings, systems and exports: what is read must be the same walk."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+FIELD_W = np.array([18.0, 5.0, -43.0])
+ZYX = "time,seconds_elapsed,z,y,x"
+METADATA = (
+    "version,device name,recording epoch time,recording time,recording timezone,platform,"
+    "appVersion,device id,sensors,sampleRateMs,standardisation,platform version\n"
+    '3,"Ana\'s phone, blue",1727600000000,2024-09-29_08-53-20,Europe/Paris,ios,1.43,a-b,'
+    "Accelerometer|Gravity|Gyroscope,10|10|10,{standardised},17.4\n"
+)
+ANDROSENSOR = [
+    f"{name} {axis} ({unit})"
+    for name, unit in (("ACCELEROMETER", "m/s²"), ("GYROSCOPE", "rad/s"), ("MAGNETIC FIELD", "μT"))
+    for axis in "XYZ"
+]
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
+    return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)
+
+
+def quaternion(walk: ImuSequence) -> FloatArray:
+    assert walk.truth is not None
+    return walk.truth.quat_xyzw
+
+
+def in_body(walk: ImuSequence, vector_W: FloatArray | list[float]) -> FloatArray:
+    assert walk.truth is not None
+    return np.asarray(walk.truth.attitude_WB.apply(vector_W, inverse=True))
+
+
+def field(walk: ImuSequence) -> FloatArray:
+    return in_body(walk, FIELD_W)
+
+
+def gravity(walk: ImuSequence) -> FloatArray:
+    return in_body(walk, [0.0, 0.0, STANDARD_GRAVITY])
+
+
+def ns(walk: ImuSequence) -> list[int]:
+    return [1_718_030_736_872_695_300 + round(t * 1e9) for t in walk.time.tolist()]
+
+
+def save(path: Path, header: str, *columns: object, joint: str = ",") -> None:
+    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
+    rows = [joint.join(str(x) for part in row for x in part) for row in zip(*parts, strict=True)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
+
+
+def zyx(folder: Path, walk: ImuSequence, **sensors: FloatArray) -> None:
+    for name, values in sensors.items():
+        save(folder / f"{name}.csv", ZYX, ns(walk), walk.time, values[:, ::-1])
+
+
+def android(folder: Path, walk: ImuSequence) -> None:
+    zyx(folder, walk, TotalAcceleration=walk.accel, Gyroscope=walk.gyro, Magnetometer=field(walk))
+
+
+def with_byte_order_mark(folder: Path, walk: ImuSequence) -> None:
+    android(folder, walk)
+    for file in folder.iterdir():
+        file.write_text("\ufeff" + file.read_text(), encoding="utf-8")
+
+
+def every_cell_quoted(folder: Path, walk: ImuSequence) -> None:
+    """As a spreadsheet saves it on Windows."""
+    android(folder, walk)
+    for file in folder.iterdir():
+        lines = ['"' + line.replace(",", '","') + '"' for line in file.read_text().splitlines()]
+        file.write_bytes("\r\n".join([*lines, ""]).encode())
+
+
+def readable_times(folder: Path, walk: ImuSequence) -> None:
+    texts = [["2024-06-10 14:45:36.872"]] * len(walk)
+    for name, values in (("TotalAcceleration", walk.accel), ("Gyroscope", walk.gyro),
+                         ("Magnetometer", field(walk))):  # fmt: skip
+        header = "time,human_readable_time,seconds_elapsed,z,y,x"
+        save(folder / f"{name}.csv", header, ns(walk), texts, walk.time, values[:, ::-1])
+
+
+def extra_sensors(folder: Path, walk: ImuSequence) -> None:
+    """And a watch's motion, other sensors, and what a Mac leaves in folders."""
+    android(folder, walk)
+    few = ns(walk)[:9], walk.time[:9]
+    save(folder / "Barometer.csv", "time,seconds_elapsed,relativeAltitude,pressure", *few,
+         np.zeros((9, 2)))  # fmt: skip
+    save(folder / "Location.csv", "time,seconds_elapsed,speed,longitude,latitude", *few,
+         np.zeros((9, 3)))  # fmt: skip
+    save(folder / "Annotation.csv", "time,seconds_elapsed,text", *few, [["turn, left"]] * 9)
+    save(folder / "WatchMagnetometer.csv", ZYX, ns(walk), walk.time, field(walk) + 300.0)
+    watch(folder, walk)
+    (folder / "._Gyroscope.csv").write_bytes(b"\0\5\26\7" * 20)
+    (folder / ".DS_Store").write_bytes(b"\0\0")
+    (folder / "Microphone.csv").write_text("time,seconds_elapsed,dBFS\n")
+
+
+def watch(folder: Path, walk: ImuSequence) -> None:
+    """An Apple watch alone: everything in one file, in g and with Apple's sign."""
+    header = "time,seconds_elapsed," + ",".join(
+        f"{name}{axis}" for name in ("rotationRate", "gravity", "acceleration") for axis in "XYZ"
+    )
+    linear = (walk.accel - gravity(walk)) / STANDARD_GRAVITY
+    columns = walk.gyro, -gravity(walk) / STANDARD_GRAVITY, -linear, quaternion(walk)
+    header += ",quaternionX,quaternionY,quaternionZ,quaternionW"
+    save(folder / "WristMotion.csv", header, ns(walk), walk.time, *columns)
+
+
+def iphone(folder: Path, walk: ImuSequence) -> None:
+    linear = walk.accel - gravity(walk)
+    zyx(folder, walk, Accelerometer=-linear, Gravity=-gravity(walk), Gyroscope=walk.gyro)
+    (folder / "Metadata.csv").write_text(METADATA.format(standardised="false"))
+
+
+def iphone_standardised(folder: Path, walk: ImuSequence) -> None:
+    linear = walk.accel - gravity(walk)
+    zyx(folder, walk, Accelerometer=linear, Gravity=gravity(walk), Gyroscope=walk.gyro)
+    (folder / "Metadata.csv").write_text(METADATA.format(standardised="true"))
+
+
+def iphone_uncalibrated(folder: Path, walk: ImuSequence) -> None:
+    """Gravity was not logged, but the raw accelerometer in g."""
+    linear = walk.accel - gravity(walk)
+    raw = -walk.accel / STANDARD_GRAVITY
+    zyx(folder, walk, Accelerometer=-linear, AccelerometerUncalibrated=raw, Gyroscope=walk.gyro)
+    (folder / "Metadata.csv").write_text(METADATA.format(standardised="false"))
+
+
+def json_export(folder: Path, walk: ImuSequence) -> None:
+    linear = walk.accel - gravity(walk)
+    rows = [
+        {"sensor": name, "time": str(stamp), "z": str(z), "y": str(y), "x": str(x)}
+        for name, values in (("Accelerometer", linear), ("Gravity", gravity(walk)),
+                             ("Gyroscope", walk.gyro), ("Magnetometer", field(walk)))
+        for stamp, (x, y, z) in zip(ns(walk), values.tolist(), strict=True)
+    ]  # fmt: skip
+    metadata = {"sensor": "Metadata", "device name": "Pixel 8", "platform": "android"}
+    folder.mkdir()
+    (folder / "2024-06-10.json").write_text(json.dumps([metadata, *rows]))
+
+
+def zip_in_a_zip(folder: Path, walk: ImuSequence) -> None:
+    android(folder / "unpacked", walk)
+    with zipfile.ZipFile(folder / "inner.zip", "w") as file:
+        for one in (folder / "unpacked").iterdir():
+            file.write(one, f"2024-06-10/{one.name}")
+            file.writestr(f"__MACOSX/2024-06-10/._{one.name}", b"\0\5\26\7")
+            one.unlink()
+    (folder / "unpacked").rmdir()
+    with zipfile.ZipFile(folder / "outer.zip", "w") as file:
+        file.write(folder / "inner.zip", "inner.zip")
+    (folder / "inner.zip").unlink()
+
+
+def phyphox_with_and_without_g(folder: Path, walk: ImuSequence) -> None:
+    linear = walk.accel - gravity(walk)
+    for name, unit, values in (("Acceleration with g", "m/s^2", walk.accel),
+                               ("Acceleration without g", "m/s^2", linear),
+                               ("Gyroscope", "rad/s", walk.gyro)):  # fmt: skip
+        header = ",".join(['"Time (s)"', *(f'"{axis} ({unit})"' for axis in "XYZ")])
+        save(folder / f"{name}.csv", header, walk.time, values)
+
+
+def phyphox_one_table(folder: Path, walk: ImuSequence) -> None:
+    """Each sensor with a clock of its own; of the shorter one the last rows are blank."""
+    header = '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)"'
+    header += ',"Acceleration z (m/s^2)","Gyroscope time (s)","Gyroscope x (rad/s)"'
+    header += ',"Gyroscope y (rad/s)","Gyroscope z (rad/s)"'
+    n = len(walk)
+    accel = np.column_stack([walk.time, walk.accel]).tolist()
+    longer = np.append(walk.time, walk.time[-1] + 0.01 * np.arange(1, 6))
+    gyro = np.column_stack([longer, np.vstack([walk.gyro, np.ones((5, 3))])])
+    save(folder / "Raw Data.csv", header, [*accel, *[[""] * 4] * 5], gyro)
+    assert (folder / "Raw Data.csv").read_text().count(",,,,") == len(longer) - n
+
+
+def androsensor_other_units(folder: Path, walk: ImuSequence) -> None:
+    header = ",".join(ANDROSENSOR).replace("m/s²", "g").replace("rad/s", "°/s")
+    columns = walk.accel / STANDARD_GRAVITY, np.degrees(walk.gyro), field(walk)
+    millis = np.round(1e3 * walk.time).astype(int)
+    save(folder / "a.csv", header + ",Time since start in ms", *columns, millis)
+
+
+def androsensor_garbled(folder: Path, walk: ImuSequence) -> None:
+    """Its signs read in another encoding and saved again."""
+    header = ",".join(ANDROSENSOR).replace("²", "Â²").replace("μ", "Î¼")
+    millis = np.round(1e3 * walk.time).astype(int)
+    columns = walk.accel, walk.gyro, field(walk), millis
+    save(folder / "a.csv", header + ",Time since start in ms", *columns)
+
+
+def androsensor_lost_signs(folder: Path, walk: ImuSequence) -> None:
+    androsensor_garbled(folder, walk)
+    text = (folder / "a.csv").read_text()
+    (folder / "a.csv").write_text(text.replace("Â²", "\ufffd").replace("Î¼", "\ufffd"))
+
+
+def senslogs_first_version(folder: Path, walk: ImuSequence) -> None:
+    """A text above the rows, two clocks, and the bias in columns of its own."""
+    drift = np.tile([0.01, 0.02, -0.01], (len(walk), 1))
+    off = ["estimated-drift-x", "estimated-drift-y", "estimated-drift-z"]
+    for name, titles, values in (
+        ("accelerometer", [], walk.accel),
+        ("gyroscope", off, np.hstack([walk.gyro + drift, drift])),
+        ("magnetometer-calibrated", [], field(walk)),
+    ):
+        words = ["elapsed-time-system", "elapsed-time-sensor", "x", "y", "z", *titles]
+        above = f"{name}.txt\n\nAll values are in SI units.\nhttp://example.org\n\n"
+        save(folder / f"{name}.txt", above + " ".join(words), walk.time + 0.003, walk.time, values,
+             joint=" ")  # fmt: skip
+
+
+def two_clocks_and_no_header(folder: Path, walk: ImuSequence) -> None:
+    for name, values in (("accelerometer", walk.accel), ("gyroscope", walk.gyro),
+                         ("magnetometer", field(walk))):  # fmt: skip
+        save(folder / f"{name}.txt", "", walk.time + 0.003, walk.time, values, joint=" ")
+
+
+def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
+    """Without its attitude: what it writes beside says on which system it ran."""
+    t = 55_687.0 + walk.time
+    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, joint=" ")
+    save(folder / "gyroscope.txt", "", t, walk.gyro, joint=" ")
+    (folder / "description.txt").write_text("[Time]\nBootTime = 55687.0793")
+
+
+def ios_logger(folder: Path, walk: ImuSequence) -> None:
+    """In g, Apple's sign; `Motion.txt` is the attitude, w first, `MotMagnFull` calibrated."""
+    t = 1.6e9 + walk.time
+    save(folder / "Accel.txt", "", t, -walk.accel / STANDARD_GRAVITY)
+    save(folder / "Gyro.txt", "", t, walk.gyro)
+    save(folder / "Magnet.txt", "", t, field(walk) + 300.0)
+    save(folder / "MotMagnFull.txt", "", t, field(walk), np.full(len(walk), 2))
+    save(folder / "Motion.txt", "", t, quaternion(walk)[:, [3, 0, 1, 2]])
+    save(folder / "Frames.txt", "", t[::3], np.ones((len(t[::3]), 5)))
+
+
+def ios_logger_with_poses(folder: Path, walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    ios_logger(folder, walk)
+    (folder / "Motion.txt").unlink()
+    up = Rotation.from_euler("x", -90.0, degrees=True)
+    quat = (up * walk.truth.attitude_WB).as_quat()[:, [3, 0, 1, 2]]
+    position = up.apply(walk.truth.position_W)
+    save(folder / "ARposes.txt", "", 1.6e9 + walk.time[::3], position[::3], quat[::3])
+
+
+VARIANTS: dict[str, Callable[[Path, ImuSequence], None]] = {
+    write.__name__: write
+    for write in (
+        with_byte_order_mark, every_cell_quoted, readable_times, extra_sensors, watch, iphone,
+        iphone_standardised, iphone_uncalibrated, json_export, zip_in_a_zip,
+        phyphox_with_and_without_g, phyphox_one_table, androsensor_other_units,
+        androsensor_garbled, androsensor_lost_signs, senslogs_first_version,
+        two_clocks_and_no_header, senslogs_ios, ios_logger, ios_logger_with_poses,
+    )
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_is_the_same_walk(variant: str, walk: ImuSequence, tmp_path: Path) -> None:
+    VARIANTS[variant](tmp_path / "s", walk)
+    (found,) = find_recordings(tmp_path / "s")
+    read = read_recording(found)
+    assert len(read) == len(walk)
+    np.testing.assert_allclose(read.time, walk.time, atol=1e-3)
+    np.testing.assert_allclose(read.gyro, walk.gyro, atol=1e-9)
+    np.testing.assert_allclose(read.accel, walk.accel, atol=1e-8)
+    if read.magnetometer is not None:
+        np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
+
+
+def test_a_recording_says_in_a_line_what_it_is(walk: ImuSequence, tmp_path: Path) -> None:
+    android(tmp_path / "a", walk)
+    ios_logger(tmp_path / "b", walk)
+    tail = "15.0 s at 100.0 Hz, magnetometer at 100 Hz"
+    assert read_recording(tmp_path / "a").summary() == f"a: Sensor Logger, {tail}, truth: none"
+    assert read_recording(tmp_path / "b").summary() == (
+        f"b: iOS Logger, {tail}, the device's own attitude, truth: none"
+    )
+
+
+def test_sensors_of_different_rates_keep_the_gyroscopes(walk: ImuSequence, tmp_path: Path) -> None:
+    save(tmp_path / "s/Gyroscope.csv", ZYX, ns(walk), walk.time, walk.gyro[:, ::-1])
+    rows = slice(None, None, 2)
+    force = walk.accel[rows, ::-1]
+    save(tmp_path / "s/TotalAcceleration.csv", ZYX, ns(walk)[rows], walk.time[rows], force)
+    read = read_recording(tmp_path / "s")
+    assert read.rate == pytest.approx(100.0)
+    np.testing.assert_array_equal(read.accel[rows], walk.accel[rows])
+    halfway = 0.5 * (walk.accel[:-2:2] + walk.accel[2::2])
+    np.testing.assert_allclose(read.accel[1::2], halfway, atol=1e-6)
+
+
+def test_where_no_one_tells_the_sign_it_is_asked_for(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    iphone(tmp_path / "s", walk)
+    (tmp_path / "s/Metadata.csv").unlink()
+    read_recording(tmp_path / "s")
+    assert "if one wrote it, pass `--accel-sign apple`" in caplog.text
+    caplog.clear()
+    ios_logger(tmp_path / "t", walk)
+    for name in ("Motion.txt", "MotMagnFull.txt"):
+        (tmp_path / "t" / name).unlink()
+    read_recording(tmp_path / "t")
+    assert "`--accel-unit g`, and if an iPhone wrote it `--accel-sign apple`" in caplog.text
+
+
+@pytest.mark.parametrize("code", ["TYPE", "AHRS"])
+def test_a_tracess_rotation_vector_is_the_devices_attitude(
+    code: str, walk: ImuSequence, tmp_path: Path
+) -> None:
+    """It holds x, y and z of a quaternion whose w is not negative."""
+    assert walk.truth is not None
+    vector = quaternion(walk)[:, :3] * np.sign(quaternion(walk)[:, 3:])
+    lines = []
+    for k, t in enumerate(walk.time.tolist()):
+        rows = (("GYROSCOPE", "GYRO", walk.gyro[k]), ("ACCELEROMETER", "ACCE", walk.accel[k]))
+        if code == "TYPE":
+            stamp = str(1_560_828_400_000 + round(1e3 * t))
+            cells = [[stamp, f"TYPE_{name}", *map(str, xyz), "3"] for name, _, xyz in rows]
+            cells.append([stamp, "TYPE_ROTATION_VECTOR", *map(str, vector[k]), "3"])
+            lines += ["\t".join(row) for row in cells]
+        else:
+            clock = [f"{t + 5:.3f}", f"{t:.4f}"]
+            lines += [";".join([name, *clock, *map(str, xyz), "3"]) for _, name, xyz in rows]
+            lines.append(";".join(["AHRS", *clock, "1", "2", "3", *map(str, vector[k]), "3"]))
+    (tmp_path / "trace.txt").write_text("\n".join(lines) + "\n")
+    attitude = read_recording(tmp_path / "trace.txt").device_attitude
+    assert attitude is not None
+    away = attitude.attitude_WB * walk.truth.attitude_WB.inv()
+    assert away.magnitude().max() < 1e-6
+    cut = (tmp_path / "trace.txt").read_text().replace(";1;2;3;", ";1;2;").replace("\t3\n", "\n")
+    (tmp_path / "trace.txt").write_text(cut)
+    assert (read_recording(tmp_path / "trace.txt").device_attitude is None) == (code == "AHRS")
+
+
+@pytest.mark.parametrize(
+    ("start", "told"),
+    [
+        (b"SQLite format 3\0" + bytes(40), "an SQLite database"),
+        (b"PK\x03\x04xl/workbook.xml", "a zip without text files"),
+        (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
+    ],
+)
+def test_what_is_not_unpacked_is_named(start: bytes, told: str, tmp_path: Path) -> None:
+    (tmp_path / "export.data").write_bytes(start)
+    with pytest.raises(ReadError, match=rf"found [\w ,]*{told}.*; export as CSV"):
+        read_recording(tmp_path / "export.data")
+
+
+def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) -> None:
+    android(tmp_path / "s", walk)
+    with zipfile.ZipFile(tmp_path / "two.zip", "w") as file:
+        for one in (tmp_path / "s").iterdir():
+            file.write(one, f"a/{one.name}")
+            file.write(one, f"b/{one.name}")
+    expected = r"two\.zip: content: found 2 recordings, a, b, expected one; unpack it"
+    with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
+        read_recording(tmp_path / "two.zip")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('[{"sensor": "Gyroscope", "time"', r"x\.json: file: found .*, expected JSON"),
+        ('[{"sensor": "../up", "time": "1"}]', r"x\.json: sensor: found '\.\./up'"),
+        ('[{"sensor": "Gyroscope", "time": "1"}, 3]', r"found other JSON, expected an array"),
+        ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
+    ],
+)
+def test_a_malformed_json_export_is_one_line(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(ReadError, match=told) as error:
+        read_recording(tmp_path / "x.json")
+    assert "\n" not in str(error.value)
+    assert "stario-" not in str(error.value)
