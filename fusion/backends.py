@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Literal, Protocol
 
+import numpy as np
+
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
@@ -130,8 +132,16 @@ class GraphBackend:
         end, seen = states[-1], estimator.ekf.state.field is not None
         bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
         own = in_last_frame(states, transforms)
-        whole = smooth(own, states[0], filtered.measurements, transforms, config, bias)
+        first = _with_bias_prior(states[0], estimator.bias_prior.variance)
+        whole = smooth(own, first, filtered.measurements, transforms, config, bias)
         return Solution(own if whole.fell_back else whole.states, None, [whole.note])
+
+
+def _with_bias_prior(first: NavState, variance: float) -> NavState:
+    """The first state with the gyroscope bias's prior as it proved right later."""
+    covariance = first.covariance.copy()
+    covariance[9:12, 9:12] = variance * np.eye(3)
+    return replace(first, covariance=covariance)
 
 
 BACKENDS: dict[str, Backend] = {"ekf": EkfBackend(), "graph": GraphBackend()}

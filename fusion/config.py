@@ -42,15 +42,17 @@ class FilterConfig:
         tilt_sigma: of the first attitude when the device is moving [rad].
         yaw_sigma: of the first attitude's yaw [rad]; small, since the start defines the yaw.
         velocity_sigma: of the first velocity, taken as zero [m/s].
-        gyro_bias_sigma: of the first gyroscope bias [rad/s], of devices that correct it. What a
-            network says of it is weak and biased itself: from 4e-3 on its slow errors turn the
-            tracks of devices whose gyroscope is right. Where gravity shows raw rates, the filter
-            widens it by itself.
+        gyro_bias_sigma: of the first gyroscope bias [rad/s], of devices that correct it well. What
+            a network says of it is weak and biased itself: its slow errors turn the tracks of
+            devices whose gyroscope is right. Where gravity, rest or the magnetic field show more,
+            the filter widens it by itself.
         accel_bias_sigma: of the first accelerometer bias [m/s^2].
         gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
         gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
         stillness_noise: factor on the white noise of a phone's IMU within which a second of samples
             counts as rest (`rest`); 0 never does.
+        adaptive: whether the accelerometer's density and the gyroscope bias's prior are first
+            guesses that innovations and gravity correct; False where the device is known.
         magnetometer: whether a recording's or stream's magnetic field is used.
     """
 
@@ -60,11 +62,12 @@ class FilterConfig:
     tilt_sigma: float = 0.05
     yaw_sigma: float = 1e-3
     velocity_sigma: float = 1.0
-    gyro_bias_sigma: float = 2.5e-3
+    gyro_bias_sigma: float = 1e-3
     accel_bias_sigma: float = 0.1
     gap_gyro_noise: float = 0.3
     gap_accel_noise: float = 1.0
     stillness_noise: float = 2.0
+    adaptive: bool = True
     magnetometer: bool = True
 
     def __post_init__(self) -> None:

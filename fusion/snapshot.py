@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 7
+FORMAT, VERSION = "stario snapshot", 8
 
 
 @cache
@@ -43,9 +43,11 @@ def _classes() -> dict[str, type]:
     """Every class that a snapshot may hold: plain data, made anew from its attributes."""
     from stario.fusion import config, continuous, fixes
     from stario.fusion.filter import (
+        accelerometer,
         ekf_state,
         estimator_state,
         frame_transform,
+        gyro_bias,
         initial,
         innovations,
         magnetic,
@@ -66,6 +68,8 @@ def _classes() -> dict[str, type]:
             ekf_state.EkfState,
             ekf_state.FieldState,
             magnetic.MagneticReference,
+            gyro_bias.GyroBiasPrior,
+            accelerometer.AccelerometerWorth,
             ekf_state.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,

@@ -135,6 +135,8 @@ class Health:
         fixes: absolute fixes applied (of these gated), and left out by reason.
         zero_velocity: updates at rest (one per state there) applied, and left out by reason.
         bearings: of the magnetic field applied (of these gated), and left out by reason.
+        accel_noise_factor: of the accelerometer's noise to the configured density at the end, as
+            the innovations tell.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
             [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.
@@ -153,6 +155,7 @@ class Health:
     fixes: dict[str, int] = field(default_factory=dict)
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
+    accel_noise_factor: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -174,6 +177,8 @@ class Health:
             text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
         if self.bearings:
             text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
+        if self.accel_noise_factor > 1.0:
+            text.append(f"accelerometer noise {self.accel_noise_factor:.1f} times the configured")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}", *self.notes]
 

@@ -42,7 +42,7 @@ _LEAST_FORCE = 1.0
 _TILT_SIGMA = 0.05
 """Of the tilt at first and behind a gap [rad]."""
 
-_BIAS_SIGMA = 0.01
+BIAS_SIGMA = 0.01
 """Of the gyroscope's bias at first, per axis [rad/s]: right ones keep, raw ones find theirs."""
 
 _BIAS_WALK = 2e-5
@@ -140,7 +140,7 @@ class LevelledAttitude:
     def __init__(self, R_NB: FloatArray) -> None:
         self.R_NB = R_NB
         self.b_g = np.zeros(3)
-        tilt, bias = _TILT_SIGMA**2, _BIAS_SIGMA**2
+        tilt, bias = _TILT_SIGMA**2, BIAS_SIGMA**2
         # Of theta about N's axes, R = (I + [theta]x) R^, and of the bias, true minus estimate.
         self._P = np.diag([tilt, tilt, 0.0, bias, bias, bias])
 
@@ -155,6 +155,12 @@ class LevelledAttitude:
         attitudes = integrate(self.R_NB, time, gyro - self.b_g)
         self.R_NB = self._levelled(attitudes, time, accel)
         return attitudes
+
+    @property
+    def bias_sigma(self) -> float:
+        """Of the bias about the level axes, per axis [rad/s]; gravity never tells the third."""
+        level = self.R_NB[:2]
+        return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
 
     def restart(self) -> None:
         """After a gap the tilt is not known well: level quickly again."""

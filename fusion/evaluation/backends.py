@@ -71,6 +71,7 @@ def score_walk(seed: int, seconds: float) -> Score:
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
+        adaptive=False,
     )
     config = NavigatorConfig(noise=errors.noise, filter=known)
     walk = generate_walk(seed, seconds)

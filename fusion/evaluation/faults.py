@@ -71,6 +71,7 @@ def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, Na
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
+        adaptive=False,
     )
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
     return sequence, NavigatorConfig(noise=noise, filter=known)

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
-from stario.fusion.filter.ekf_state import EkfState, FieldState
+from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
     CLONE,
@@ -38,6 +38,9 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 _NO_GAIN = np.zeros(3)
+
+_SAME_PRIOR = 1e-6
+"""Relative difference of variances that is none."""
 
 
 class StateCloningEkf(ErrorStateEngine):
@@ -258,6 +261,28 @@ class StateCloningEkf(ErrorStateEngine):
         off = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
         blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
         return self.update_linear(np.array([off]), blocks, np.array([[variance]]), gate)
+
+    def exchange_gyro_bias_prior(self, old: float, new: float) -> None:
+        """Everything as if the gyroscope bias's prior, zero mean, had been another from the start.
+
+        The old prior's information is taken off and the new one's added: an update by a measurement
+        of zero, of negative variance where the prior widens; exact as far as the filter is linear.
+
+        Args:
+            old: variance per axis of the prior until now [rad^2/s^2].
+            new: of the one that takes its place.
+        """
+        while abs(new - old) > _SAME_PRIOR * old:
+            step = min(new, 2.0 * old)  # a larger one would be badly conditioned
+            P = self.state.P
+            rows = P[GYRO_BIAS]
+            S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
+            K = np.linalg.solve(S, rows).T
+            P = P - K @ rows
+            self.P = 0.5 * (P + P.T)
+            self.x = (K @ -self.state.b_g)[:, None]
+            self._inject()
+            old = step
 
     def _inject(self) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""

@@ -21,7 +21,7 @@ from stario.sequences.errors import InputError
 _CLONE_COLUMNS = [0, 1, 2, 4]
 """Columns R, p of a pose: a clone has no velocity."""
 
-_GYRO_BIAS = slice(9, 12)
+GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
 
 _FAR = 1e3
@@ -224,12 +224,6 @@ class EkfState:
         if self.field is not None and field_too:
             N[self.first_field, 0] = 1.0
         return replace(self, P=self.P + sigma**2 * (N @ N.T))
-
-    def with_gyro_bias_inflated(self, variance: float) -> EkfState:
-        """The gyroscope's bias less known, by a variance per axis [rad^2/s^2]."""
-        P = self.P.copy()
-        P[_GYRO_BIAS, _GYRO_BIAS] += variance * np.eye(3)
-        return replace(self, P=P)
 
     def with_position_inflated(self, sigma: float) -> EkfState:
         """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""

@@ -11,15 +11,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import GYRO_BIAS, Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
     IntervalMeasurements,
     Step,
 )
+from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
@@ -51,8 +53,8 @@ _RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
 may itself be wrong. Some five seconds of false displacements are bridged so."""
 
-_CORRECTED_BIAS = 0.01
-"""Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
+_BIAS_AT_REST = 2.5e-3
+"""Of the gyroscope's bias where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
 _ROUNDING = 1e-9
 """Of times [s]."""
@@ -91,7 +93,8 @@ class Estimator:
         )
         self._magnetic = MagneticReference()
         self._outlier_share = 0.5  # trust is to be earned
-        self._raw_bias = 0.0
+        self._bias_prior = GyroBiasPrior.first(max(f.gyro_bias_sigma, SMALLEST_SIGMA))
+        self._accelerometer = AccelerometerWorth()
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -99,6 +102,8 @@ class Estimator:
         self._history: tuple[Step, ...] = ()
         self.oldest: Estimate | None = None
         initialise(self.ekf, start, prior, config)
+        if f.adaptive:
+            self._exchange_gyro_bias_prior(self._bias_prior.before_gravity_tells())
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------
@@ -113,6 +118,7 @@ class Estimator:
             displacement: None where no window ends, or nothing is known of it.
             fixes: with times up to the interval's end that were not given before, in order.
         """
+        interval = replace(interval, accel_factor=self._accelerometer.factor)
         self._remember(interval, displacement, fixes)
         segment, accepted = self._propagate(interval, fixes)
         at_rest = self._update_zero_velocity(interval)
@@ -121,6 +127,7 @@ class Estimator:
         taken = None if offered is None else self._update_displacement(interval, *offered)
         self._update_bearing(interval)
         if interval.update or interval.gap:
+            self._follow_gyro_bias_prior(interval)
             self._clone()
         return IntervalMeasurements(interval, offered, taken, at_rest, accepted, segment)
 
@@ -185,23 +192,23 @@ class Estimator:
         s = self.ekf.state
         segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
         self.ekf.propagate(segment)
-        self._doubt_gyroscope(interval)
         if interval.gap:
             sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
             self.ekf.state = self.ekf.state.with_yaw_inflated(s.p_W, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
         return segment
 
-    def _doubt_gyroscope(self, interval: ImuInterval) -> None:
-        """A device whose rates gravity shows to be raw may be off as much about the vertical.
+    def _follow_gyro_bias_prior(self, interval: ImuInterval) -> None:
+        """The bias's prior as it should be, by what gravity and the data tell of it by now."""
+        s, P = self.ekf.state, self.ekf.P[GYRO_BIAS, GYRO_BIAS]
+        unknown = interval.levelled_bias_sigma if self._config.filter.adaptive else 0.0
+        wanted = self._bias_prior.wanted(interval.levelled_bias, unknown, s.b_g, P)
+        self._exchange_gyro_bias_prior(wanted)
 
-        Corrected devices keep within 0.01 rad/s; others are off by up to 0.1, about every axis.
-        """
-        raw = interval.levelled_bias - _CORRECTED_BIAS
-        if raw > self._raw_bias:
-            variance = raw**2 - self._raw_bias**2
-            self.ekf.state = self.ekf.state.with_gyro_bias_inflated(variance)
-            self._raw_bias = raw
+    def _exchange_gyro_bias_prior(self, wanted: GyroBiasPrior) -> None:
+        """Everything as if it had been the prior from the start."""
+        self.ekf.exchange_gyro_bias_prior(self._bias_prior.variance, wanted.variance)
+        self._bias_prior = wanted
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self._map_frame.update(self.ekf, fix)
@@ -212,10 +219,15 @@ class Estimator:
         if not self._stillness.is_still(interval):
             return None
         measured = zero_velocity(self._stillness)
+        before = self.ekf.state, self._bias_prior
+        # Rest tells the bias, be it what it may.
+        wide = max(self._bias_prior.variance, _BIAS_AT_REST**2)
+        self._exchange_gyro_bias_prior(replace(self._bias_prior, variance=wide))
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
+            self.ekf.state, self._bias_prior = before
             return None
         return measured
 
@@ -238,6 +250,8 @@ class Estimator:
             )
         late = 1.0 / (f.update_rate * _SHARE_SECONDS)
         self._outlier_share += late * (is_gated(result) - self._outlier_share)
+        if f.adaptive:
+            self._accelerometer = self._accelerometer.seen(result)
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
@@ -275,7 +289,8 @@ class Estimator:
             self._stillness.window,
             self._magnetic,
             self._outlier_share,
-            self._raw_bias,
+            self._bias_prior,
+            self._accelerometer,
             self._counts,
             self.in_gap,
             self.oldest,
@@ -287,8 +302,18 @@ class Estimator:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
         self._magnetic, self._outlier_share, self._counts = s.magnetic, s.outlier_share, s.counts
-        self._raw_bias = s.raw_bias
+        self._bias_prior, self._accelerometer = s.bias_prior, s.accelerometer
         self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
+
+    @property
+    def accelerometer(self) -> AccelerometerWorth:
+        """What it is worth, as the innovations tell."""
+        return self._accelerometer
+
+    @property
+    def bias_prior(self) -> GyroBiasPrior:
+        """Of the gyroscope's bias, as it stands in the filter."""
+        return self._bias_prior
 
     @property
     def time(self) -> float:
@@ -329,4 +354,5 @@ class Estimator:
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """The report so far, with the sigmas of another estimator's state where one is given."""
-        return self._counts.health(counts, state or self.nav_state())
+        health = self._counts.health(counts, state or self.nav_state())
+        return replace(health, accel_noise_factor=self._accelerometer.factor)

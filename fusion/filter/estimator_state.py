@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.ekf_state import EkfState, Estimate
+from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.map_frame import MapFrameState
@@ -55,7 +57,8 @@ class EstimatorState:
         stillness: the last second's sums (`StillnessDetector`).
         magnetic: what the magnetic field usually is.
         outlier_share: of the displacements of late.
-        raw_bias: of the gyroscope, beyond what a device leaves that corrects it [rad/s].
+        bias_prior: of the gyroscope's bias, as it stands in the filter.
+        accelerometer: what it is worth.
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
@@ -68,7 +71,8 @@ class EstimatorState:
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference
     outlier_share: float
-    raw_bias: float
+    bias_prior: GyroBiasPrior
+    accelerometer: AccelerometerWorth
     counts: UpdateCounts
     in_gap: bool
     oldest: Estimate | None

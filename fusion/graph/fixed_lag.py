@@ -20,10 +20,15 @@ from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
+from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health, NavState
+
+_WIDER, _NARROWER = 1.2, 0.99
+"""Ratios of variances from which on the gyroscope bias's prior is another: a graph begins anew
+with a wider one, and is told the difference to a narrower one."""
 
 _ROUNDS = 3
 """Of each optimisation: the next keyframe's goes on from there."""
@@ -39,6 +44,7 @@ class FixedLagState:
         ahead: the newest state, carried on by the IMU from the last keyframe.
         origin_W: (3,) of the graph's positions [m]: see `EkfState`.
         map_frame: frame transforms before the graph began.
+        bias_prior: variance of the gyroscope bias's prior as the graph has it [rad^2/s^2].
         fallbacks: how often the graph fell back to the filter, and why it last did.
     """
 
@@ -47,6 +53,7 @@ class FixedLagState:
     ahead: EkfState
     origin_W: FloatArray
     map_frame: int
+    bias_prior: float
     fallbacks: tuple[int, str]
 
 
@@ -72,6 +79,7 @@ class FixedLagEstimator:
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)
         self._map_frame = 0
+        self._bias_prior = 0.0
         self._builder: GraphBuilder
         self._begin(0)
 
@@ -80,11 +88,12 @@ class FixedLagEstimator:
     ) -> None:
         """Move to the interval's end and take in what was measured; as `Estimator.step`."""
         taken = self._filter.step(interval, displacement, fixes)
-        if self._filter.map_frame != self._map_frame or interval.anew is not None:
+        self._narrow_bias_prior()
+        if self._stale or interval.anew is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
         near = [self._near(accepted) for accepted in taken.fixes]
-        if self._builder.step(interval, taken.displacement, near, taken.zero_velocity):
+        if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -95,7 +104,7 @@ class FixedLagEstimator:
         accepted = self._filter.late_fix(fix)
         if accepted is None:
             return None
-        if self._filter.map_frame != self._map_frame or self._filter.judged != judged:
+        if self._stale or self._filter.judged != judged:
             self._begin(self._builder.count)
             return accepted
         for taken in accepted:
@@ -112,6 +121,7 @@ class FixedLagEstimator:
             self._ahead.state,
             self._origin_W,
             self._map_frame,
+            self._bias_prior,
             self._fallbacks,
         )
 
@@ -119,6 +129,7 @@ class FixedLagEstimator:
     def state(self, s: FixedLagState) -> None:
         self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
         self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
+        self._bias_prior = s.bias_prior
 
     @property
     def time(self) -> float:
@@ -139,6 +150,21 @@ class FixedLagEstimator:
         note = f"graph fell back to the filter {times} times, last for {why}"
         return replace(health, notes=[*health.notes, note])
 
+    @property
+    def _stale(self) -> bool:
+        """Whether the filter knows by now that the graph began from something else."""
+        wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
+        return wider or self._filter.map_frame != self._map_frame
+
+    def _narrow_bias_prior(self) -> None:
+        """As the filter did: what the narrower prior knows more, as a measurement of zero."""
+        variance = self._filter.bias_prior.variance
+        if variance < _NARROWER * self._bias_prior:
+            more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+            graph = self._builder.graph
+            graph.add(GyroBias(graph.last, np.zeros(3), more * np.eye(3)), gated=False)
+            self._bias_prior = variance
+
     def _near(self, accepted: Accepted) -> Fix:
         """A fix as the filter inflated it, from the graph's origin."""
         return accepted.inflated.shifted(-self._origin_W)
@@ -147,6 +173,7 @@ class FixedLagEstimator:
         """A new graph from the filter's state."""
         first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
+        self._bias_prior = self._filter.bias_prior.variance
         first = first.shifted(-self._origin_W)
         self._builder = GraphBuilder(self._config, first, count, streaming=True)
         self._restart_from(first)

@@ -312,7 +312,11 @@ def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) 
     else:
         attitudes = attitude.advance(time, gyro, accel)
     bias = float(np.linalg.norm(attitude.b_g))
-    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB, levelled_bias=bias)
+    return ImuInterval(
+        *(time, gyro, accel, gap, attitudes, attitude.R_NB),
+        levelled_bias=bias,
+        levelled_bias_sigma=attitude.bias_sigma,
+    )
 
 
 def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:

@@ -45,7 +45,9 @@ class ImuInterval:
         R_NB_window: (3, 3) levelled attitude at the window's start.
         heading: of the device in N, averaged over the window [rad].
         levelled_bias: size of the gyroscope's bias as far as gravity tells it [rad/s].
+        levelled_bias_sigma: of it, per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT], None where none was measured.
+        accel_factor: on the accelerometer's noise density, as the filter finds it.
     """
 
     time: FloatArray
@@ -59,7 +61,9 @@ class ImuInterval:
     R_NB_window: FloatArray | None = None
     heading: float = 0.0
     levelled_bias: float = 0.0
+    levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
+    accel_factor: float = 1.0
     anew: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False

@@ -157,6 +157,8 @@ def _unseen(
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     """White noise, wider where a sensor was saturated."""
     noise, f = config.noise, config.filter
+    if interval.accel_factor != 1.0:
+        noise = replace(noise, accel_noise=interval.accel_factor * noise.accel_noise)
     # What a saturated sensor missed is as unknown as what happens in a gap.
     if interval.flags.gyro:
         noise = replace(noise, gyro_noise=max(noise.gyro_noise, f.gap_gyro_noise))

@@ -1,0 +1,91 @@
+"""How wide the gyroscope bias's prior must be, by what is known of the bias.
+
+README.md, "Noise and the gyroscope's bias". Most devices correct their bias to a thousandth of a
+radian per second, some to five, some not at all, and no single Gaussian holds for all of them. So
+its width follows what is known (empirical Bayes: Carlin and Louis 2000), without a threshold to
+flip at: wide while gravity has told little of the bias, narrow once it has told that it is small,
+wide where it is large, or where the data say clearly that it lies outside the prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stario.fusion.lie import FloatArray
+from stario.sequences.levelling import BIAS_SIGMA
+
+_CORRECTED = 0.01
+"""Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
+
+_ALIKE = 0.4
+"""What is not known yet about the level axes counts by this share: what is known of them tells of
+the vertical one as well, since a device corrects all or none."""
+
+_CLEARLY = 3.0
+"""Deviations of what the data say, about any axis, within which the prior is left alone."""
+
+_PRECISE = 5e-3
+"""Data that tell less than this [rad/s] are the network's displacements alone: too little to go
+by, since their errors are alike for long. Rest, gravity, fixes and the magnetic field tell more."""
+
+_WIDEST = 0.015
+"""To which data widen it [rad/s]; what lies outside is raw, which levelling tells sooner."""
+
+
+@dataclass(frozen=True)
+class GyroBiasPrior:
+    """Zero mean, with a variance that follows what is known.
+
+    Attributes:
+        sigma: of a device that corrects its bias well [rad/s].
+        variance: per axis, now [rad^2/s^2].
+        raw: of the bias beyond what such a device leaves, at most so far [rad/s].
+        evident: variance that the data asked for, at most so far.
+    """
+
+    sigma: float
+    variance: float
+    raw: float = 0.0
+    evident: float = 0.0
+
+    @classmethod
+    def first(cls, sigma: float) -> GyroBiasPrior:
+        """Before anything is known."""
+        return cls(sigma, sigma**2)
+
+    def before_gravity_tells(self) -> GyroBiasPrior:
+        """As wide as while levelling knows nothing of the bias."""
+        return replace(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
+
+    def wanted(
+        self, levelled: float, levelled_sigma: float, b_g: FloatArray, P: FloatArray
+    ) -> GyroBiasPrior:
+        """What the prior should be by now; to be put in place of this one in the filter.
+
+        Args:
+            levelled: size of the bias as far as gravity tells it [rad/s].
+            levelled_sigma: of it, per level axis [rad/s].
+            b_g: (3,) the bias as the filter estimates it [rad/s].
+            P: (3, 3) its covariance.
+        """
+        raw = max(self.raw, levelled - _CORRECTED)
+        evident = max(self.evident, min(self._asked(b_g, P), _WIDEST**2))
+        known = self.sigma**2 + (_ALIKE * levelled_sigma) ** 2 + raw**2
+        return GyroBiasPrior(self.sigma, max(known, evident), raw, evident)
+
+    def _asked(self, b_g: FloatArray, P: FloatArray) -> float:
+        """The variance that the data ask for.
+
+        With prior variance s^2 and posterior b, P they alone say y with covariance E:
+        E^-1 = P^-1 - s^-2 I, y = E P^-1 b; about each principal axis s^2 >= y^2 - (3 e)^2.
+        """
+        p, axes = np.linalg.eigh(P)
+        p = np.maximum(p, 1e-6 * self.variance)
+        precise = p < self.variance * _PRECISE**2 / (self.variance + _PRECISE**2)
+        if not precise.any():
+            return 0.0
+        e = p[precise] * self.variance / (self.variance - p[precise])  # squares
+        y = (axes.T @ b_g)[precise] * e / p[precise]
+        return float(np.max(y**2 - _CLEARLY**2 * e))

@@ -1,0 +1,59 @@
+"""What the accelerometer is worth: followed by the innovations, and not led by a few false ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavigatorConfig
+from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimator import Estimator
+from stario.sequences.sequence import ImuSequence
+
+
+def factor_at_the_end(
+    oracle: object, walk: ImuSequence, shake: float = 0.0, false: range = range(0)
+) -> float:
+    """Of an accelerometer with errors of a tenth of a second [m/s^2], and false displacements."""
+    config, rng = NavigatorConfig(), np.random.default_rng(3)
+    preprocessed = Navigator(oracle, config).observe(walk)
+    start = preprocessed.front_end.start
+    assert start is not None
+    estimator = Estimator(config, start)
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    for k, (interval, measured) in enumerate(pairs):
+        shaken = replace(interval, accel=interval.accel + rng.normal(0.0, shake, 3))
+        if measured is not None and k in false:
+            measured = (measured[0] + [1.0, 0.0, 0.0], measured[1])
+        estimator.step(shaken, measured)
+    return estimator.accelerometer.factor
+
+
+def test_a_bad_accelerometer_is_found_and_a_good_one_keeps_its_worth(
+    make_walk, make_oracle
+) -> None:
+    walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
+    oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
+    assert factor_at_the_end(oracle, walk) < 1.5
+    assert factor_at_the_end(oracle, walk, shake=3.0) > 2.5
+
+
+def test_five_seconds_of_false_displacements_are_not_its_fault(make_walk, make_oracle) -> None:
+    walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
+    oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
+    assert factor_at_the_end(oracle, walk, false=range(340, 390)) < 2.5
+
+
+@pytest.mark.parametrize(("nis", "moves"), [(1e9, 1), (0.0, -1)])
+def test_one_displacement_moves_it_by_little(nis: float, moves: int) -> None:
+    before = AccelerometerWorth(log_factor=1.0, gain=0.05)
+    after = before.seen(UpdateResult(nis, 3, True))
+    assert after.log_factor - before.log_factor == pytest.approx(moves * 0.05, abs=1e-6)
+
+
+def test_what_could_not_be_judged_tells_nothing() -> None:
+    before = AccelerometerWorth(log_factor=1.0)
+    assert before.seen(UpdateResult(float("nan"), 3, False)) == before

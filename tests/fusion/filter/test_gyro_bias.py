@@ -1,0 +1,63 @@
+"""The gyroscope bias's prior: exchanged exactly, and as wide as what is known of the bias asks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.state import NavState
+
+
+def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
+    """With a prior of the bias, then told its sum with other states twice."""
+    ekf = StateCloningEkf(slots=1)
+    zero = np.zeros(3)
+    variances = np.repeat([1e-2, 0.5, 1.0, sigma**2, 1e-2], 3)
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, np.diag(variances)))
+    ekf.clone()
+    for value, share in (([2e-3, -1e-3, 4e-3], 0.1), ([1e-3, 2e-3, -3e-3], 0.4)):
+        blocks = [(9, np.eye(3)), (12, share * np.eye(3))]
+        ekf.update_linear(np.array(value) - ekf.state.b_g, blocks, 1e-6 * np.eye(3))
+    return ekf
+
+
+@pytest.mark.parametrize("new", [1e-4, 2e-3, 1e-2])
+def test_an_exchanged_prior_is_as_if_it_had_been_there_from_the_start(new: float) -> None:
+    old = 1e-3
+    ekf = ekf_with_rates_measured(old)
+    ekf.exchange_gyro_bias_prior(old**2, new**2)
+    expected = ekf_with_rates_measured(new).state
+    # The second residual took b_a as zero in both, so what is compared is linear.
+    np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
+
+
+def wanted(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0) -> GyroBiasPrior:
+    P = np.diag([prior.variance, prior.variance, sigma**2])
+    return prior.wanted(levelled, 0.0, np.array([0.0, 0.0, b]), P)
+
+
+def test_a_bias_that_the_data_tell_clearly_widens_it() -> None:
+    prior = GyroBiasPrior(1e-3, 1e-6)
+    # Posterior of a measured 8e-3 +- 1e-3: half of it, the prior being as sure.
+    wider = wanted(prior, 4e-3, 1e-3 / np.sqrt(2.0))
+    assert wider.variance == pytest.approx(8e-3**2 - 3e-3**2)
+
+
+@pytest.mark.parametrize(("b", "e"), [(8e-3, 2e-2), (2.5e-3, 1e-3)])
+def test_what_is_vague_or_fits_leaves_it_alone(b: float, e: float) -> None:
+    """The network's displacements alone tell 2e-2 rad/s: their slow errors look like a bias."""
+    prior, share = GyroBiasPrior(1e-3, 1e-6), 1e-6 / (1e-6 + e**2)
+    assert wanted(prior, share * b, np.sqrt(share) * e).variance == pytest.approx(1e-6)
+
+
+def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> None:
+    first = GyroBiasPrior.first(1e-3)
+    nothing = np.zeros(3), first.variance * np.eye(3)
+    early = first.wanted(0.0, 1e-2, *nothing)
+    late = early.wanted(0.0, 1e-3, *nothing)
+    assert 3e-3 < np.sqrt(early.variance) < 6e-3
+    assert np.sqrt(late.variance) < 1.2e-3
+    raw = late.wanted(0.05, 1e-3, *nothing).wanted(0.02, 1e-3, *nothing)
+    assert np.sqrt(raw.variance) > 0.03
