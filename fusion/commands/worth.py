@@ -12,7 +12,6 @@ from stario.fusion.commands.common import collected, leave_with_skipped, print_j
 from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.judging import check_by, labels
     from stario.fusion.evaluation.worth import Worth
 
 
@@ -29,6 +28,7 @@ def fusion(
 ) -> None:
     """Hold the filter's error against its network's, with NIS and honesty of the yaw, by group."""
     from stario.fusion.backends import BackendName
+    from stario.fusion.evaluation.judging import check_by, labels
     from stario.fusion.evaluation.worth import worth_of, worth_table
     from stario.sequences.batch import each
 

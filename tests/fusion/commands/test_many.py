@@ -33,6 +33,17 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
     assert "covers" not in done.out
 
 
+def test_the_fusion_is_held_against_its_network(stario, recording: Path) -> None:
+    done = stario("check", "fusion", recording, recording, "--json")
+    assert done.code == 0
+    first, second = json.loads(done.out)
+    assert first == second
+    assert first["network_m"] > 0.0
+    refused = stario("check", "fusion", recording, "--by", "colour")
+    assert refused.code == 1
+    assert "carry" in refused.err
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
     walk = read_own_csv(recording)
