@@ -266,12 +266,17 @@ class StateCloningEkf(ErrorStateEngine):
         """Everything as if the gyroscope bias's prior, zero mean, had been another from the start.
 
         The old prior's information is taken off and the new one's added: an update by a measurement
-        of zero, of negative variance where the prior widens; exact as far as the filter is linear.
+        of zero, of negative variance where the prior widens; exact as far as the filter is linear
+        and the bias constant. One that has wandered may be less certain than its prior was: no more
+        information can be taken off than there is, so both priors then count as wider, alike.
 
         Args:
             old: variance per axis of the prior until now [rad^2/s^2].
             new: of the one that takes its place.
         """
+        if new > old:
+            widest = float(np.linalg.eigvalsh(self.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
+            old, new = max(old, widest), new * max(1.0, widest / old)
         while abs(new - old) > _SAME_PRIOR * old:
             step = min(new, 2.0 * old)  # a larger one would be badly conditioned
             P = self.state.P

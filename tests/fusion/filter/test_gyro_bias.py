@@ -33,6 +33,19 @@ def test_an_exchanged_prior_is_as_if_it_had_been_there_from_the_start(new: float
     np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
 
 
+def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_covariance() -> None:
+    """No more information can be taken off than there is."""
+    ekf = ekf_with_rates_measured(1e-3)
+    P = ekf.P.copy()
+    P[9:12, 9:12] += 2e-6 * np.eye(3)  # a random walk, twice the prior's variance
+    ekf.P = P
+    before = np.linalg.eigvalsh(P).min()
+    ekf.exchange_gyro_bias_prior(1e-6, 1e-5)
+    assert np.linalg.eigvalsh(ekf.P).min() > 0.5 * before
+    assert (np.diag(ekf.P)[9:12] <= 10.0 * np.diag(P)[9:12] * (1.0 + 1e-6)).all()
+    assert (np.diag(ekf.P)[9:12] > np.diag(P)[9:12]).all()
+
+
 def wanted(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0) -> GyroBiasPrior:
     P = np.diag([prior.variance, prior.variance, sigma**2])
     return prior.wanted(levelled, 0.0, np.array([0.0, 0.0, b]), P)
