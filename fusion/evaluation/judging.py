@@ -175,13 +175,16 @@ def _strata(
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
     """What a recording is grouped by; its set is its archive's name, or that of its folder.
 
+    OxIOD keeps each form of a recording in a folder of that name, `syn`.
+
     Args:
         path: of the recording.
         attributes: of the recording.
         group: from a list; empty where none is named.
     """
     file, member = split_name(path)
-    named = group.split(" ")[0] if group else file.stem if member else file.parent.name
+    folder = "oxiod" if file.parent.name == "syn" else file.parent.name
+    named = group.split(" ")[0] if group else file.stem if member else folder
     known = {key: str(attributes.get(key) or "unknown") for key in get_args(By)[2:]}
     return {"set": named, "group": group or named, **known}
 
