@@ -105,16 +105,21 @@ class StateCloningEkf(ErrorStateEngine):
         P = self._propagated(s.P, end.transition, end.noise)
         self.state = replace(s, time=segment.stop, X=X, P=P)
 
-    def clone(self) -> int:
-        """Copy the current pose into a free slot and return the slot's number.
+    def clone(self, instead_of: int | None = None) -> int:
+        """Copy the current pose into a slot and return its number.
+
+        Args:
+            instead_of: slot of a clone that makes way; None for a free slot.
 
         Raises:
-            InputError: every slot is taken; `release` one first.
+            InputError: every slot is taken, `release` one first; or `instead_of` holds no clone.
         """
         s = self.state
-        if None not in s.clone_times:
+        if instead_of is not None:
+            s.time_of_clone(instead_of)
+        elif None not in s.clone_times:
             raise InputError("clone", f"all {self.slots} slots taken", "a free slot", "release one")
-        slot = s.clone_times.index(None)
+        slot = s.clone_times.index(None) if instead_of is None else instead_of
         X = s.X.copy()
         X[1 + slot] = X[0]
         X[1 + slot, :, 3] = 0.0
@@ -274,7 +279,7 @@ class StateCloningEkf(ErrorStateEngine):
             old: variance per axis of the prior until now [rad^2/s^2].
             new: of the one that takes its place.
         """
-        if new > old:
+        if new > (1.0 + _SAME_PRIOR) * old:
             widest = float(np.linalg.eigvalsh(self.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
             old, new = max(old, widest), new * max(1.0, widest / old)
         while abs(new - old) > _SAME_PRIOR * old:

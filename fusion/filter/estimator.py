@@ -264,12 +264,12 @@ class Estimator:
         self._counts = self._counts.add_bearing(result)
 
     def _clone(self) -> None:
-        if len(self._clones) == self.ekf.slots:
-            slot, *later = self._clones
-            self.oldest = self.ekf.state.clone_estimate(slot, self.map_frame)
-            self.ekf.release(slot)
-            self._clones = tuple(later)
-        self._clones = (*self._clones, self.ekf.clone())
+        if len(self._clones) < self.ekf.slots:
+            self._clones = (*self._clones, self.ekf.clone())
+            return
+        slot, *later = self._clones
+        self.oldest = self.ekf.state.clone_estimate(slot, self.map_frame)
+        self._clones = (*later, self.ekf.clone(instead_of=slot))
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""

@@ -282,6 +282,23 @@ def test_a_clone_is_the_current_pose(driven: StateCloningEkf) -> None:
     np.testing.assert_array_equal(driven.P[:, 15:21], driven.P[:, pose])
 
 
+def test_a_clone_in_place_of_another_is_as_one_in_its_slot_when_it_was_free(
+    driven: StateCloningEkf,
+) -> None:
+    before = driven.state
+    driven.release(3)
+    driven.clone()
+    expected = driven.state
+    driven.state = before
+    assert driven.clone(instead_of=3) == 3
+    np.testing.assert_array_equal(driven.P, expected.P)
+    np.testing.assert_array_equal(driven.state.X, expected.X)
+    assert driven.state.clone_times == expected.clone_times
+    driven.release(3)
+    with pytest.raises(InputError, match="slot"):
+        driven.clone(instead_of=3)
+
+
 def test_a_released_slot_is_empty(driven: StateCloningEkf) -> None:
     driven.release(2)
     with pytest.raises(InputError, match="slot"):
