@@ -19,6 +19,7 @@ from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.faults import faults
+from stario.fusion.commands.gaps import gaps
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
 from stario.fusion.commands.models import models
@@ -40,7 +41,7 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, table, fusion, backends, faults, consistency, benchmark):
+for command in (models, table, fusion, backends, faults, gaps, consistency, benchmark):
     check.command()(command)
 app.add_typer(check, name="check")
 

@@ -38,8 +38,8 @@ def faults(duration: float) -> list[Fault]:
         Fault("network off by 1 m for 5 s", corrupt=_offset_block(5.0 / duration, 1.0)),
         Fault("5 % of windows off by 2 m", corrupt=_outliers(0.05, 2.0)),
         Fault("covariance 100 times too small", corrupt=_overconfident(0.01)),
-        *(Fault(f"gap of {gap:g} s", _gap(half, gap)) for gap in (0.1, 1.0, 3.0)),
-        *(Fault(f"{share:.0%} of samples dropped", _drops(share)) for share in (0.05, 0.2)),
+        *(Fault(f"gap of {length:g} s", gap(half, length)) for length in (0.1, 1.0, 3.0)),
+        *(Fault(f"{share:.0%} of samples dropped", drops(share)) for share in (0.05, 0.2)),
         *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
         Fault("accelerometer clipped", _clipped(0.98)),
         *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
@@ -94,7 +94,9 @@ def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
     )
 
 
-def _gap(start: float, seconds: float) -> Spoil:
+def gap(start: float, seconds: float) -> Spoil:
+    """No sample for so long, from an instant after the first sample [s]."""
+
     def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         since = sequence.time - sequence.time[0] - start
         return _kept(sequence, (since <= 0.0) | (since >= seconds))
@@ -102,7 +104,8 @@ def _gap(start: float, seconds: float) -> Spoil:
     return spoil
 
 
-def _drops(share: float) -> Spoil:
+def drops(share: float) -> Spoil:
+    """A share of the samples missing, at random."""
     return lambda sequence, rng: _kept(sequence, rng.random(len(sequence)) >= share)
 
 
