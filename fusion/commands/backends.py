@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import collected, leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.common import (
+    leave_with_skipped,
+    print_json,
+    progress_bar,
+    result_of_each,
+)
 from stario.fusion.commands.options import Estimating, JsonOption, PathsArgument, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.backends import Score
     from stario.sequences.batch import Skipped
+    from stario.sequences.sequence import ImuSequence
 
 
 @grouped
@@ -35,20 +41,17 @@ def backends(
     """
     from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
     from stario.network.training.splits import split_paths
-    from stario.sequences.batch import each
 
     scores: list[Score] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
-        files, skipped = reading.recordings(paths or split_paths(data or Path(), split))
         settings, network = estimating.settings(), estimating.network()
 
-        def scored(file: Path) -> Score:
-            return score_recording(network, reading.read(file), settings)
+        def scored(path: Path, sequence: ImuSequence) -> Score:
+            return score_recording(network, sequence, settings)
 
-        with progress_bar("backends", len(files)) as progress:
-            outcomes = each(scored, files, jobs=1)
-            scores = collected(outcomes, skipped, lambda done: progress(done / len(files)))
+        recordings = paths or split_paths(data or Path(), split)
+        scores, skipped = result_of_each("backends", reading, recordings, scored)
     else:
         with progress_bar("backends", walks) as progress:
             for seed in range(walks):

@@ -46,6 +46,33 @@ def collected(
     return results
 
 
+def result_of_each(
+    title: str,
+    reading: Reading,
+    paths: Sequence[Path],
+    work: Callable[[Path, ImuSequence], Result],
+) -> tuple[list[Result], list[Skipped]]:
+    """What `work` makes of each recording, behind a progress bar, and what could not be used.
+
+    Args:
+        title: of the bar.
+        reading: how recordings are read.
+        paths: of recordings, folders or lists.
+        work: given a recording's path and the recording.
+    """
+    from stario.sequences.batch import each
+
+    files, skipped = reading.recordings(paths)
+
+    def done_with(file: Path) -> Result:
+        return work(file, reading.read(file))
+
+    with progress_bar(title, len(files)) as progress:
+        outcomes = each(done_with, files, jobs=1)
+        found = collected(outcomes, skipped, lambda done: progress(done / len(files)))
+    return found, skipped
+
+
 def one_by_one(
     reading: Reading,
     paths: Sequence[Path],

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import collected, leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.common import leave_with_skipped, print_json, result_of_each
 from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.missing import Moved
+    from stario.sequences.sequence import ImuSequence
 
 
 @grouped
@@ -28,20 +29,15 @@ def gaps(
     """Take 0.1 s out at six instants, then 5 % of the samples, and see how far the end moves."""
     from stario.fusion.evaluation.judging import check_by, labels
     from stario.fusion.evaluation.missing import moved_ends, moved_table
-    from stario.sequences.batch import each
 
     grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
-    files, skipped = reading.recordings(paths)
 
-    def moved(path: Path) -> list[Moved]:
-        sequence = reading.read(path)
+    def moved(path: Path, sequence: ImuSequence) -> list[Moved]:
         group = labels(path, sequence.attributes)[grouping]
         return moved_ends(model, sequence, settings, group)
 
-    with progress_bar("check gaps") as progress:
-        outcomes = each(moved, files, jobs=1)
-        found = collected(outcomes, skipped, lambda done: progress(done / len(files)))
+    found, skipped = result_of_each("check gaps", reading, paths, moved)
     ends = [one for ends in found for one in ends]
     if as_json:
         print_json([asdict(one) for one in ends])

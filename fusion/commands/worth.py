@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import collected, leave_with_skipped, print_json, progress_bar
+from stario.fusion.commands.common import leave_with_skipped, print_json, result_of_each
 from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.worth import Worth
+    from stario.sequences.sequence import ImuSequence
 
 
 @grouped
@@ -30,21 +31,16 @@ def fusion(
     from stario.fusion.backends import BackendName
     from stario.fusion.evaluation.judging import check_by, labels
     from stario.fusion.evaluation.worth import worth_of, worth_table
-    from stario.sequences.batch import each
 
     grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
-    files, skipped = reading.recordings(paths)
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
 
-    def judged(path: Path) -> Worth:
-        sequence = reading.read(path)
+    def judged(path: Path, sequence: ImuSequence) -> Worth:
         group = labels(path, sequence.attributes)[grouping]
         return worth_of(model, sequence, settings, group, backends)
 
-    with progress_bar("check fusion") as progress:
-        outcomes = each(judged, files, jobs=1)
-        found = collected(outcomes, skipped, lambda done: progress(done / len(files)))
+    found, skipped = result_of_each("check fusion", reading, paths, judged)
     if as_json:
         print_json([asdict(one) for one in found])
     elif found:
