@@ -101,7 +101,7 @@ def train(
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import gather
+    from stario.network.training.data import cached_walks, gather
     from stario.network.training.parallel import leads
     from stario.network.training.train import train as train_network
     from stario.sequences.stream_cache import cache_folder
@@ -119,7 +119,7 @@ def train(
     material = gather(
         recorded + held_out if last_stage is not None else recorded,
         _captured(captured, recipe, folder) if captured else [],
-        _generated(generated, recipe.seed, recipe.attitude, folder),
+        cached_walks(generated, recipe.seed, folder, recipe.attitude),
         recipe.shares,
     )
     kept = gather(held_out, [], [])
@@ -132,7 +132,7 @@ def train(
         )
     calibrated_by = last_stage or (None if kept.streams else start_from)
     # Sigma needs windows with full truth; where nobody has any, those of generated walks.
-    windows = kept.streams or _generated(10, recipe.seed + 1, recipe.attitude, folder)
+    windows = kept.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
     if leads():
         for words in material.words:
             typer.echo(words, err=True)
@@ -250,10 +250,3 @@ def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldSt
         return captured_streams(read_vicon_walks(walks), seed, attitude)
 
     return simulated_streams("captured", build, folder, walks, seed, attitude)
-
-
-def _generated(count: int, seed: int, attitude: Attitude, folder: Path) -> list[WorldStream]:
-    from stario.network.training.data import generated_streams, simulated_streams
-
-    build = partial(generated_streams, count, 60.0, seed, attitude)
-    return simulated_streams("generated", build, folder, count, seed, attitude)

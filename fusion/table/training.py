@@ -13,7 +13,7 @@ from time import process_time
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
-from stario.network.training.data import Recorded, gather, generated_streams, simulated_streams
+from stario.network.training.data import Recorded, cached_walks, gather
 from stario.network.training.train import EpochReport, train
 from stario.sequences.batch import Skipped
 from stario.sequences.files import write_json
@@ -31,7 +31,8 @@ SPARE = ("checkpoint.safetensors", "clock.json")
 """Files of a training that nobody needs once its end is noted."""
 
 _WALKS, _VALIDATION_WALKS = 40, 8
-"""Simulated walks of 60 s that teach and test windows where no recording has poses."""
+"""Simulated walks that teach and test windows where no recording has poses: alike for every cell,
+since what differs are the networks."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def train_cell(
     """
     streams, skipped = _streams(dataset.training, recipe, reading)
     held_out, missing = _streams(dataset.validation, recipe, reading)
-    simulated = partial(_simulated, recipe=recipe, cache=reading.cache)
+    simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for one in streams for s in one.streams)
     material = gather(streams, [], [] if poses else simulated(_WALKS, 0))
     kept = gather(held_out, [], [])
@@ -152,12 +153,6 @@ _MOST_OPEN = 2
 """Parts of sets whose streams a process keeps open: those of one cell."""
 
 _open: dict[object, tuple[list[Recorded], list[Skipped]]] = {}
-
-
-def _simulated(count: int, seed: int, recipe: TrainingConfig, cache: Path) -> list[WorldStream]:
-    """Walks of one seed for every cell: what differs are the networks."""
-    build = partial(generated_streams, count, 60.0, seed, recipe.attitude)
-    return simulated_streams("generated", build, cache, count, seed, recipe.attitude)
 
 
 def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:

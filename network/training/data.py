@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -26,6 +27,8 @@ SIMULATED = "simulated"
 
 _SIMULATED_SHARE, _CAPTURED_SHARE = 0.4, 0.7
 """Of all windows, the simulated ones' where none is said; of those, along captured walks."""
+
+_WALK_SECONDS = 60.0
 
 _SHORTEST = 400
 """Samples of the shortest stretch that is kept, 2 s."""
@@ -184,6 +187,14 @@ def simulated_streams(
     ]
     key = {"kind": kind, "values": values, "module": Path(__file__).read_text(encoding="utf-8")}
     return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
+
+
+def cached_walks(
+    count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
+) -> list[WorldStream]:
+    """`generated_streams` of walks of a minute, from the cache in `folder`."""
+    build = partial(generated_streams, count, _WALK_SECONDS, seed, attitude)
+    return simulated_streams("generated", build, folder, count, seed, attitude)
 
 
 def captured_streams(
