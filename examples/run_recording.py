@@ -35,4 +35,4 @@ if __name__ == "__main__":
     sigma = track.trajectory.position_covariance_W[-1].diagonal() ** 0.5
     seconds = track.time[-1] - track.time[0]
     print(f"after {seconds:.0f} s at {end.round(2)} m, sigma {sigma.round(2)} m")
-    print("\n".join(track.health.lines()))
+    print("\n".join([*track.health.lines(), *track.health.notes]))

@@ -160,15 +160,15 @@ class Health:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The report for a person."""
+        """The counts for a person; `stario.fusion.report.health` says what they mean."""
         dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
-        text = [f"samples used {self.samples.get('used', 0)}, dropped {dropped or 'none'}"]
+        text = [f"samples used {self.samples.get('used', 0)}, dropped {_counted(dropped)}"]
         if any(self.flagged.values()):
             text.append(f"samples flagged: {_counted(self.flagged)}")
         text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
         share = self.gated / self.updates if self.updates else 0.0
         text.append(
-            f"updates {self.updates}, gated {share:.1%}, refused {self.refused or 'none'}, "
+            f"updates {self.updates}, gated {share:.1%}, refused {_counted(self.refused)}, "
             f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
         )
         if self.fixes:
@@ -180,11 +180,12 @@ class Health:
         if self.accel_noise_factor > 1.0:
             text.append(f"accelerometer noise {self.accel_noise_factor:.1f} times the configured")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
-        return [*text, f"final sigma: {sigma}", *self.notes]
+        return [*text, f"final sigma: {sigma}"]
 
 
 def _counted(counts: dict[str, int]) -> str:
-    return ", ".join(f"{reason} {n}" for reason, n in counts.items())
+    """The counts by reason; `none` where there are none."""
+    return ", ".join(f"{reason} {n}" for reason, n in counts.items()) or "none"
 
 
 @dataclass(frozen=True, eq=False)

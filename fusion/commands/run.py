@@ -79,6 +79,7 @@ def _run(
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
+    from stario.fusion.report.health import told
     from stario.sequences.metrics import align
 
     check_within(fixes, sequence)
@@ -111,16 +112,16 @@ def _run(
     if not shown.figures:
         return record
     typer.echo(sequence.summary())
-    told = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
+    length = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    typer.echo(f"{told} travelled by the estimate, which ends {ends:.1f} m from its start")
+    typer.echo(f"{length} travelled by the estimate, which ends {ends:.1f} m from its start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     elif sequence.positions is not None:
         from stario.fusion.evaluation.known_positions import position_error_words
 
         typer.echo(position_error_words(track, sequence.positions))
-    for line in track.health.lines() if track.health else []:
-        typer.echo(line)
+    if track.health is not None:
+        typer.echo("\n".join([*track.health.lines(), *told(track.health)]))
     typer.echo(f"{len(written)} files in {folder}")
     return record

@@ -51,23 +51,52 @@ class Finding:
 
 def findings(health: Health) -> list[Finding]:
     """What stands out in a run so far, warnings first; never empty."""
-    found = [
-        *_samples(health),
-        *_gaps(health),
-        *_updates(health),
-        *_fixes(health),
-        *_direction(health),
-        *map(_noted, health.notes),
-    ]
+    if _is_shaken(health):
+        reasons = [_shaken(health), *_samples(health), *_gaps(health)]
+        notes = [note for note in health.notes if not _is_unfamiliar(note)]
+    else:
+        reasons = [*_samples(health), *_flagged(health), *_gaps(health), *_updates(health)]
+        notes = health.notes
+    found = [*reasons, *_fixes(health), *_direction(health), *map(_noted, notes)]
     if not health.notes and not any(finding.level == "warning" for finding in found):
         found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
     order: dict[str, int] = {"warning": 0, "good": 1, "note": 2}
     return sorted(found, key=lambda finding: order[finding.level])
 
 
+def told(health: Health) -> list[str]:
+    """The findings as lines of text, one each; those to act on begin with "!"."""
+    return [
+        f"{'! ' if finding.level == 'warning' else '  '}{finding.text} {finding.advice}".rstrip()
+        for finding in findings(health)
+    ]
+
+
+def _is_shaken(health: Health) -> bool:
+    """Whether sensor, weights and filter all disagree: then it is the data, and none of them."""
+    return (
+        _has_flagged(health)
+        and any(map(_is_unfamiliar, health.notes))
+        and health.gated > GATED_SHARE * health.updates
+    )
+
+
+def _shaken(health: Health) -> Finding:
+    text = (
+        "This track is not to be trusted: the device was shaken or struck, not carried ("
+        f"{_counted(health.flagged)} samples, most of the motion is unlike a person's, and "
+        f"{health.gated / health.updates:.0%} of the network's displacements did not fit the IMU)."
+    )
+    return Finding("warning", text, "Record a walk with the device held or strapped firmly.")
+
+
+def _is_unfamiliar(note: str) -> bool:
+    return "weights were trained on" in note
+
+
 def _noted(note: str) -> Finding:
     text = f"{note[:1].upper()}{note[1:]}."
-    if "weights were trained on" not in note:
+    if not _is_unfamiliar(note):
         return Finding("note", text)
     advice = "Fine-tune the weights on recordings of this kind: `stario train --start-from`."
     return Finding("warning", text, advice)
@@ -79,17 +108,24 @@ def _samples(health: Health) -> list[Finding]:
     share = sum(dropped.values()) / max(1, used + sum(dropped.values()))
     found = []
     if dropped:
-        reasons = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in dropped.items())
+        reasons = _counted(dropped)
         advice = "Log gyroscope and accelerometer at one rate, and close other apps."
         bad = share > DROPPED_SHARE
         text = f"{share:.1%} of the samples were dropped ({reasons})."
         found.append(Finding("warning" if bad else "note", text, advice if bad else ""))
-    flagged = {name: n for name, n in health.flagged.items() if n}
-    if sum(flagged.values()) > FLAGGED_SHARE * max(1, used):
-        reasons = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in flagged.items())
-        advice = "Hold or strap the device more firmly, or choose a larger range of the sensor."
-        found.append(Finding("warning", f"Samples that no motion explains: {reasons}.", advice))
     return found
+
+
+def _has_flagged(health: Health) -> bool:
+    return sum(health.flagged.values()) > FLAGGED_SHARE * max(1, health.samples.get("used", 0))
+
+
+def _flagged(health: Health) -> list[Finding]:
+    if not _has_flagged(health):
+        return []
+    text = f"Samples that no motion explains: {_counted(health.flagged)}."
+    advice = "Hold or strap the device more firmly, or choose a larger range of the sensor."
+    return [Finding("warning", text, advice)]
 
 
 def _gaps(health: Health) -> list[Finding]:
@@ -125,10 +161,9 @@ def _updates(health: Health) -> list[Finding]:
     elif ratio < 1.0 / NIS_RATIO:
         text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
         found.append(Finding("note", f"{text} The sigmas are on the safe side."))
-    left_out = {name: n for name, n in health.refused.items() if n}
+    left_out = _counted(health.refused)
     if left_out:
-        reasons = ", ".join(f"{n} {name}" for name, n in left_out.items())
-        found.append(Finding("note", f"Displacements left out: {reasons}."))
+        found.append(Finding("note", f"Displacements left out: {left_out}."))
     return found
 
 
@@ -140,7 +175,7 @@ def _fixes(health: Health) -> list[Finding]:
     text = f"{applied} fixes applied"
     if not other:
         return [Finding("note", f"{text}.")]
-    reasons = ", ".join(f"{n} {name}" for name, n in other.items())
+    reasons = _counted(other)
     refused = sum(n for name, n in other.items() if name not in ("gated", "waiting"))
     advice = "Check the fixes' clock, frame and sigmas." if refused else ""
     return [Finding("warning" if refused else "note", f"{text}; {reasons}.", advice)]
@@ -153,3 +188,7 @@ def _direction(health: Health) -> list[Finding]:
     text = f"The direction is known to {math.degrees(yaw):.0f} degrees only (1 sigma)."
     advice = "Rest for two seconds now and then, or give a fix of yaw or two of position."
     return [Finding("warning", text, advice)]
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)

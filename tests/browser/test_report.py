@@ -5,10 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from stario.fusion import Health, Navigator
+from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare, demonstration
-from stario.fusion.report.health import findings
 from stario.fusion.report.page import write_comparison_report, write_report
 from stario.fusion.report.series import ellipse
 from stario.network import load_model
@@ -91,33 +90,6 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     track = Navigator(load_model()).run(sequence)
     path = write_report(tmp_path / "r.html", sequence, {"ekf": track}, NavigatorConfig(), {})
     assert "Against the truth" not in path.read_text()
-
-
-def test_health_in_words_says_what_to_do():
-    good = findings(Health(samples={"used": 1000}, updates=100, mean_nis=3.0))
-    assert [finding.level for finding in good] == ["good"]
-    noted = findings(
-        Health(
-            mean_nis=3.0,
-            notes=["60% of the windows move unlike all that the weights were trained on"],
-        )
-    )
-    assert [finding.level for finding in noted] == ["warning"]
-    assert "stario train" in noted[0].advice
-    bad = findings(
-        Health(
-            samples={"used": 900, "out_of_order": 100},
-            updates=100,
-            gated=30,
-            mean_nis=9.0,
-            gap_count=2,
-            longest_gap=4.0,
-            final_sigma={"yaw_rad": 1.0},
-        )
-    )
-    assert [finding.level for finding in bad] == ["warning"] * 5
-    assert all(finding.advice for finding in bad)
-    assert "4.00 s" in " ".join(finding.text for finding in bad)
 
 
 def test_ellipse_is_where_the_mahalanobis_distance_is_three():

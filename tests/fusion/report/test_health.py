@@ -1,0 +1,77 @@
+"""The health report in words: what stands out, and what to do about it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stario.fusion import Health, Navigator
+from stario.fusion.report.health import findings, told
+from stario.network import load_model
+from stario.sequences import read_recording
+
+DATA = Path(
+    os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"
+)
+BAGS = DATA / "raw" / "rosbag"
+
+UNFAMILIAR = "60% of the windows move unlike all that the weights were trained on"
+
+
+def test_what_stands_out_comes_with_what_to_do() -> None:
+    good = findings(Health(samples={"used": 1000}, updates=100, mean_nis=3.0))
+    assert [finding.level for finding in good] == ["good"]
+    noted = findings(Health(mean_nis=3.0, notes=[UNFAMILIAR]))
+    assert [finding.level for finding in noted] == ["warning"]
+    assert "stario train" in noted[0].advice
+    bad = findings(
+        Health(
+            samples={"used": 900, "out_of_order": 100},
+            updates=100,
+            gated=30,
+            mean_nis=9.0,
+            gap_count=2,
+            longest_gap=4.0,
+            final_sigma={"yaw_rad": 1.0},
+        )
+    )
+    assert [finding.level for finding in bad] == ["warning"] * 5
+    assert all(finding.advice for finding in bad)
+    assert "4.00 s" in " ".join(finding.text for finding in bad)
+
+
+SHAKEN = Health(
+    samples={"used": 2000},
+    flagged={"spike": 3, "saturated": 9},
+    updates=60,
+    gated=10,
+    mean_nis=8.0,
+    notes=[UNFAMILIAR],
+)
+
+
+def test_only_sensor_weights_and_filter_together_condemn_the_data() -> None:
+    [verdict] = told(SHAKEN)
+    assert verdict.startswith("! This track is not to be trusted")
+    assert "3 spike, 9 saturated" in verdict
+    assert "17%" in verdict
+    for agrees in ({"flagged": {"spike": 1}}, {"gated": 3}, {"notes": []}):
+        lines = told(replace(SHAKEN, **agrees))
+        assert not any("trusted" in line for line in lines)
+        assert any(line.startswith("! ") for line in lines)
+
+
+@pytest.mark.skipif(not BAGS.is_dir(), reason=f"no recordings at {BAGS}")
+def test_a_board_shaken_by_hand_gets_one_line_and_one_turned_by_hand_does_not() -> None:
+    """Beyond the 2 g of its accelerometer for seconds; the other was moved within its range."""
+    navigator = Navigator(load_model("default"))
+    shaken = navigator.run(read_recording(BAGS / "sparkfun_razor.bag")).health
+    turned = navigator.run(read_recording(BAGS / "phidgets_imu_upside_down.bag")).health
+    assert shaken is not None
+    assert turned is not None
+    [warning] = [line for line in told(shaken) if line.startswith("!")]
+    assert "not to be trusted" in warning
+    assert not any("trusted" in line for line in told(turned))
