@@ -38,6 +38,7 @@ def test_every_example_is_tested_here():
         "train_own",
         "cluster",
         "replay_live",
+        "live_latency",
         "fine_tune",
         "streaming_onnx",
         "ros2_node",
@@ -69,6 +70,14 @@ def test_train_own_leaves_weights_that_predict(tmp_path):
     mean, covariance = model.predict(np.zeros((2, 6, 200)))
     assert mean.shape == (2, 3)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_live_latency_hears_of_each_position_within_a_second(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    measured = load("live_latency").main(phones=2, seconds=3.0)
+    assert len(measured.latencies) >= 8  # two seconds of events behind the first window
+    assert 0.0 < min(measured.latencies) < 1.0
+    assert measured.memory_mb > 50.0
 
 
 def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
