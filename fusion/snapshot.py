@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 8
+FORMAT, VERSION = "stario snapshot", 9
 
 
 @cache
@@ -52,6 +52,7 @@ def _classes() -> dict[str, type]:
         innovations,
         magnetic,
         map_frame,
+        sceptic,
         zero_velocity,
     )
     from stario.fusion.graph import builder, factors, fixed_lag, keyframes, whitening
@@ -70,6 +71,7 @@ def _classes() -> dict[str, type]:
             magnetic.MagneticReference,
             gyro_bias.GyroBiasPrior,
             accelerometer.AccelerometerWorth,
+            sceptic.Sceptic,
             ekf_state.Estimate,
             estimator_state.EstimatorState,
             estimator_state.Step,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
@@ -32,6 +34,8 @@ from stario.fusion.filter.innovations import (
 )
 from stario.fusion.filter.magnetic import MagneticReference, update_bearing
 from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
+from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
+from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
@@ -95,6 +99,7 @@ class Estimator:
         self._outlier_share = 0.5  # trust is to be earned
         self._bias_prior = GyroBiasPrior.first(max(f.gyro_bias_sigma, SMALLEST_SIGMA))
         self._accelerometer = AccelerometerWorth()
+        self._opinion = SecondOpinion(self.ekf)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -120,6 +125,8 @@ class Estimator:
         """
         interval = replace(interval, accel_factor=self._accelerometer.factor)
         self._remember(interval, displacement, fixes)
+        if interval.gap or fixes:
+            self._opinion.sceptic = None
         segment, accepted = self._propagate(interval, fixes)
         at_rest = self._update_zero_velocity(interval)
         # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
@@ -189,26 +196,40 @@ class Estimator:
         return None, accepted
 
     def _propagate_piece(self, interval: ImuInterval) -> Segment:
+        before = self.ekf.state.p_W
+        segment = self._opinion.both(lambda: self._propagate_samples(interval))
+        if interval.gap:
+            sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
+            self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
+            self._map_frame.lose_yaw(self.ekf)
+        return segment
+
+    def _propagate_samples(self, interval: ImuInterval) -> Segment:
         s = self.ekf.state
         segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
         self.ekf.propagate(segment)
-        if interval.gap:
-            sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
-            self.ekf.state = self.ekf.state.with_yaw_inflated(s.p_W, sigma, field_too=False)
-            self._map_frame.lose_yaw(self.ekf)
         return segment
 
     def _follow_gyro_bias_prior(self, interval: ImuInterval) -> None:
         """The bias's prior as it should be, by what gravity and the data tell of it by now."""
         s, P = self.ekf.state, self.ekf.P[GYRO_BIAS, GYRO_BIAS]
-        unknown = interval.levelled_bias_sigma if self._config.filter.adaptive else 0.0
-        wanted = self._bias_prior.wanted(interval.levelled_bias, unknown, s.b_g, P)
-        self._exchange_gyro_bias_prior(wanted)
+        if self._config.filter.adaptive:
+            levelled = interval.levelled_bias, interval.levelled_bias_sigma
+            wanted = self._bias_prior.wanted(*levelled, s.b_g, P, self._bias_wander)
+            self._exchange_gyro_bias_prior(wanted)
 
     def _exchange_gyro_bias_prior(self, wanted: GyroBiasPrior) -> None:
         """Everything as if it had been the prior from the start."""
-        self.ekf.exchange_gyro_bias_prior(self._bias_prior.variance, wanted.variance)
+        wander = self._bias_wander
+        old, new = self._bias_prior.variance + wander, wanted.variance + wander
+        self._opinion.both(lambda: self.ekf.exchange_gyro_bias_prior(old, new))
         self._bias_prior = wanted
+
+    @property
+    def _bias_wander(self) -> float:
+        """Variance by which the gyroscope's bias may have changed since the start."""
+        seconds = max(0.0, self.ekf.state.time - self._start)
+        return float(self._config.noise.gyro_walk**2 * seconds)
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self._map_frame.update(self.ekf, fix)
@@ -219,7 +240,7 @@ class Estimator:
         if not self._stillness.is_still(interval):
             return None
         measured = zero_velocity(self._stillness)
-        before = self.ekf.state, self._bias_prior
+        before = self.ekf.state, self._bias_prior, self._opinion.sceptic
         # Rest tells the bias, be it what it may.
         wide = max(self._bias_prior.variance, _BIAS_AT_REST**2)
         self._exchange_gyro_bias_prior(replace(self._bias_prior, variance=wide))
@@ -227,27 +248,19 @@ class Estimator:
         result = update_zero_velocity(self.ekf, measured, gate)
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
-            self.ekf.state, self._bias_prior = before
+            self.ekf.state, self._bias_prior, self._opinion.sceptic = before
             return None
+        self._opinion.sceptic = None
         return measured
 
     def _update_displacement(
         self, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
     ) -> Displacement | None:
         """Of the window that began with the oldest clone; as inflated, None where left out."""
-        assert interval.R_NB_window is not None  # a window comes with the attitude it started at
-        f, slot = self._config.filter, self._clones[0]
-        R_WN = yaw_rotation(self.ekf.state.clone_pose(slot)[0] @ interval.R_NB_window.T)
-        # What is not finite is the filter's to refuse and count.
-        with np.errstate(invalid="ignore"):
-            result = self.ekf.update_displacement(
-                slot,
-                None,
-                R_WN @ d_N,
-                R_WN @ (covariance_N * f.overlap_scale) @ R_WN.T,
-                chi2_quantile(f.gate, 3),
-                power=_RARE_POWER if self._outlier_share < _RARE else 1.0,
-            )
+        f, before = self._config.filter, self.ekf.state
+        rare = self._outlier_share < _RARE
+        power = _RARE_POWER if rare else 1.0
+        result = self._displace(interval, d_N, covariance_N, f.gate, power=power)
         late = 1.0 / (f.update_rate * _SHARE_SECONDS)
         self._outlier_share += late * (is_gated(result) - self._outlier_share)
         if f.adaptive:
@@ -255,21 +268,49 @@ class Estimator:
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
+        if self._opinion.sceptic is None and rare and is_gated(result):
+            self._opinion.sceptic = Sceptic(before, before.time)
+        elif result.accepted:
+            without = partial(self._displace, interval, d_N, covariance_N, SCEPTIC_GATE, "reject")
+            self._opinion.ask(lambda: without().accepted, not is_gated(result))
         return (d_N, result.scale * covariance_N) if result.accepted else None
+
+    def _displace(
+        self,
+        interval: ImuInterval,
+        d_N: FloatArray,
+        covariance_N: FloatArray,
+        gate: float,
+        gate_mode: GateMode = "inflate",
+        power: float = 1.0,
+    ) -> UpdateResult:
+        """The update of the filter as it stands."""
+        assert interval.R_NB_window is not None  # a window comes with the attitude it started at
+        slot = self._clones[0]
+        R_WN = yaw_rotation(self.ekf.state.clone_pose(slot)[0] @ interval.R_NB_window.T)
+        # What is not finite is the filter's to refuse and count.
+        with np.errstate(invalid="ignore"):
+            covariance_W = R_WN @ (covariance_N * self._config.filter.overlap_scale) @ R_WN.T
+            return self.ekf.update_displacement(
+                slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
+            )
 
     def _update_bearing(self, interval: ImuInterval) -> None:
         if interval.field_B is None or not self._magnetic.due(interval.stop):
             return
-        result, self._magnetic = update_bearing(self.ekf, self._magnetic, interval.field_B)
+        field_B = interval.field_B
+        result, self._magnetic = self._opinion.both(
+            lambda: update_bearing(self.ekf, self._magnetic, field_B)
+        )
         self._counts = self._counts.add_bearing(result)
 
     def _clone(self) -> None:
         if len(self._clones) < self.ekf.slots:
-            self._clones = (*self._clones, self.ekf.clone())
+            self._clones = (*self._clones, self._opinion.both(self.ekf.clone))
             return
         slot, *later = self._clones
         self.oldest = self.ekf.state.clone_estimate(slot, self.map_frame)
-        self._clones = (*later, self.ekf.clone(instead_of=slot))
+        self._clones = (*later, self._opinion.both(lambda: self.ekf.clone(instead_of=slot)))
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""
@@ -291,6 +332,7 @@ class Estimator:
             self._outlier_share,
             self._bias_prior,
             self._accelerometer,
+            self._opinion.sceptic,
             self._counts,
             self.in_gap,
             self.oldest,
@@ -303,6 +345,7 @@ class Estimator:
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
         self._magnetic, self._outlier_share, self._counts = s.magnetic, s.outlier_share, s.counts
         self._bias_prior, self._accelerometer = s.bias_prior, s.accelerometer
+        self._opinion.sceptic = s.sceptic
         self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
 
     @property

@@ -12,6 +12,7 @@ from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.map_frame import MapFrameState
+from stario.fusion.filter.sceptic import Sceptic
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval
@@ -59,6 +60,7 @@ class EstimatorState:
         outlier_share: of the displacements of late.
         bias_prior: of the gyroscope's bias, as it stands in the filter.
         accelerometer: what it is worth.
+        sceptic: the filter without the outliers of the last seconds, where there were some.
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
         oldest: the newest pose that left the window, corrected by all of it.
@@ -73,6 +75,7 @@ class EstimatorState:
     outlier_share: float
     bias_prior: GyroBiasPrior
     accelerometer: AccelerometerWorth
+    sceptic: Sceptic | None
     counts: UpdateCounts
     in_gap: bool
     oldest: Estimate | None

@@ -60,7 +60,12 @@ class GyroBiasPrior:
         return replace(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
 
     def wanted(
-        self, levelled: float, levelled_sigma: float, b_g: FloatArray, P: FloatArray
+        self,
+        levelled: float,
+        levelled_sigma: float,
+        b_g: FloatArray,
+        P: FloatArray,
+        wander: float = 0.0,
     ) -> GyroBiasPrior:
         """What the prior should be by now; to be put in place of this one in the filter.
 
@@ -69,23 +74,26 @@ class GyroBiasPrior:
             levelled_sigma: of it, per level axis [rad/s].
             b_g: (3,) the bias as the filter estimates it [rad/s].
             P: (3, 3) its covariance.
+            wander: variance by which it may have changed since the start [rad^2/s^2].
         """
         raw = max(self.raw, levelled - _CORRECTED)
-        evident = max(self.evident, min(self._asked(b_g, P), _WIDEST**2))
+        evident = max(self.evident, min(self._asked(b_g, P, wander), _WIDEST**2))
         known = self.sigma**2 + (_ALIKE * levelled_sigma) ** 2 + raw**2
         return GyroBiasPrior(self.sigma, max(known, evident), raw, evident)
 
-    def _asked(self, b_g: FloatArray, P: FloatArray) -> float:
+    def _asked(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
         """The variance that the data ask for.
 
-        With prior variance s^2 and posterior b, P they alone say y with covariance E:
-        E^-1 = P^-1 - s^-2 I, y = E P^-1 b; about each principal axis s^2 >= y^2 - (3 e)^2.
+        With prior variance s^2, wander w included, and posterior b, P they alone say y with
+        covariance E: E^-1 = P^-1 - s^-2 I, y = E P^-1 b; about each principal axis
+        s^2 >= y^2 - (3 e)^2.
         """
+        prior = self.variance + wander
         p, axes = np.linalg.eigh(P)
-        p = np.maximum(p, 1e-6 * self.variance)
-        precise = p < self.variance * _PRECISE**2 / (self.variance + _PRECISE**2)
+        p = np.maximum(p, 1e-6 * prior)
+        precise = p < prior * _PRECISE**2 / (prior + _PRECISE**2)
         if not precise.any():
             return 0.0
-        e = p[precise] * self.variance / (self.variance - p[precise])  # squares
+        e = p[precise] * prior / (prior - p[precise])  # squares
         y = (axes.T @ b_g)[precise] * e / p[precise]
-        return float(np.max(y**2 - _CLEARLY**2 * e))
+        return float(np.max(y**2 - _CLEARLY**2 * e)) - wander
