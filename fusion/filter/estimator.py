@@ -6,6 +6,7 @@ right-invariant error (Barrau and Bonnabel 2017).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -60,7 +61,7 @@ may itself be wrong. Some five seconds of false displacements are bridged so."""
 _BIAS_AT_REST = 2.5e-3
 """Of the gyroscope's bias where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
-_ROUNDING = 1e-9
+_ROUNDING = 1e-6
 """Of times [s]."""
 
 
@@ -133,8 +134,9 @@ class Estimator:
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
         self._update_bearing(interval)
-        if interval.update or interval.gap:
+        if interval.gap or self._halves(interval.stop) > self._halves(interval.start):
             self._follow_gyro_bias_prior(interval)
+        if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(interval, offered, taken, at_rest, accepted, segment)
 
@@ -209,6 +211,10 @@ class Estimator:
         segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
         self.ekf.propagate(segment)
         return segment
+
+    def _halves(self, time: float) -> int:
+        """Whole half seconds since the start: what is known of a bias changes no faster."""
+        return math.floor(2.0 * (time - self._start) + _ROUNDING)
 
     def _follow_gyro_bias_prior(self, interval: ImuInterval) -> None:
         """The bias's prior as it should be, by what gravity and the data tell of it by now."""

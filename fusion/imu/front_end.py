@@ -18,6 +18,7 @@ import math
 import statistics
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +208,7 @@ class FrontEnd:
         if len(before) > 1:
             table = np.array(before)
             flags = self._flag_outliers(table)
-            intervals.append(replace(_interval(table, self._attitude), flags=flags))
+            intervals.append(_interval(table, self._attitude, flags=flags))
         if sample[0] - before[-1][0] > LONG_GAP:
             self._attitude, self._before_long_gap = None, before[-1]
             self._next = -math.inf
@@ -258,7 +259,7 @@ class FrontEnd:
         # _cut() has counted this interval already.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._field_at(table[-1, 0])
-        interval = replace(_interval(table, attitude), update=update, flags=flags, field_B=field_B)
+        interval = _interval(table, attitude, update=update, flags=flags, field_B=field_B)
         self._window.append(self._block(interval))
         if not update or len(self._window) < self._blocks:
             return interval
@@ -305,7 +306,9 @@ def cut_recording(
     return intervals, front_end
 
 
-def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) -> ImuInterval:
+def _interval(
+    table: FloatArray, attitude: LevelledAttitude, gap: bool = False, **measured: Any
+) -> ImuInterval:
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:7]
     if gap and time[-1] - time[0] >= SHORT_GAP:
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
@@ -316,6 +319,7 @@ def _interval(table: FloatArray, attitude: LevelledAttitude, gap: bool = False) 
         *(time, gyro, accel, gap, attitudes, attitude.R_NB),
         levelled_bias=bias,
         levelled_bias_sigma=attitude.bias_sigma,
+        **measured,
     )
 
 
