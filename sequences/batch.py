@@ -32,7 +32,7 @@ class Skipped:
 def each(
     work: Callable[[Item], Result], items: Iterable[Item], jobs: int | None = None
 ) -> Iterator[Result | Skipped]:
-    """What `work` makes of each item, in the items' order, as soon as it is there.
+    """What `work` makes of each item, in the items' order, as soon as it is there (Ray: at the end).
 
     An item for which it raises a `StarioError` comes back as `Skipped`; any other exception is a
     bug and ends the batch.
@@ -43,8 +43,10 @@ def each(
         jobs: processes; -1 for one per core, None for what `joblib.parallel_config` says (1).
     """
     from joblib import Parallel, delayed
+    from joblib.parallel import get_active_backend
 
-    parallel = Parallel(n_jobs=jobs, return_as="generator")
+    one_by_one = get_active_backend()[0].supports_return_generator
+    parallel = Parallel(n_jobs=jobs, return_as="generator" if one_by_one else "list")
     yield from parallel(delayed(_attempt)(work, item) for item in items)
 
 

@@ -4,6 +4,7 @@ import os
 import time
 
 import pytest
+from joblib import parallel_config
 
 from stario.sequences.batch import Skipped, each
 from stario.sequences.errors import InputError
@@ -33,6 +34,16 @@ def test_results_come_one_by_one() -> None:
     assert next(results) == 0
     assert len(seen) < 10
     assert list(results) == list(range(1, 10))
+
+
+def double(number: int) -> int:
+    return 2 * number
+
+
+def test_a_backend_that_hands_out_nothing_before_the_end_works_too() -> None:
+    """As Ray's; joblib's own of the kind runs processes without loky."""
+    with parallel_config("multiprocessing"):
+        assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
 def test_a_bug_ends_the_batch() -> None:
