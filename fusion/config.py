@@ -7,6 +7,7 @@ is saved beside its results and can be given to the next run as it is.
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -54,6 +55,9 @@ class FilterConfig:
         adaptive: whether the accelerometer's density and the gyroscope bias's prior are first
             guesses that innovations and gravity correct; False where the device is known.
         magnetometer: whether a recording's or stream's magnetic field is used.
+        declination: of magnetic from true north, positive east [rad]. Where it is given, a track
+            whose direction nothing else tells is turned by its magnetic field, so that x points
+            east and y north; None leaves its first yaw zero.
     """
 
     update_rate: int = 2
@@ -69,6 +73,7 @@ class FilterConfig:
     stillness_noise: float = 2.0
     adaptive: bool = True
     magnetometer: bool = True
+    declination: float | None = None
 
     def __post_init__(self) -> None:
         if self.update_rate not in UPDATE_RATES:
@@ -76,8 +81,10 @@ class FilterConfig:
         if not 0.5 <= self.gate < 1.0:
             raise ConfigError("gate", repr(self.gate), "a probability from 0.5 to below 1")
         for item in fields(self):
-            if item.name not in ("update_rate", "magnetometer"):
+            if item.name not in ("update_rate", "magnetometer", "declination"):
                 check_number(self, item.name)
+        if self.declination is not None:
+            check_number(self, "declination", -math.pi, math.pi)
         if self.covariance_scale == 0.0:
             raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
 

@@ -32,7 +32,7 @@ class Skipped:
 def each(
     work: Callable[[Item], Result], items: Iterable[Item], jobs: int | None = None
 ) -> Iterator[Result | Skipped]:
-    """What `work` makes of each item, in the items' order, as soon as it is there (Ray: at the end).
+    """What `work` makes of each item, in order, as soon as it is there; with Ray in the end.
 
     An item for which it raises a `StarioError` comes back as `Skipped`; any other exception is a
     bug and ends the batch.

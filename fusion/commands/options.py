@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import typing
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
@@ -145,14 +146,25 @@ class Estimating:
         ),
     ] = True
 
+    declination: Annotated[
+        float | None,
+        typer.Option(
+            "--declination",
+            help="Of magnetic from true north, degrees east; the track's y then points north.",
+        ),
+    ] = None
+
     def settings(self) -> NavigatorConfig:
         """The filter's settings."""
         from stario.fusion.config import NavigatorConfig, read_config
 
         config = NavigatorConfig() if self.config is None else read_config(self.config)
-        if self.magnetometer:
-            return config
-        return replace(config, filter=replace(config.filter, magnetometer=False))
+        chosen = config.filter
+        if not self.magnetometer:
+            chosen = replace(chosen, magnetometer=False)
+        if self.declination is not None:
+            chosen = replace(chosen, declination=math.radians(self.declination))
+        return replace(config, filter=chosen)
 
     def network(self) -> DisplacementModel:
         """The network with its weights."""

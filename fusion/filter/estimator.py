@@ -33,7 +33,7 @@ from stario.fusion.filter.innovations import (
     is_gated,
     stacked,
 )
-from stario.fusion.filter.magnetic import MagneticReference, update_bearing
+from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
 from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
 from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
 from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
@@ -134,6 +134,7 @@ class Estimator:
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
         self._update_bearing(interval)
+        accepted += self._update_north()
         if interval.gap or self._halves(interval.stop) > self._halves(interval.start):
             self._follow_gyro_bias_prior(interval)
         if interval.update or interval.gap:
@@ -300,6 +301,18 @@ class Estimator:
             return self.ekf.update_displacement(
                 slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
             )
+
+    def _update_north(self) -> list[Accepted]:
+        """By what the magnetic field says of yaw, once, where it is asked and not known yet."""
+        declination = self._config.filter.declination
+        if declination is None or self._map_frame.state.oriented:
+            return []
+        fix = north_fix(self.ekf.state, self._magnetic, declination)
+        taken = None if fix is None else self._update_fix(fix)
+        if taken is None:
+            return []
+        self._opinion.sceptic = None  # its frame is no more
+        return [taken]
 
     def _update_bearing(self, interval: ImuInterval) -> None:
         if interval.field_B is None or not self._magnetic.due(interval.stop):

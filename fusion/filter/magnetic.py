@@ -7,7 +7,8 @@ README.md, "Magnetometer". Where the field points in the world is unknown, and i
 The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. Yaw and azimuth turn
 together unseen, so that yaw stays as unobservable as it was; its rate, the gyroscope's vertical
 bias, does not. A field whose size or dip is not the place's usual counts for less, and one that
-contradicts the rest is an outlier as any other.
+contradicts the rest is an outlier as any other. Only where a declination is given it says once
+where north is, as a fix of yaw.
 
 The field is slow and its errors alike for metres: two bearings a second are all there is to learn.
 """
@@ -22,7 +23,8 @@ import numpy as np
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.lie import FloatArray
+from stario.fusion.fixes import Fix, yaw_fix
+from stario.fusion.lie import FloatArray, yaw_twist
 from stario.sequences.chi_square import chi2_quantile
 
 PERIOD = 0.5
@@ -51,6 +53,12 @@ _LEAST_HORIZONTAL = 4.0
 
 _USUAL_SIZE, _USUAL_DIP = 0.05, 0.05
 """Deviations from the place's usual size (share) and dip [rad] that double the variance."""
+
+NORTH_SIGMA = 0.1
+"""Of the direction that magnetic north has on the average where somebody walks [rad]."""
+
+_NORTH_AFTER = 20
+"""Bearings from which on north is told: those of ten seconds."""
 
 _MEMORY = 120
 """Bearings that make the place's usual size and dip: a minute of them."""
@@ -86,6 +94,26 @@ class MagneticReference:
         size = self.size + share * min(max(size - self.size, -near), near)
         dip = self.dip + share * min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
         return MagneticReference(time, count, size, dip)
+
+
+def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
+    """The yaw of now in a frame with x east and y north; None where it is not known yet.
+
+    Magnetic north lies at pi/2 - declination there, and at c in the filter's world.
+
+    Args:
+        s: the filter's state.
+        reference: of the field so far.
+        declination: of magnetic from true north, positive east [rad].
+    """
+    yaw = yaw_twist(s.R_WB)
+    if s.field is None or reference.count < _NORTH_AFTER or not math.isfinite(yaw):
+        return None
+    c, P = s.first_field, s.P
+    variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
+    turn = math.pi / 2.0 - declination - s.field.azimuth
+    sigma = math.sqrt(max(variance, 0.0) + NORTH_SIGMA**2)
+    return yaw_fix(s.time, math.remainder(yaw + turn, 2.0 * math.pi), sigma)
 
 
 def first_field(s: EkfState, m_B: FloatArray) -> EkfState:

@@ -7,15 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import CONFIG, streamed_off
+from support import CONFIG, GRAPH, streamed_off
 
-from stario.fusion import Navigator, NavState
+from stario.fusion import Navigator, NavState, PriorPose
+from stario.fusion.backends import BackendName
+from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
 from stario.fusion.lie import exp_so3
 from stario.fusion.navigator import Navigator as Stream
+from stario.sequences.errors import ConfigError
+from stario.sequences.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -149,3 +153,41 @@ def test_switched_off_it_changes_nothing(biased_walk: ImuSequence, make_oracle: 
     blind = Navigator(oracle, CONFIG).run(replace(short, magnetometer=None))
     without = Navigator(oracle, off).run(short)
     np.testing.assert_array_equal(without.trajectory.position_W, blind.trajectory.position_W)
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_declination_turns_the_track_to_true_north(
+    biased_walk: ImuSequence, make_oracle: Make, backend: BackendName
+) -> None:
+    """All of it, from the first pose on; the field of this place points to 39 degrees."""
+    declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
+    settings = replace(GRAPH, filter=replace(GRAPH.filter, declination=declination))
+    walk = biased_walk.slice(0.0, 60.0)
+    oracle = make_oracle(walk, biased_walk.truth, settings, noise=0.05, sigma=0.05)
+    track = Navigator(oracle, settings, backend=backend).run(walk)
+    truth = walk.truth.at(track.time)
+    R = track.trajectory.attitude_WB * truth.attitude_WB.inv()
+    off = np.arctan2(*R.as_matrix()[:, [1, 0], 0].T)
+    sigma = np.sqrt(track.covariance[:, 2, 2])
+    assert 0.05 < sigma[-1] < 0.6
+    assert np.all(np.abs(off) < 3.0 * sigma[-1])
+    assert track.health.fixes == {"applied": 1}
+    before = Navigator(oracle, GRAPH, backend=backend).run(walk)
+    assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # the first yaw, without
+
+
+def test_north_is_not_told_where_the_direction_is_known(
+    biased_walk: ImuSequence, make_oracle: Make
+) -> None:
+    walk = biased_walk.slice(0.0, 20.0)
+    settings = replace(CONFIG, filter=replace(CONFIG.filter, declination=0.1))
+    oracle = make_oracle(walk, biased_walk.truth, settings)
+    known = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3))
+    track = Navigator(oracle, settings, prior=known).run(walk)
+    assert track.health.fixes == {}
+
+
+@pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
+def test_a_declination_is_an_angle(declination: Any) -> None:
+    with pytest.raises(ConfigError, match="declination"):
+        FilterConfig(declination=declination)
