@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS, Estimate, nav_states, smoothed_poses
-from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
@@ -30,20 +29,16 @@ from stario.fusion.filter.innovations import (
     UpdateCounts,
     counted,
     innovation_row,
-    is_gated,
     stacked,
 )
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
 from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
-from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
-from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
-from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
 from stario.sequences.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
@@ -52,11 +47,6 @@ from stario.sequences.windows import WINDOW_SECONDS
 GAP_TURN = 0.5
 """How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
 second and 0.36 to 0.7 per second over three in the training and validation recordings."""
-
-_RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
-"""While fewer than this share of the displacements of the last seconds were outliers they are the
-network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
-may itself be wrong. Some five seconds of false displacements are bridged so."""
 
 _BIAS_AT_REST = 2.5e-3
 """Of the gyroscope's bias where rest tells it, at least [rad/s]: a glide that turns is no rest."""
@@ -97,10 +87,9 @@ class Estimator:
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
         self._magnetic = MagneticReference()
-        self._outlier_share = 0.5  # trust is to be earned
         self._bias_prior = GyroBiasPrior.first(max(f.gyro_bias_sigma, SMALLEST_SIGMA))
-        self._accelerometer = AccelerometerWorth()
-        self._opinion = SecondOpinion(self.ekf)
+        self._displacements = DisplacementUpdates(self.ekf, f)
+        self._opinion = self._displacements.opinion
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -124,7 +113,7 @@ class Estimator:
             displacement: None where no window ends, or nothing is known of it.
             fixes: with times up to the interval's end that were not given before, in order.
         """
-        interval = replace(interval, accel_factor=self._accelerometer.factor)
+        interval = replace(interval, accel_factor=self._displacements.accelerometer.factor)
         self._remember(interval, displacement, fixes)
         if interval.gap or fixes:
             self._opinion.sceptic = None
@@ -264,43 +253,14 @@ class Estimator:
         self, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
     ) -> Displacement | None:
         """Of the window that began with the oldest clone; as inflated, None where left out."""
-        f, before = self._config.filter, self.ekf.state
-        rare = self._outlier_share < _RARE
-        power = _RARE_POWER if rare else 1.0
-        result = self._displace(interval, d_N, covariance_N, f.gate, power=power)
-        late = 1.0 / (f.update_rate * _SHARE_SECONDS)
-        self._outlier_share += late * (is_gated(result) - self._outlier_share)
-        if f.adaptive:
-            self._accelerometer = self._accelerometer.seen(result)
+        assert interval.R_NB_window is not None  # a window comes with the attitude it started at
+        result = self._displacements.update(
+            self._clones[0], interval.R_NB_window, d_N, covariance_N
+        )
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
-        if self._opinion.sceptic is None and rare and is_gated(result):
-            self._opinion.sceptic = Sceptic(before, before.time)
-        elif result.accepted:
-            without = partial(self._displace, interval, d_N, covariance_N, SCEPTIC_GATE, "reject")
-            self._opinion.ask(lambda: without().accepted, not is_gated(result))
         return (d_N, result.scale * covariance_N) if result.accepted else None
-
-    def _displace(
-        self,
-        interval: ImuInterval,
-        d_N: FloatArray,
-        covariance_N: FloatArray,
-        gate: float,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
-    ) -> UpdateResult:
-        """The update of the filter as it stands."""
-        assert interval.R_NB_window is not None  # a window comes with the attitude it started at
-        slot = self._clones[0]
-        R_WN = yaw_rotation(self.ekf.state.clone_pose(slot)[0] @ interval.R_NB_window.T)
-        # What is not finite is the filter's to refuse and count.
-        with np.errstate(invalid="ignore"):
-            covariance_W = R_WN @ (covariance_N * self._config.filter.overlap_scale) @ R_WN.T
-            return self.ekf.update_displacement(
-                slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
-            )
 
     def _update_north(self) -> list[Accepted]:
         """By what the magnetic field says of yaw, once, where it is asked and not known yet."""
@@ -348,9 +308,9 @@ class Estimator:
             self._map_frame.state,
             self._stillness.window,
             self._magnetic,
-            self._outlier_share,
+            self._displacements.outlier_share,
             self._bias_prior,
-            self._accelerometer,
+            self._displacements.accelerometer,
             self._opinion.sceptic,
             self._counts,
             self.in_gap,
@@ -362,15 +322,16 @@ class Estimator:
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._magnetic, self._outlier_share, self._counts = s.magnetic, s.outlier_share, s.counts
-        self._bias_prior, self._accelerometer = s.bias_prior, s.accelerometer
+        self._magnetic, self._bias_prior, self._counts = s.magnetic, s.bias_prior, s.counts
+        self._displacements.outlier_share = s.outlier_share
+        self._displacements.accelerometer = s.accelerometer
         self._opinion.sceptic = s.sceptic
         self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
 
     @property
     def accelerometer(self) -> AccelerometerWorth:
         """What it is worth, as the innovations tell."""
-        return self._accelerometer
+        return self._displacements.accelerometer
 
     @property
     def bias_prior(self) -> GyroBiasPrior:
@@ -417,4 +378,4 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """The report so far, with the sigmas of another estimator's state where one is given."""
         health = self._counts.health(counts, state or self.nav_state())
-        return replace(health, accel_noise_factor=self._accelerometer.factor)
+        return replace(health, accel_noise_factor=self._displacements.accelerometer.factor)

@@ -1,0 +1,87 @@
+"""The network's displacements into the filter, false ones among them. README.md, "Gates"."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from stario.fusion.config import FilterConfig
+from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.engine import GateMode, UpdateResult
+from stario.fusion.filter.innovations import is_gated
+from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
+from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
+from stario.fusion.lie import FloatArray, yaw_rotation
+from stario.sequences.chi_square import chi2_quantile
+
+_RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
+"""While fewer than this share of the displacements of the last seconds were outliers they are the
+network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
+may itself be wrong. Some five seconds of false displacements are bridged so."""
+
+
+class DisplacementUpdates:
+    """Takes displacements in, and follows what their innovations tell.
+
+    Args:
+        ekf: the filter.
+        config: its settings.
+
+    Attributes:
+        opinion: the filter without the outliers of the last seconds, beside it.
+        outlier_share: of the displacements of late.
+        accelerometer: what it is worth.
+    """
+
+    def __init__(self, ekf: StateCloningEkf, config: FilterConfig) -> None:
+        self._ekf, self._config = ekf, config
+        self.opinion = SecondOpinion(ekf)
+        self.outlier_share = 0.5  # trust is to be earned
+        self.accelerometer = AccelerometerWorth()
+
+    def update(
+        self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
+    ) -> UpdateResult:
+        """Take in the displacement of the window that ends now.
+
+        Args:
+            slot: of the clone at the window's start.
+            R_NB: (3, 3) levelled attitude there, that the window was prepared with.
+            d_N: (3,) [m].
+            covariance_N: (3, 3) [m^2].
+        """
+        f, before = self._config, self._ekf.state
+        rare = self.outlier_share < _RARE
+        update = partial(self._update, slot, R_NB, d_N, covariance_N)
+        result = update(f.gate, power=_RARE_POWER if rare else 1.0)
+        gated = is_gated(result)
+        late = 1.0 / (f.update_rate * _SHARE_SECONDS)
+        self.outlier_share += late * (gated - self.outlier_share)
+        if f.adaptive:
+            self.accelerometer = self.accelerometer.seen(result)
+        if self.opinion.sceptic is None and rare and gated:
+            self.opinion.sceptic = Sceptic(before, before.time)
+        elif result.accepted:
+            self.opinion.ask(lambda: update(SCEPTIC_GATE, "reject").accepted, not gated)
+        return result
+
+    def _update(
+        self,
+        slot: int,
+        R_NB: FloatArray,
+        d_N: FloatArray,
+        covariance_N: FloatArray,
+        gate: float,
+        gate_mode: GateMode = "inflate",
+        power: float = 1.0,
+    ) -> UpdateResult:
+        """Of the filter as it stands."""
+        R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
+        # What is not finite is the filter's to refuse and count.
+        with np.errstate(invalid="ignore"):
+            covariance_W = R_WN @ (covariance_N * self._config.overlap_scale) @ R_WN.T
+            return self._ekf.update_displacement(
+                slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
+            )
