@@ -44,6 +44,17 @@ def test_the_fusion_is_held_against_its_network(stario, recording: Path) -> None
     assert "carry" in refused.err
 
 
+def test_missing_samples_are_told_by_how_far_they_move_the_end(stario, recording: Path) -> None:
+    done = stario("check", "gaps", recording, "--json")
+    assert done.code == 0
+    found = json.loads(done.out)
+    assert len(found) == 7
+    assert all(one["recording"] == "walk" and one["metres"] >= 0.0 for one in found)
+    shown = stario("check", "gaps", recording)
+    assert "walk" not in shown.err
+    assert "within 1% and 3 deg" in shown.out
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
     walk = read_own_csv(recording)
