@@ -26,7 +26,9 @@ def faults(
             help="Let the network measure; else the true displacements under white noise do.",
         ),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the faults' draws.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of the faults' draws, and of the walk where none is given.")
+    ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Put faults into a recording, one by one, and print what each costs and what is reported."""
@@ -36,7 +38,7 @@ def faults(
     if path is not None:
         sequence = reading.read(path)
     else:
-        sequence, matched = matched_walk()
+        sequence, matched = matched_walk(seed=seed)
         settings = matched if estimating.config is None else settings
     results = run_faults(sequence, settings, estimating.network() if network else None, seed)
     if as_json:
