@@ -2,8 +2,9 @@
 
 `torchrun --nproc-per-node 2 --no-python stario train ...` starts the command twice and tells each
 process its number in the environment. Every process draws the same windows and takes its share of
-them; gradients are averaged, so that a step is that of one process with the whole batch, but for
-the batch norms, which see a share.
+them, of stretches between waypoints likewise where they share out evenly; gradients are averaged,
+so that a step is that of one process with the whole batch, but for the batch norms, which see a
+share, and for legs, which count alike within each.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ class _Run:
         begin = perf_counter()
         drawn = self.sampler.batch(self.config.batch // self.config.successive)
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
-        legs = [sampler.batch(size).to(self.device) for sampler, size in self.legs]
+        legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
         loss, error = self._loss(windows, target, legs)
         self.optimiser.zero_grad()

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from stario.network.training.augment import Augmentation, WindowSampler, heading_of, show
 from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
+from stario.network.training.parallel import Workers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray
@@ -64,6 +65,12 @@ class LegBatch:
     def to(self, device: torch.device) -> LegBatch:
         """The same on another device."""
         return LegBatch(**{name: value.to(device) for name, value in vars(self).items()})
+
+    def shared(self, among: Workers) -> LegBatch:
+        """One process's stretches; all of them where they cannot be shared out evenly."""
+        if len(self.known) % among.count:
+            return self
+        return LegBatch(**{name: among.share(value) for name, value in vars(self).items()})
 
 
 class LegSampler:

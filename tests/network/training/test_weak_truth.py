@@ -13,6 +13,7 @@ import torch
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.parallel import Workers
 from stario.network.training.train import train
 from stario.network.training.weak_truth import (
     LegBatch,
@@ -157,6 +158,15 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
     assert not ((cut.start < 30.0) & (cut.stop > 30.1)).any()
     ride = replace(recording, positions=PositionTrack(time, 9.0 * position, "positions"))
     assert leg_streams(ride) == []
+
+
+def test_two_processes_share_the_stretches_out_and_three_cannot() -> None:
+    batch, cpu = batch_of(known("positions", 0.1)), torch.device("cpu")
+    halves = [batch.shared(Workers(rank, 2, cpu)) for rank in (0, 1)]
+    for name, value in vars(batch).items():
+        parts = [getattr(half, name) for half in halves]
+        torch.testing.assert_close(torch.stack(parts, dim=1).flatten(0, 1), value)
+    assert batch.shared(Workers(1, 3, cpu)) is batch
 
 
 def test_a_recording_without_positions_has_no_legs() -> None:
