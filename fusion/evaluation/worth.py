@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.known_positions import position_error
+from stario.fusion.evaluation.known_positions import LEAST, position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -62,7 +62,7 @@ def worth_of(
     """Run a recording through the network alone and the back ends.
 
     Raises:
-        InputError: nothing is known of where it led, or it cannot be run.
+        InputError: nothing or too little is known of where it led, or it cannot be run.
     """
     known: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
     if known is None:
@@ -70,11 +70,18 @@ def worth_of(
     preprocessed = Navigator(model, config).observe(sequence)
     tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
     first = tracks[backends[0]]
+    network_m = _error(network_track(preprocessed), known)
+    if math.isnan(network_m):
+        raise InputError(
+            f"{sequence.name}: positions",
+            f"fewer than {LEAST} within the track",
+            f"{LEAST} or more",
+        )
     error, sigma = _yaw(first, sequence.truth)
     return Worth(
         sequence.name,
         group,
-        _error(network_track(preprocessed), known),
+        network_m,
         {name: _error(track, known) for name, track in tracks.items()},
         math.nan if first.nis is None else first.nis,
         error,

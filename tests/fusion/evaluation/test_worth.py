@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from support import CONFIG
 
@@ -41,3 +42,7 @@ def test_a_fusion_with_a_true_network_is_as_good_at_waypoints_as_at_poses(
 def test_without_truth_there_is_nothing_to_judge(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
         worth_of(still_model, replace(walk, truth=None), CONFIG, "walks")
+    # A mean over a group would be not-a-number for one tap within the track.
+    tapped = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
+    with pytest.raises(InputError, match="fewer than 2 within the track"):
+        worth_of(still_model, replace(walk, truth=None, positions=tapped), CONFIG, "walks")
