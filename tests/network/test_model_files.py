@@ -1,0 +1,108 @@
+"""Files of weights and their cards: whole ones load, spoilt ones are refused by name."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+import stario.network
+from stario.network.card import card_path
+from stario.network.model import load_model
+from stario.sequences.errors import StarioError, WeightsError
+
+DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetensors"
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A copy of the default weights and their card, to be spoilt."""
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(DEFAULT.read_bytes())
+    card_path(path).write_bytes(card_path(DEFAULT).read_bytes())
+    return path
+
+
+def spoil_card(path: Path, **values: object) -> None:
+    content = json.loads(card_path(path).read_text(encoding="utf-8"))
+    card_path(path).write_text(json.dumps(content | values), encoding="utf-8")
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(WeightsError) as caught:
+        load_model(path)
+    assert isinstance(caught.value, StarioError)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert str(path.parent) in text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("architecture", "ResNet99"),
+        ("architecture", ["StarIO"]),
+        ("sha256", "0" * 64),
+        ("sha256", 7),
+        ("outputs", 2),
+        ("rate", 100.0),
+        ("samples", 400),
+        ("frame", "body"),
+        ("channels", ["accel_x"]),
+        ("format", 2),
+        ("colour", "red"),
+        ("calibration", {"scale": [1.0, 1.0], "floor": [0.0, 0.0, 0.0]}),
+        ("calibration", {"scale": [1.0, 1.0, -1.0], "floor": [0.0, 0.0, 0.0]}),
+        ("calibration", {"tint": [1.0, 1.0, 1.0]}),
+        ("calibration", 1.0),
+    ],
+)
+def test_a_card_that_does_not_match_is_refused(model: Path, field: str, value: object) -> None:
+    spoil_card(model, **{field: value})
+    assert field in refused(model)
+
+
+def test_the_unspoilt_copy_loads(model: Path) -> None:
+    assert load_model(model).name == "StarIO"
+    assert load_model(str(model)).name == "StarIO"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"architecture": "StarIO"}', "\udcff"])
+def test_a_card_that_is_none_is_refused(model: Path, text: str) -> None:
+    card_path(model).write_bytes(text.encode(errors="surrogateescape"))
+    assert "card" in refused(model)
+
+
+def test_truncated_weights_are_refused(model: Path) -> None:
+    model.write_bytes(model.read_bytes()[:-100])
+    assert "cut short" in refused(model)
+
+
+@pytest.mark.parametrize("missing", ["weights", "card"])
+def test_a_missing_half_is_refused(model: Path, missing: str) -> None:
+    (model if missing == "weights" else card_path(model)).unlink()
+    assert "side by side" in refused(model)
+
+
+def with_state(path: Path, state: dict[str, torch.Tensor]) -> None:
+    """Other tensors under a card whose checksum is right."""
+    content = safetensors.torch.save(state)
+    path.write_bytes(content)
+    spoil_card(path, sha256=hashlib.sha256(content).hexdigest())
+
+
+@pytest.mark.parametrize("change", ["unknown", "missing", "shape", "none"])
+def test_tensors_of_another_network_are_refused(model: Path, change: str) -> None:
+    state = safetensors.torch.load_file(model)
+    if change == "unknown":
+        state["another.weight"] = torch.zeros(3)
+    elif change == "missing":
+        del state["head.7.bias"]
+    elif change == "shape":
+        state["head.7.bias"] = torch.zeros(2)
+    with_state(model, state if change != "none" else {})
+    found = {"unknown": "another.weight", "missing": "head.7.bias", "shape": "head.7.bias"}
+    assert found.get(change, "Missing") in refused(model)
