@@ -33,6 +33,9 @@ FixesOption = Annotated[
         help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or yaw.",
     ),
 ]
+ByOption = Annotated[
+    str, typer.Option(help="Group by set, or by an attribute such as person, device, carry.")
+]
 JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
 ]
@@ -150,6 +153,8 @@ class Estimating:
         float | None,
         typer.Option(
             "--declination",
+            min=-180.0,
+            max=180.0,
             help="Of magnetic from true north, degrees east; the track's y then points north.",
         ),
     ] = None

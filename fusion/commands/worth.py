@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import leave_with_skipped, print_json, result_of_each
-from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
+from stario.fusion.commands.options import ByOption, Estimating, JsonOption, Reading, grouped
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.worth import Worth
@@ -21,9 +21,7 @@ def fusion(
     paths: Annotated[list[Path], typer.Argument(help="Recordings, folders, archives or lists.")],
     reading: Reading,
     estimating: Estimating,
-    by: Annotated[
-        str, typer.Option(help="Group by set, or by an attribute such as person, device, carry.")
-    ] = "set",
+    by: ByOption = "set",
     graph: Annotated[bool, typer.Option("--graph", help="The graph as well; slower.")] = False,
     as_json: JsonOption = False,
 ) -> None:

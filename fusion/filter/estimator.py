@@ -208,11 +208,12 @@ class Estimator:
 
     def _follow_gyro_bias_prior(self, interval: ImuInterval) -> None:
         """The bias's prior as it should be, by what gravity and the data tell of it by now."""
-        s, P = self.ekf.state, self.ekf.P[GYRO_BIAS, GYRO_BIAS]
-        if self._config.filter.adaptive:
-            levelled = interval.levelled_bias, interval.levelled_bias_sigma
-            wanted = self._bias_prior.wanted(*levelled, s.b_g, P, self._bias_wander)
-            self._exchange_gyro_bias_prior(wanted)
+        if not self._config.filter.adaptive:
+            return
+        levelled = interval.levelled_bias, interval.levelled_bias_sigma
+        b_g, P = self.ekf.state.b_g, self.ekf.P[GYRO_BIAS, GYRO_BIAS]
+        wanted = self._bias_prior.wanted(*levelled, b_g, P, self._bias_wander)
+        self._exchange_gyro_bias_prior(wanted)
 
     def _exchange_gyro_bias_prior(self, wanted: GyroBiasPrior) -> None:
         """Everything as if it had been the prior from the start."""

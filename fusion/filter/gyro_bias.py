@@ -65,7 +65,7 @@ class GyroBiasPrior:
         levelled_sigma: float,
         b_g: FloatArray,
         P: FloatArray,
-        wander: float = 0.0,
+        wander: float,
     ) -> GyroBiasPrior:
         """What the prior should be by now; to be put in place of this one in the filter.
 

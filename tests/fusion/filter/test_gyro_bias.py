@@ -48,7 +48,7 @@ def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_covariance() -> None:
 
 def wanted(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0) -> GyroBiasPrior:
     P = np.diag([prior.variance, prior.variance, sigma**2])
-    return prior.wanted(levelled, 0.0, np.array([0.0, 0.0, b]), P)
+    return prior.wanted(levelled, 0.0, np.array([0.0, 0.0, b]), P, wander=0.0)
 
 
 def test_a_bias_that_the_data_tell_clearly_widens_it() -> None:
@@ -67,7 +67,7 @@ def test_what_is_vague_or_fits_leaves_it_alone(b: float, e: float) -> None:
 
 def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> None:
     first = GyroBiasPrior.first(1e-3)
-    nothing = np.zeros(3), first.variance * np.eye(3)
+    nothing = np.zeros(3), first.variance * np.eye(3), 0.0
     early = first.wanted(0.0, 1e-2, *nothing)
     late = early.wanted(0.0, 1e-3, *nothing)
     assert 3e-3 < np.sqrt(early.variance) < 6e-3
