@@ -38,6 +38,8 @@ class FilterConfig:
             which accounts for overlapping windows. Successive errors of the network are alike,
             so innovations are smaller than single errors; fitted to NIS and position NEES on the
             training and validation recordings, the latter unknown to the network then.
+        network_turn_sigma: by which what the network says of a minute or so is turned [rad]; a
+            state of its own once fixes tell the direction.
         gate: probability of the chi-square test; beyond it the covariance is inflated, at once: one
             left out lets the speed drift, which makes the next right one look false.
         tilt_sigma: of the first attitude when the device is moving [rad].
@@ -62,6 +64,7 @@ class FilterConfig:
 
     update_rate: int = 2
     covariance_scale: float = 0.5
+    network_turn_sigma: float = 0.05
     gate: float = 0.997
     tilt_sigma: float = 0.05
     yaw_sigma: float = 1e-3

@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 9
+FORMAT, VERSION = "stario snapshot", 10
 
 
 @cache
@@ -53,6 +53,7 @@ def _classes() -> dict[str, type]:
         magnetic,
         map_frame,
         sceptic,
+        seen_positions,
         zero_velocity,
     )
     from stario.fusion.graph import builder, factors, fixed_lag, keyframes, whitening
@@ -78,6 +79,7 @@ def _classes() -> dict[str, type]:
         ),
         continuous.ContinuousPose,
         *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
+        seen_positions.SeenPositions,
         *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
         *(keyframes.KeyframeGraph, whitening.Whitened, factors.KeyframeState),
         *factors.KINDS,

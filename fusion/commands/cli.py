@@ -13,13 +13,13 @@ import typer
 
 from stario.fusion.commands.backends import backends
 from stario.fusion.commands.benchmark import benchmark
+from stario.fusion.commands.by_group import fixes, fusion, gaps
 from stario.fusion.commands.compare import compare
 from stario.fusion.commands.consistency import consistency
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.faults import faults
-from stario.fusion.commands.gaps import gaps
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
 from stario.fusion.commands.models import models
@@ -27,7 +27,6 @@ from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
 from stario.fusion.commands.train import train
-from stario.fusion.commands.worth import fusion
 from stario.sequences.errors import StarioError
 
 app = typer.Typer(
@@ -41,7 +40,7 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, table, fusion, backends, faults, gaps, consistency, benchmark):
+for command in (models, table, fusion, backends, faults, gaps, fixes, consistency, benchmark):
     check.command()(command)
 app.add_typer(check, name="check")
 

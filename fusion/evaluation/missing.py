@@ -14,6 +14,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.groups import by_group
 from stario.fusion.evaluation.spoiling import drops, gap
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
@@ -98,9 +99,7 @@ def moved_table(found: Sequence[Moved]) -> str:
     """A row for each group: how many ends stay, and how far the others go."""
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
-    groups = list(dict.fromkeys(one.group for one in found))
-    parts = [(group, [one for one in found if one.group == group]) for group in groups]
-    for group, part in [*parts, ("all", list(found))] if len(groups) > 1 else parts:
+    for group, part in by_group(found):
         metres = np.array([one.metres for one in part])
         degrees = np.array([one.degrees for one in part])
         stay = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()

@@ -15,6 +15,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.groups import by_group
 from stario.fusion.evaluation.known_positions import LEAST, position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
@@ -96,9 +97,7 @@ def worth_table(found: Sequence[Worth]) -> str:
     for name in names:
         head += [f"{name} mean", "p95", "worst"]
     rows = [[*head, "NIS", "yaw deg", "< 3 sigma"]]
-    groups = list(dict.fromkeys(one.group for one in found))
-    parts = [(group, [one for one in found if one.group == group]) for group in groups]
-    for group, part in [*parts, ("all", list(found))] if len(groups) > 1 else parts:
+    for group, part in by_group(found):
         rows.append(_row(group, part, names))
     words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
     return "\n".join([*aligned(rows), words])

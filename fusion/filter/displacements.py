@@ -11,6 +11,7 @@ from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.innovations import is_gated
+from stario.fusion.filter.network_turn import wandered
 from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
 from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
 from stario.fusion.lie import FloatArray, yaw_rotation
@@ -78,10 +79,12 @@ class DisplacementUpdates:
         power: float = 1.0,
     ) -> UpdateResult:
         """Of the filter as it stands."""
+        f = self._config
+        self._ekf.state = wandered(self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma)
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # What is not finite is the filter's to refuse and count.
         with np.errstate(invalid="ignore"):
-            covariance_W = R_WN @ (covariance_N * self._config.overlap_scale) @ R_WN.T
+            covariance_W = R_WN @ (covariance_N * f.overlap_scale) @ R_WN.T
             return self._ekf.update_displacement(
                 slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
             )

@@ -28,11 +28,12 @@ from stario.fusion.filter.jacobians import (
     mean_velocity_jacobian,
     position_jacobian,
     propagated,
+    turn_jacobian,
     velocity_jacobian,
     yaw_jacobian,
 )
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import FloatArray, exp_times, yaw_twist
+from stario.fusion.lie import FloatArray, exp_so3, exp_times, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -63,7 +64,7 @@ class StateCloningEkf(ErrorStateEngine):
         zero = np.zeros(3)
         nothing = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
         self.state = EkfState.initial(nothing, slots)
-        super().__init__(CORE + CLONE * slots)
+        super().__init__(CORE + CLONE * slots + 1)
         self.gravity = gravity
         self.slots = slots
 
@@ -162,8 +163,9 @@ class StateCloningEkf(ErrorStateEngine):
 
         `d_W` is expressed in the filter's estimated world: the network saw the window rotated by
         the estimated attitude, so that the displacement carries the yaw error of clone i,
-        p_j - p_i = (I + theta_iz [e3]x) d + n. Nothing here is an Euler angle, so no attitude of
-        the device is singular, and the Jacobian times the yaw direction is exactly zero.
+        p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own turn. Nothing here is an
+        Euler angle, so no attitude of the device is singular, and the Jacobian times the yaw
+        direction is exactly zero.
 
         Args:
             slot_i: slot of the window's first pose.
@@ -182,10 +184,13 @@ class StateCloningEkf(ErrorStateEngine):
         self.state.time_of_clone(slot_i)
         if slot_j is not None:
             self.state.time_of_clone(slot_j)
-        X = self.state.X
+        X, turn_row = self.state.X, self.state.turn_row
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
         residual = d_W - (p_j - p_i)
+        if self.state.P[turn_row, turn_row] > 0.0:
+            residual = exp_so3(np.array([0.0, 0.0, -self.state.network_turn])) @ d_W - (p_j - p_i)
+            blocks.append(turn_jacobian(p_j - p_i, turn_row))
         return self.update_linear(residual, blocks, covariance, gate, gate_mode, power)
 
     def update_mean_velocity(
@@ -299,11 +304,12 @@ class StateCloningEkf(ErrorStateEngine):
         s, dx = self.state, self.x[:, 0]
         xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = dx[:9].reshape(3, 3)
-        xi[1:, ::2] = dx[CORE : s.first_field].reshape(self.slots, 2, 3)
+        xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
         X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
         field = None if s.field is None else _moved(s.field, dx[s.first_field :])
-        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, field=field)
+        turn = s.network_turn + float(dx[s.turn_row])
+        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
 
 

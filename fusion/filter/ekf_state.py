@@ -89,6 +89,8 @@ class EkfState:
         b_a: (3,) accelerometer bias [m/s^2].
         P: (n, n) covariance of the error state; zero for an empty slot.
         clone_times: [s], None for an empty slot.
+        network_turn: by which the network's displacements are turned to the left [rad]; known to be
+            zero until fixes tell the direction (`network_turn.py`).
         field: the magnetic field, None before the first was measured.
     """
 
@@ -99,6 +101,7 @@ class EkfState:
     b_a: FloatArray
     P: FloatArray
     clone_times: tuple[float | None, ...]
+    network_turn: float = 0.0
     field: FieldState | None = None
 
     @classmethod
@@ -107,7 +110,7 @@ class EkfState:
         origin_W = state.p_W if np.linalg.norm(state.p_W) > _FAR else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
-        P = np.zeros((CORE + CLONE * slots,) * 2)
+        P = np.zeros((CORE + CLONE * slots + 1,) * 2)
         P[:CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
         return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
 
@@ -136,9 +139,14 @@ class EkfState:
         return plain_covariance(self.P[:CORE, :CORE], self.X[0, :, 3:].T)
 
     @property
+    def turn_row(self) -> int:
+        """Row of the error of the network's turn."""
+        return CORE + CLONE * len(self.clone_times)
+
+    @property
     def first_field(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return CORE + CLONE * len(self.clone_times)
+        return self.turn_row + 1
 
     def time_of_clone(self, slot: int) -> float:
         """When a clone was taken [s].

@@ -82,7 +82,7 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
-        self._map_frame = MapFrame(prior is not None, oriented, f.gate)
+        self._map_frame = MapFrame(prior is not None, oriented, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )

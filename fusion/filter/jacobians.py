@@ -50,6 +50,11 @@ def displacement_jacobian(
     return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
 
 
+def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
+    """Jacobian of the same residual by the network's turn: e3 x d, d (3,) the displacement [m]."""
+    return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
+
+
 def mean_velocity_jacobian(
     v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
 ) -> list[Block]:

@@ -3,7 +3,8 @@
 A track that starts without a pose calls its first position zero and its first yaw zero. The first
 position fix moves this frame so that the track passes through the fix; what is known of the
 absolute position is then the fix's covariance. The first fix that tells the direction turns it
-about that point: a second position far enough away, a velocity, or a yaw. Neither is a small
+about that point: a second position far enough away, several nearer ones together, a velocity, or a
+yaw. Neither is a small
 correction, so neither goes through the filter's linearisation: the frame is transformed exactly
 (the right-invariant error turns with it), then the covariance is inflated as if nothing were known
 of this shift or turn, then the fix is an ordinary measurement (README.md, "Fixes").
@@ -23,6 +24,8 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform
+from stario.fusion.filter.network_turn import begun
+from stario.fusion.filter.seen_positions import SeenPositions
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import FloatArray, exp_so3, yaw_twist
 from stario.fusion.state import NavState
@@ -53,6 +56,7 @@ class MapFrameState:
         transforms: of the states given out.
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
+        seen: positions since it was placed, from the pivot, while its yaw is not known.
     """
 
     placed: bool
@@ -60,6 +64,7 @@ class MapFrameState:
     transforms: tuple[FrameTransform, ...] = ()
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
+    seen: SeenPositions = field(default_factory=SeenPositions)
 
 
 class MapFrame:
@@ -69,14 +74,15 @@ class MapFrame:
         placed: whether the first position was given.
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
+        turn_sigma: of the network's turn, `FilterConfig.network_turn_sigma` [rad].
 
     Attributes:
         state: what is known of the frame.
     """
 
-    def __init__(self, placed: bool, oriented: bool, gate: float) -> None:
+    def __init__(self, placed: bool, oriented: bool, gate: float, turn_sigma: float = 0.0) -> None:
         self.state = MapFrameState(placed, oriented)
-        self._gate = gate
+        self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         """Take in a fix at the filter's time."""
@@ -108,21 +114,36 @@ class MapFrame:
         left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
         sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
         ekf.state = ekf.state.with_position_inflated(sigma)
-        self.state = replace(self.state, placed=True, pivot=fix.value)
+        self.state = replace(self.state, placed=True, pivot=fix.value, seen=SeenPositions())
+        self._remember(ekf, fix)
         return transform
 
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
         """None where the fix does not tell the direction."""
         pivot, since = self.state.pivot, self.state.since
         turn, sigma = _turn(_nav_state(ekf), pivot, fix)
+        inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
         if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "yaw")):
-            return None
+            turn, inflation = self.state.seen.turn
+            self._remember(ekf, fix)
+            if fix.kind != "position" or inflation > FAR_ENOUGH:
+                return None
         R = exp_so3(np.array([0.0, 0.0, turn]))
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since)
         moved = ekf.state.transformed(transform.R, transform.shift)
-        ekf.state = moved.with_yaw_inflated(pivot, UNKNOWN_YAW)
-        self.state = replace(self.state, oriented=True)
+        ekf.state = moved.with_yaw_inflated(pivot, inflation)
+        self.state = replace(self.state, oriented=True, seen=SeenPositions())
         return transform
+
+    def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
+        if fix.kind != "position":
+            return
+        now, pivot = _nav_state(ekf), self.state.pivot
+        track, seen = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
+        variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
+        drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
+        seen_now = self.state.seen.and_one(track, seen, variance, drift)
+        self.state = replace(self.state, seen=seen_now)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
         """A transform with what is not known of it, by the state behind it."""
@@ -134,6 +155,8 @@ class MapFrame:
         )
 
     def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+        if self.state.oriented:
+            ekf.state = begun(ekf.state, self._turn_sigma)
         gate = chi2_quantile(self._gate, len(fix.value))
         if fix.kind == "position":
             return ekf.update_position_W(fix.value, fix.covariance, gate)
@@ -153,11 +176,14 @@ def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
     first, seen, ours = 3, fix.value, state.v_W
     if fix.kind == "position":
         first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
-    P = state.covariance
-    by_yaw = P[first : first + 2, 2]
-    # What of it comes from the yaw is what the fix is to tell.
-    P = P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2]
+    P = _without_yaw(state.covariance, first)
     arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
     across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
     turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
     return turn, across / arm if arm > 0.0 else math.inf
+
+
+def _without_yaw(P: FloatArray, first: int) -> FloatArray:
+    """Covariance (2, 2) of two rows, less what comes from the yaw: that is what fixes tell."""
+    by_yaw = P[first : first + 2, 2]
+    return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])

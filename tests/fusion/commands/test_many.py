@@ -55,6 +55,16 @@ def test_missing_samples_are_told_by_how_far_they_move_the_end(stario, recording
     assert "within 1% and 3 deg" in shown.out
 
 
+def test_tracks_with_fixes_are_judged(stario, recording: Path) -> None:
+    done = stario("check", "fixes", recording, "--every", "2", "--sigma", "0.1", "--json")
+    assert done.code == 0
+    (found,) = json.loads(done.out)
+    assert found["recording"] == "walk"
+    assert 0.0 < found["position_rms"] < 1.0
+    shown = stario("check", "fixes", recording, "--every", "2")
+    assert "yaw NEES" in shown.out
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
     walk = read_own_csv(recording)

@@ -65,7 +65,9 @@ def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> l
 
 def turned_by(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
     """What turning the world does to the filter's error state."""
-    return np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
+    turn = np.eye(ekf.dim_x)  # the network's own turn, the last, stays what it is
+    turn[:-1, :-1] = np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
+    return turn
 
 
 @pytest.fixture
@@ -142,7 +144,8 @@ def injected(dx: np.ndarray) -> StateCloningEkf:
     ekf = initialised(1)
     ekf.clone()
     ekf.P = np.eye(ekf.dim_x)
-    ekf.update_linear(dx, [(0, np.eye(ekf.dim_x))], 1e-14 * np.eye(ekf.dim_x))
+    n = len(dx)
+    ekf.update_linear(dx, [(0, np.eye(n))], 1e-14 * np.eye(n))
     return ekf
 
 
@@ -360,7 +363,7 @@ def test_displacements_carry_no_information_about_yaw_and_position(
     driven.release(newest)  # it equals the current pose, P has no inverse with it
     held = np.flatnonzero(np.diag(driven.P))
     N = np.zeros((driven.dim_x, 4))
-    for first, rho in ((0, 6), *((k, k + 3) for k in range(15, driven.dim_x, 6))):
+    for first, rho in ((0, 6), *((k, k + 3) for k in range(15, driven.state.turn_row, 6))):
         N[first + 2, 0] = 1.0
         N[rho : rho + 3, 1:] = np.eye(3)
     N = N[held]

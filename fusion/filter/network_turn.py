@@ -1,0 +1,40 @@
+"""By how much the network's displacements are turned, where fixes can tell it.
+
+README.md, "Fixes". How somebody carries the device turns all that the network says of a stretch by
+some degrees, alike for a minute or so. A filter that takes it for white noise soon claims to know
+the direction better than it does, once fixes tell it. So from the first fix on that is taken in
+with the direction known the turn is a Gauss-Markov state of its own. Without fixes nothing could
+tell turn and yaw apart, and a track in a frame of its own gains nothing from it: there it is zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from stario.fusion.filter.ekf_state import EkfState
+
+SECONDS = 60.0
+"""After which a turn is forgotten."""
+
+
+def begun(s: EkfState, sigma: float) -> EkfState:
+    """The state with a turn of which no more is known than its deviation [rad]."""
+    row = s.turn_row
+    if s.P[row, row] > 0.0 or sigma == 0.0:
+        return s
+    P = s.P.copy()
+    P[row, row] = sigma**2
+    return replace(s, P=P)
+
+
+def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
+    """The state after a time [s]; as it is where no turn has begun."""
+    row = s.turn_row
+    if s.P[row, row] == 0.0:
+        return s
+    kept, P = math.exp(-seconds / SECONDS), s.P.copy()
+    P[row] *= kept
+    P[:, row] *= kept
+    P[row, row] += (1.0 - kept**2) * sigma**2
+    return replace(s, P=P, network_turn=kept * s.network_turn)

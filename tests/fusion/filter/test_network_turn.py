@@ -1,0 +1,124 @@
+"""The network's turn: a state of its own once fixes tell the direction, nothing before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import GRAPH as CONFIG
+
+from stario.fusion import Navigator
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.fixed import fixed_track, true_fixes
+from stario.fusion.filter.jacobians import turn_jacobian
+from stario.fusion.filter.seen_positions import SeenPositions
+from stario.fusion.lie import exp_so3
+from stario.sequences.metrics import pose_errors
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+TURN = 0.12
+"""Of the network's displacements [rad]: seven degrees."""
+
+
+class Turned:
+    """A network that takes everything to be turned to the left."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner = inner
+
+    def predict(self, windows: Any) -> Any:
+        mean, covariance = self.inner.predict(windows)
+        return mean @ exp_so3(np.array([0.0, 0.0, TURN])).T, covariance
+
+
+def with_turn(sigma: float) -> NavigatorConfig:
+    return replace(CONFIG, filter=replace(CONFIG.filter, network_turn_sigma=sigma))
+
+
+def test_jacobian_agrees_with_finite_differences() -> None:
+    """What is measured of a true displacement grows with the turn."""
+    d, step = np.array([1.2, -0.7, 0.1]), 1e-6
+    row, H = turn_jacobian(d, 21)
+    assert row == 21
+    ends = [exp_so3(np.array([0.0, 0.0, s * step])) @ d for s in (1.0, -1.0)]
+    np.testing.assert_allclose(H[:, 0], (ends[0] - ends[1]) / (2.0 * step), atol=1e-9)
+
+
+def test_a_track_without_fixes_does_not_know_of_it(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    one, other = (Navigator(oracle, with_turn(sigma)).run(walk) for sigma in (0.05, 0.0))
+    np.testing.assert_array_equal(one.trajectory.position_W, other.trajectory.position_W)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_a_turned_network_does_not_make_the_yaw_overconfident(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """The fixes tell where the track leads; which part of the difference is whose, nothing does."""
+    walk = make_walk(11, 120.0)
+    model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
+    told, ignored = (
+        fixed_track(model, walk, with_turn(sigma), "walks", 3.0, 0.1) for sigma in (0.1, 0.0)
+    )
+    assert told.yaw_covered > 0.95
+    assert told.yaw_nees < 3.0
+    assert ignored.yaw_nees > 2.0 * told.yaw_nees
+
+
+def test_positions_too_near_for_one_to_tell_the_direction_tell_it_together(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    walk = make_walk(8, 60.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02)
+    farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
+    sigma = 0.4 * float(farthest.max())
+    fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
+    track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
+    counts = track.health.fixes
+    assert counts["yaw not known"] > 3
+    assert counts["applied"] > 10
+    yaw = pose_errors(track.trajectory, walk.truth).yaw[-1]
+    assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
+
+
+# --- the fit -------------------------------------------------------------------------------------
+
+
+def seen(rng: np.random.Generator, turn: float, count: int, sigma: float) -> SeenPositions:
+    """Of a walk in a room; every position's own noise in the fix."""
+    z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
+    noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)
+    fixed = np.exp(1j * turn) * z + (3.0 - 1.0j) + noise
+    positions = SeenPositions()
+    for a, b in zip(z, fixed, strict=True):
+        pair = np.array([a.real, a.imag]), np.array([b.real, b.imag])
+        positions = positions.and_one(*pair, sigma**2, 0.0)
+    return positions
+
+
+@pytest.mark.parametrize("count", [5, 20])
+def test_the_fit_is_as_good_as_it_says(count: int) -> None:
+    rng, errors = np.random.default_rng(0), []
+    for turn in rng.uniform(-np.pi, np.pi, 400):
+        found, sigma = seen(rng, turn, count, 0.3).turn
+        errors.append(np.angle(np.exp(1j * (found - turn))) / sigma)
+    assert 0.8 < np.mean(np.square(errors)) < 1.3
+
+
+def test_nothing_and_one_place_tell_no_direction() -> None:
+    assert SeenPositions().turn[1] == np.inf
+    here = SeenPositions()
+    for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
+        here = here.and_one(np.zeros(2), fix, 1.0, 0.0)
+    assert here.turn[1] > 10.0
+
+
+def test_a_track_that_drifted_since_counts_for_less() -> None:
+    steady = seen(np.random.default_rng(2), 0.5, 8, 0.3)
+    last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
+    kept, drifted = (steady.and_one(*last, 0.09, drift) for drift in (0.0, 5.0))
+    assert drifted.turn[1] > 2.0 * kept.turn[1]
