@@ -23,7 +23,7 @@ from stario.fusion.filter.estimator_state import (
     IntervalMeasurements,
     Step,
 )
-from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.filter.gyro_bias import GyroBiasPrior, told_of_bias
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
@@ -122,13 +122,13 @@ class Estimator:
         # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
-        self._update_bearing(interval)
+        bias_told = self._update_bearing(interval)
         accepted += self._update_north()
         if interval.gap or self._halves(interval.stop) > self._halves(interval.start):
             self._follow_gyro_bias_prior(interval)
         if interval.update or interval.gap:
             self._clone()
-        return IntervalMeasurements(interval, offered, taken, at_rest, accepted, segment)
+        return IntervalMeasurements(interval, offered, taken, bias_told, at_rest, accepted, segment)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Take in a fix at a time before now; None where it is more than a window late.
@@ -275,14 +275,16 @@ class Estimator:
         self._opinion.sceptic = None  # its frame is no more
         return [taken]
 
-    def _update_bearing(self, interval: ImuInterval) -> None:
+    def _update_bearing(self, interval: ImuInterval) -> tuple[FloatArray, FloatArray] | None:
+        """Returns what it told of the gyroscope's bias, and the covariance of that."""
         if interval.field_B is None or not self._magnetic.due(interval.stop):
-            return
-        field_B = interval.field_B
+            return None
+        field_B, before = interval.field_B, self.ekf.state
         result, self._magnetic = self._opinion.both(
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
         self._counts = self._counts.add_bearing(result)
+        return told_of_bias(before, self.ekf.state)
 
     def _clone(self) -> None:
         if len(self._clones) < self.ekf.slots:

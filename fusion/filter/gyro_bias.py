@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.lie import FloatArray
 from stario.sequences.levelling import BIAS_SIGMA
 
@@ -32,6 +33,10 @@ by, since their errors are alike for long. Rest, gravity, fixes and the magnetic
 
 _WIDEST = 0.015
 """To which data widen it [rad/s]; what lies outside is raw, which levelling tells sooner."""
+
+
+_LEAST_GAIN, _UNTOLD = 1e-6, 1.0
+"""Share of the information by which an update must add to it; sigma along axes untold [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -97,3 +102,22 @@ class GyroBiasPrior:
         e = p[precise] * prior / (prior - p[precise])  # squares
         y = (axes.T @ b_g)[precise] * e / p[precise]
         return float(np.max(y**2 - _CLEARLY**2 * e)) - wander
+
+
+def told_of_bias(before: EkfState, after: EkfState) -> tuple[FloatArray, FloatArray] | None:
+    """What an update told of the gyroscope's bias, whatever it measured.
+
+    The information that the bias alone has gained by it: E^-1 = P+^-1 - P-^-1 with the mean
+    E (P+^-1 b+ - P-^-1 b-), along the axis that has gained most of it.
+
+    Returns:
+        (3,) [rad/s] and covariance (3, 3); None where nothing was gained.
+    """
+    was, now = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
+    gained, axes = np.linalg.eigh(now - was)
+    most, axis = float(gained[-1]), axes[:, -1]
+    if most < _LEAST_GAIN * float(np.trace(was)):
+        return None
+    told = float(axis @ (now @ after.b_g - was @ before.b_g)) / most
+    covariance = np.outer(axis, axis) / most + _UNTOLD**2 * (np.eye(3) - np.outer(axis, axis))
+    return told * axis, covariance

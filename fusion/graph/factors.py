@@ -276,7 +276,7 @@ class Yaw:
 
 @dataclass(frozen=True, eq=False)
 class GyroBias:
-    """The gyroscope's bias, read while the device zero_velocity.
+    """The gyroscope's bias, as rest, a prior or the magnetic field tells it.
 
     Attributes:
         k: keyframe.

@@ -1,8 +1,9 @@
 """The fixed-lag graph for streams: the last seconds optimised anew at every keyframe.
 
 What leaves the lag is marginalised. The filter runs alongside: it judges what is measured for both
-(`GraphBuilder`), and the stream goes on from the filter's state where the graph does not determine
-its own, or where a late fix has changed what was judged.
+(`GraphBuilder`) and tells the graph what the magnetic field says of the gyroscope; the stream goes
+on from the filter's state where the graph does not determine its own, or where a late fix has
+changed what was judged.
 """
 
 from __future__ import annotations
@@ -92,6 +93,8 @@ class FixedLagEstimator:
         if self._stale or interval.anew is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
+        if taken.bias_told is not None:
+            self._tell_gyro_bias(*taken.bias_told)
         near = [self._near(accepted) for accepted in taken.fixes]
         if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
@@ -161,9 +164,12 @@ class FixedLagEstimator:
         variance = self._filter.bias_prior.variance
         if variance < _NARROWER * self._bias_prior:
             more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
-            graph = self._builder.graph
-            graph.add(GyroBias(graph.last, np.zeros(3), more * np.eye(3)), gated=False)
+            self._tell_gyro_bias(np.zeros(3), more * np.eye(3))
             self._bias_prior = variance
+
+    def _tell_gyro_bias(self, b_g: FloatArray, covariance: FloatArray) -> None:
+        graph = self._builder.graph
+        graph.add(GyroBias(graph.last, b_g, covariance), gated=False)
 
     def _near(self, accepted: Accepted) -> Fix:
         """A fix as the filter inflated it, from the graph's origin."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.filter.gyro_bias import GyroBiasPrior, told_of_bias
 from stario.fusion.state import NavState
 
 
@@ -74,3 +74,24 @@ def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> Non
     assert np.sqrt(late.variance) < 1.2e-3
     raw = late.wanted(0.05, 1e-3, *nothing).wanted(0.02, 1e-3, *nothing)
     assert np.sqrt(raw.variance) > 0.03
+
+
+def test_what_a_measurement_of_the_bias_told_is_that_measurement() -> None:
+    ekf = ekf_with_rates_measured(1e-3)
+    before, axis, sigma = ekf.state, np.array([[0.6, 0.0, 0.8]]), 3e-4
+    off = np.array([5e-3]) - axis @ before.b_g
+    ekf.update_linear(off, [(9, axis)], np.array([[sigma**2]]))
+    told = told_of_bias(before, ekf.state)
+    assert told is not None
+    mean, covariance = told
+    np.testing.assert_allclose(mean, 5e-3 * axis[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(axis @ covariance @ axis.T, sigma**2, rtol=1e-6)
+
+
+def test_what_says_nothing_of_the_bias_tells_nothing() -> None:
+    ekf = StateCloningEkf(slots=0)
+    zero = np.zeros(3)
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))
+    before = ekf.state
+    ekf.update_position_W(np.ones(3), 0.01 * np.eye(3))
+    assert told_of_bias(before, ekf.state) is None

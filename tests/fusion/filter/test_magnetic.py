@@ -118,6 +118,17 @@ def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
     return abs(math.remainder(ends[1] - ends[0], 2.0 * math.pi))
 
 
+def pushed(navigator: Stream, sequence: ImuSequence) -> list[NavState]:
+    """The states of a stream of both sensors."""
+    states, fields = [], sequence.magnetometer
+    waiting = list(zip(fields.time.tolist(), fields.field, strict=True)) if fields else []
+    for row in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
+        while waiting and waiting[0][0] <= row[0]:
+            navigator.push_magnetometer(*waiting.pop(0))
+        states.append(navigator.push(*row))
+    return [s for s in states if s is not None]
+
+
 def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Make) -> None:
     """In a stream as in a batch; without it the yaw drifts, a magnet beside the device is found."""
     oracle = make_oracle(biased_walk, biased_walk.truth, CONFIG, noise=0.1, sigma=0.1)
@@ -128,15 +139,24 @@ def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Mak
     assert track.health.bearings["applied"] > 200
     assert blind.health.bearings == {}
 
-    navigator, states, fields = Stream(oracle, CONFIG), [], biased_walk.magnetometer
-    waiting = list(zip(fields.time.tolist(), fields.field, strict=True))
-    for row in zip(biased_walk.time, biased_walk.gyro, biased_walk.accel, strict=True):
-        while waiting and waiting[0][0] <= row[0]:
-            navigator.push_magnetometer(*waiting.pop(0))
-        states.append(navigator.push(*row))
-    states = [s for s in states if s is not None]
+    states = pushed(Stream(oracle, CONFIG), biased_walk)
     assert streamed_off(states, track) < 1e-6
     assert last_yaw_error(states, biased_walk) < math.radians(20.0)
+
+
+def test_a_streams_graph_knows_the_bias_as_its_filter_does(
+    biased_walk: ImuSequence, make_oracle: Make
+) -> None:
+    config = replace(GRAPH, filter=replace(GRAPH.filter, gyro_bias_sigma=1e-2))
+    oracle = make_oracle(biased_walk, biased_walk.truth, config, noise=0.1, sigma=0.1)
+    filtered = pushed(Stream(oracle, config), biased_walk)[-1]
+    told, untold = (
+        pushed(Stream(oracle, config, backend="graph"), replace(biased_walk, magnetometer=field))[
+            -1
+        ]
+        for field in (biased_walk.magnetometer, None)
+    )
+    assert abs(told.b_g[2] - filtered.b_g[2]) < 0.2 * abs(untold.b_g[2] - filtered.b_g[2])
 
 
 def test_what_is_no_field_is_dropped_and_counted(still_model: Any) -> None:
