@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
     Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
 
-PathsArgument = Annotated[
+RecordingsArgument = Annotated[
     list[Path], typer.Argument(help="Recordings, folders, archives or lists.")
 ]
 
 
 @grouped
 def fusion(
-    paths: PathsArgument,
+    paths: RecordingsArgument,
     reading: Reading,
     estimating: Estimating,
     by: ByOption = "set",
@@ -50,7 +50,7 @@ def fusion(
 
 @grouped
 def fixes(
-    paths: PathsArgument,
+    paths: RecordingsArgument,
     reading: Reading,
     estimating: Estimating,
     every: Annotated[float, typer.Option(min=0.1, help="Seconds between two fixes.")] = 5.0,
@@ -73,7 +73,7 @@ def fixes(
 
 @grouped
 def gaps(
-    paths: PathsArgument,
+    paths: RecordingsArgument,
     reading: Reading,
     estimating: Estimating,
     by: ByOption = "set",
