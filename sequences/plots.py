@@ -8,18 +8,36 @@ slow to import.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stario.sequences.boxes import box_of, excess, frame_around, rounds, size_of
 from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.drawing import (
+    ABOVE_LEFT,
+    ABOVE_RIGHT,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LEGEND,
+    ORANGE,
+    RED,
+    SKY,
+    broken,
+    distance,
+    draw_dots,
+    draw_path,
+    draw_samples,
+    new_figure,
+    panels_of,
+    reach_of,
+    style_of,
+)
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_write
 from stario.sequences.metrics import PoseErrors, pose_errors
 from stario.sequences.sequence import (
-    MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     BoolArray,
     FloatArray,
@@ -32,36 +50,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
-_BLUE, _ORANGE, _GREEN, _PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
-_RED, _SKY, _GREY, _INK = "#D55E00", "#56B4E9", "#999999", "#333333"
-TRACK_STYLES = {
-    "inertial": ("inertial", _GREY),
-    "network": ("network", _ORANGE),
-    "network_true_attitude": ("network, true attitude", _GREEN),
-    "ekf": ("EKF", _BLUE),
-    "graph": ("factor graph", _PINK),
-}
-_SPARE_COLOURS = (_RED, _SKY, "#7F5539", "#6A4C93")
-_AXIS_COLOURS = (_BLUE, _ORANGE, _GREEN)
-_LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
-_ABOVE_LEFT = {**_LEGEND, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "ncols": 3}
-_ABOVE_RIGHT = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4}
-_DPI = 150
+_AXIS_COLOURS = (BLUE, ORANGE, GREEN)
 _CLIP_FACTOR = 3.0
-_MAX_SAMPLES = 3000
-_BLOCKS = 600
 _CROWDED = 12.0  # rounds from which lines are drawn finer
-
-
-def save_figure(fig: Figure, path: Path | str) -> None:
-    """Write a figure as PNG, whole or not at all.
-
-    Raises:
-        InputError: the folder does not exist.
-    """
-    with atomic_write(path, "wb") as file:
-        fig.savefig(file, format="png", dpi=_DPI)
 
 
 def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title: str) -> Figure:
@@ -79,10 +70,8 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     Raises:
         InputError: there is nothing to draw.
     """
-    paths = {name: _broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
-    path_truth = (
-        None if truth is None else _broken(truth.time, truth.position_W[:, :2], truth.valid)
-    )
+    paths = {name: broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
+    path_truth = None if truth is None else broken(truth.time, truth.position_W[:, :2], truth.valid)
     boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
     if path_truth is not None and np.isfinite(path_truth[1]).any():
         typical = path_truth[1]
@@ -96,21 +85,21 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
     near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
     frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
-    fig = _figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
-    (axes,) = _panels(fig)
+    fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
+    (axes,) = panels_of(fig)
     fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
     if path_truth is not None:
-        _draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
+        draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
-        label, colour = _style(name, k)
+        label, colour = style_of(name, k)
         far = excess(box, home)
         if far > 0.5 * size_of(home):
-            label += f" (leaves the figure, by {_distance(far)})"
-        _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+            label += f" (leaves the figure, by {distance(far)})"
+        draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.plot([], [], "o", mfc="white", mec=_INK, label="start")
-    axes.plot([], [], "s", mfc=_INK, mec="white", label="end")
-    fig.legend(loc="outside lower center", ncols=3, **_LEGEND)
+    axes.plot([], [], "o", mfc="white", mec=INK, label="start")
+    axes.plot([], [], "s", mfc=INK, mec="white", label="end")
+    fig.legend(loc="outside lower center", ncols=3, **LEGEND)
     return fig
 
 
@@ -133,25 +122,25 @@ def error_over_time(
     largest = {name: float(norm.max()) for name, norm in norms.items()}
     typical = sorted(largest.values())[(len(largest) - 1) // 2]
     good = [name for name in tracks if largest[name] <= _CLIP_FACTOR * max(typical, 0.1)]
-    fig = _figure(9.0, 9.0, title)
-    panels = _panels(fig, 1.7, 1, 1, 1)
+    fig = new_figure(9.0, 9.0, title)
+    panels = panels_of(fig, 1.7, 1, 1, 1)
     for k, name in enumerate(tracks):
-        label, colour = _style(name, k)
+        label, colour = style_of(name, k)
         if name not in good:
-            label += f" (leaves the figure, up to {_distance(largest[name])})"
-        time, norm = _broken(errors[name].estimate.time, norms[name][:, None])
+            label += f" (leaves the figure, up to {distance(largest[name])})"
+        time, norm = broken(errors[name].estimate.time, norms[name][:, None])
         panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
     panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
     panels[0].set_ylabel("horizontal error [m]")
     stated = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
     for k, name in enumerate(tracks):
         if name in (stated or good):
-            _draw_axis_errors(panels[1:], errors[name], *_style(name, k))
+            _draw_axis_errors(panels[1:], errors[name], *style_of(name, k))
     panels[-1].set_xlabel("time [s]")
     fig.align_ylabels()
-    panels[0].legend(**_ABOVE_LEFT)
+    panels[0].legend(**ABOVE_LEFT)
     if stated:
-        panels[1].legend(**_ABOVE_LEFT)
+        panels[1].legend(**ABOVE_LEFT)
     return fig
 
 
@@ -186,14 +175,14 @@ def innovations(
         if np.shape(value) != shape or m == 0:
             raise InputError(name, f"shape {np.shape(value)}", f"{shape}, with at least one update")
     gated = np.asarray(gated, dtype=np.bool_)
-    fig = _figure(9.0, 9.0, title)
-    panels = _panels(fig, 1, 1, 1, 1.3)
+    fig = new_figure(9.0, 9.0, title)
+    panels = panels_of(fig, 1, 1, 1, 1.3)
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
-        band_time, band = _broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
-        axes.fill_between(band_time, -band[:, 0], band[:, 0], color=_BLUE, alpha=0.15, lw=0)
-        reach = _reach(residual[~gated, k], 3 * sigma[:, k])
+        band_time, band = broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
+        axes.fill_between(band_time, -band[:, 0], band[:, 0], color=BLUE, alpha=0.15, lw=0)
+        reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
         # A gated residual can be huge: marked at the edge, it leaves the others their room.
-        _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
+        draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
         axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
     panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
     _draw_nis(panels[3], time, nis, dof, gated)
@@ -228,85 +217,34 @@ def imu_overview(
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     count = 2 + (rotation is not None) + (sequence.truth is not None)
-    fig = _figure(9.0, 2.0 + 2.0 * count, f"IMU of {sequence.name}")
-    panels = _panels(fig, *([1] * count))
-    _draw_samples(panels[1], time, np.linalg.norm(accel, axis=1), "norm", _GREY)
+    fig = new_figure(9.0, 2.0 + 2.0 * count, f"IMU of {sequence.name}")
+    panels = panels_of(fig, *([1] * count))
+    draw_samples(panels[1], time, np.linalg.norm(accel, axis=1), "norm", GREY)
     for axes, values in ((panels[0], gyro), (panels[1], accel)):
         for k, axis in enumerate("xyz"):
-            _draw_samples(axes, time, values[:, k], axis, _AXIS_COLOURS[k])
-    panels[1].axhline(STANDARD_GRAVITY, color=_INK, lw=0.9, ls="--", label="gravity")
+            draw_samples(axes, time, values[:, k], axis, _AXIS_COLOURS[k])
+    panels[1].axhline(STANDARD_GRAVITY, color=INK, lw=0.9, ls="--", label="gravity")
     panels[0].set_ylabel("angular rate [rad/s]")
     panels[1].set_ylabel("specific force [m/s$^2$]")
     if rotation is not None:
-        panels[2].plot(*rotation, color=_GREY, lw=0.8, label="truth")
-        _draw_samples(panels[2], time, np.linalg.norm(gyro, axis=1), "gyroscope", _BLUE)
-        panels[2].set(ylabel="rotation [rad/s]", ylim=(0, _reach(np.linalg.norm(gyro, axis=1))))
+        panels[2].plot(*rotation, color=GREY, lw=0.8, label="truth")
+        draw_samples(panels[2], time, np.linalg.norm(gyro, axis=1), "gyroscope", BLUE)
+        panels[2].set(ylabel="rotation [rad/s]", ylim=(0, reach_of(np.linalg.norm(gyro, axis=1))))
     for k, (start, stop) in enumerate(rest):
-        panels[1].axvspan(start, stop, color=_SKY, alpha=0.3, lw=0, label="" if k else "at rest")
+        panels[1].axvspan(start, stop, color=SKY, alpha=0.3, lw=0, label="" if k else "at rest")
     for k, (start, stop) in enumerate(gaps):
         for axes in panels[:2]:
-            axes.axvspan(start, stop, color=_RED, alpha=0.5, lw=1, label="" if k else "gap")
+            axes.axvspan(start, stop, color=RED, alpha=0.5, lw=1, label="" if k else "gap")
     for axes in panels[: 2 + (rotation is not None)]:
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **LEGEND)
     if sequence.truth is not None:
         ticks, speed = _speed(sequence.truth)
         panels[-1].plot(ticks, speed, color="black", lw=1.0)
-        panels[-1].set(ylabel="true speed [m/s]", ylim=(0, _reach(speed)))
+        panels[-1].set(ylabel="true speed [m/s]", ylim=(0, reach_of(speed)))
     panels[-1].set_xlabel("time [s]")
     fig.align_ylabels()
     panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)
     return fig
-
-
-def _figure(width: float, height: float, title: str) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(fig)
-    fig.suptitle(title, fontsize=13, color=_INK, x=0.02, ha="left")
-    return fig
-
-
-def _panels(fig: Figure, *heights: float) -> list[Axes]:
-    """Panels above each other with these relative heights and one abscissa; one without any."""
-    ratios = heights or (1,)
-    panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color(_GREY)
-        axes.tick_params(colors=_INK, labelsize=9)
-        axes.grid(color="#E6E6E6", lw=0.7)
-        axes.set_axisbelow(True)
-        axes.margins(x=0.01)
-    return list(panels)
-
-
-def _style(name: str, index: int) -> tuple[str, str]:
-    """Legend text and colour of a track; unknown names take spare colours by their position."""
-    return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
-
-
-def _broken(
-    time: FloatArray,
-    values: FloatArray,
-    valid: BoolArray | None = None,
-    max_gap: float = MAX_TRUTH_GAP,
-) -> tuple[FloatArray, FloatArray]:
-    """The valid rows of time (N,) and values (N, k), with a row of nan in each gap.
-
-    A gap is longer than `max_gap` [s] and than three usual steps.
-    """
-    if valid is not None:
-        time, values = time[valid], values[valid]
-    steps = np.diff(time)
-    if len(steps) == 0:
-        return time, values
-    gaps = np.flatnonzero(steps > max(max_gap, 3 * float(np.median(steps)))) + 1
-    return (
-        np.insert(time, gaps, 0.5 * (time[gaps] + time[gaps - 1])),
-        np.insert(values, gaps, np.nan, axis=0),
-    )
 
 
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
@@ -321,28 +259,13 @@ def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     return ticks[:-1] + step / 2, np.where(known, speed, np.nan)
 
 
-def _distance(metres: float) -> str:
-    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
-
-
-def _draw_path(
-    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
-) -> None:
-    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
-    known = path[np.isfinite(path).all(axis=1)]
-    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
-    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
-
-
 def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
     time = errors.estimate.time
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
-        axes.plot(
-            *_broken(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label
-        )
+        axes.plot(*broken(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label)
         if errors.estimate.position_covariance_W is not None:
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
-            band_time, band = _broken(time, 3 * sigma[:, None])
+            band_time, band = broken(time, 3 * sigma[:, None])
             axes.fill_between(
                 band_time,
                 -band[:, 0],
@@ -355,36 +278,11 @@ def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour
         axes.set_ylabel(f"error in {axis} [m]")
 
 
-def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
-    axes.plot(time[~gated], value[~gated], ".", color=_BLUE, ms=3, label="used")
-    # An empty line has no extent; unclipped, it would leave the layout without any bounds.
-    clipped = not gated.any()
-    axes.plot(time[gated], value[gated], "x", color=_RED, ms=5, label="gated", clip_on=clipped)
-
-
-def _draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
-    """A curve through the samples; through block means, within their extremes, if they are many."""
-    block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)
-    starts = np.arange(0, len(time), block)
-    mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
-    extremes = [ufunc.reduceat(value, starts) for ufunc in (np.minimum, np.maximum)]
-    ticks, curves = _broken(time[starts], np.column_stack([mean, *extremes]))
-    axes.plot(ticks, curves[:, 0], color=colour, lw=0.8, label=label)
-    if block > 1:
-        axes.fill_between(ticks, curves[:, 1], curves[:, 2], color=colour, alpha=0.3, lw=0.4)
-
-
-def _reach(*values: FloatArray) -> float:
-    """A little more than the largest finite magnitude."""
-    finite = np.abs(np.concatenate([value[np.isfinite(value)] for value in values]))
-    return 1.1 * float(finite.max(initial=0.0)) or 1.0
-
-
 def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
     low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
-    _draw_dots(axes, time, np.maximum(nis, low), gated)
-    axes.axhline(dof, color=_INK, lw=1.0, label=f"expected {dof}")
-    axes.axhline(bound, color=_INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
+    draw_dots(axes, time, np.maximum(nis, low), gated)
+    axes.axhline(dof, color=INK, lw=1.0, label=f"expected {dof}")
+    axes.axhline(bound, color=INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
     axes.set_yscale("log")
     axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
     axes.set_ylabel("NIS [1]")
@@ -393,4 +291,4 @@ def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: Bo
         loc="left",
         fontsize=10,
     )
-    axes.legend(**_ABOVE_RIGHT)
+    axes.legend(**ABOVE_RIGHT)

@@ -34,7 +34,7 @@ _AGAINST = "R-ResNet"
 
 def write_table(folder: Path, table: NetworkTable) -> list[Path]:
     """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
-    from stario.sequences.plots import save_figure
+    from stario.sequences.drawing import save_figure
 
     text = io.StringIO()
     names = list(Entry.__dataclass_fields__)

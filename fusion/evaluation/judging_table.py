@@ -12,8 +12,8 @@ from stario.fusion.evaluation.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.displacement_error import FIGURES
 from stario.fusion.evaluation.judging import POOLED, Judged, Row
 from stario.fusion.evaluation.judging_figure import groups_figure
+from stario.sequences.drawing import save_figure
 from stario.sequences.files import atomic_write, write_json
-from stario.sequences.plots import save_figure
 from stario.sequences.text_table import aligned, figure
 
 _COLUMNS = {

@@ -6,24 +6,23 @@ right-invariant error (Barrau and Bonnabel 2017).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import GYRO_BIAS, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
     IntervalMeasurements,
     Step,
 )
-from stario.fusion.filter.gyro_bias import GyroBiasPrior, told_of_bias
+from stario.fusion.filter.gyro_bias import FollowedBiasPrior, GyroBiasPrior, told_of_bias
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
@@ -47,9 +46,6 @@ from stario.sequences.windows import WINDOW_SECONDS
 GAP_TURN = 0.5
 """How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
 second and 0.36 to 0.7 per second over three in the training and validation recordings."""
-
-_BIAS_AT_REST = 2.5e-3
-"""Of the gyroscope's bias where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
 _ROUNDING = 1e-6
 """Of times [s]."""
@@ -87,9 +83,9 @@ class Estimator:
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
         self._magnetic = MagneticReference()
-        self._bias_prior = GyroBiasPrior.first(max(f.gyro_bias_sigma, SMALLEST_SIGMA))
         self._displacements = DisplacementUpdates(self.ekf, f)
         self._opinion = self._displacements.opinion
+        self._bias = FollowedBiasPrior(self._opinion, config, start.time)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -97,8 +93,7 @@ class Estimator:
         self._history: tuple[Step, ...] = ()
         self.oldest: Estimate | None = None
         initialise(self.ekf, start, prior, config)
-        if f.adaptive:
-            self._exchange_gyro_bias_prior(self._bias_prior.before_gravity_tells())
+        self._bias.begin()
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------
@@ -124,8 +119,7 @@ class Estimator:
         taken = None if offered is None else self._update_displacement(interval, *offered)
         bias_told = self._update_bearing(interval)
         accepted += self._update_north()
-        if interval.gap or self._halves(interval.stop) > self._halves(interval.start):
-            self._follow_gyro_bias_prior(interval)
+        self._bias.follow(interval)
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(interval, offered, taken, bias_told, at_rest, accepted, segment)
@@ -202,32 +196,6 @@ class Estimator:
         self.ekf.propagate(segment)
         return segment
 
-    def _halves(self, time: float) -> int:
-        """Whole half seconds since the start: what is known of a bias changes no faster."""
-        return math.floor(2.0 * (time - self._start) + _ROUNDING)
-
-    def _follow_gyro_bias_prior(self, interval: ImuInterval) -> None:
-        """The bias's prior as it should be, by what gravity and the data tell of it by now."""
-        if not self._config.filter.adaptive:
-            return
-        levelled = interval.levelled_bias, interval.levelled_bias_sigma
-        b_g, P = self.ekf.state.b_g, self.ekf.P[GYRO_BIAS, GYRO_BIAS]
-        wanted = self._bias_prior.wanted(*levelled, b_g, P, self._bias_wander)
-        self._exchange_gyro_bias_prior(wanted)
-
-    def _exchange_gyro_bias_prior(self, wanted: GyroBiasPrior) -> None:
-        """Everything as if it had been the prior from the start."""
-        wander = self._bias_wander
-        old, new = self._bias_prior.variance + wander, wanted.variance + wander
-        self._opinion.both(lambda: self.ekf.exchange_gyro_bias_prior(old, new))
-        self._bias_prior = wanted
-
-    @property
-    def _bias_wander(self) -> float:
-        """Variance by which the gyroscope's bias may have changed since the start."""
-        seconds = max(0.0, self.ekf.state.time - self._start)
-        return float(self._config.noise.gyro_walk**2 * seconds)
-
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self._map_frame.update(self.ekf, fix)
         self._counts = self._counts.add_fix(result)
@@ -237,15 +205,13 @@ class Estimator:
         if not self._stillness.is_still(interval):
             return None
         measured = zero_velocity(self._stillness)
-        before = self.ekf.state, self._bias_prior, self._opinion.sceptic
-        # Rest tells the bias, be it what it may.
-        wide = max(self._bias_prior.variance, _BIAS_AT_REST**2)
-        self._exchange_gyro_bias_prior(replace(self._bias_prior, variance=wide))
+        before = self.ekf.state, self._bias.prior, self._opinion.sceptic
+        self._bias.widen_for_rest()
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
-            self.ekf.state, self._bias_prior, self._opinion.sceptic = before
+            self.ekf.state, self._bias.prior, self._opinion.sceptic = before
             return None
         self._opinion.sceptic = None
         return measured
@@ -312,7 +278,7 @@ class Estimator:
             self._stillness.window,
             self._magnetic,
             self._displacements.outlier_share,
-            self._bias_prior,
+            self._bias.prior,
             self._displacements.accelerometer,
             self._opinion.sceptic,
             self._counts,
@@ -325,7 +291,7 @@ class Estimator:
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._magnetic, self._bias_prior, self._counts = s.magnetic, s.bias_prior, s.counts
+        self._magnetic, self._bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
         self._displacements.outlier_share = s.outlier_share
         self._displacements.accelerometer = s.accelerometer
         self._opinion.sceptic = s.sceptic
@@ -339,7 +305,7 @@ class Estimator:
     @property
     def bias_prior(self) -> GyroBiasPrior:
         """Of the gyroscope's bias, as it stands in the filter."""
-        return self._bias_prior
+        return self._bias.prior
 
     @property
     def time(self) -> float:

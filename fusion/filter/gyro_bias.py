@@ -9,11 +9,15 @@ wide where it is large, or where the data say clearly that it lies outside the p
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
+from stario.fusion.filter.sceptic import SecondOpinion
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import FloatArray
 from stario.sequences.levelling import BIAS_SIGMA
 
@@ -34,6 +38,11 @@ by, since their errors are alike for long. Rest, gravity, fixes and the magnetic
 _WIDEST = 0.015
 """To which data widen it [rad/s]; what lies outside is raw, which levelling tells sooner."""
 
+_AT_REST = 2.5e-3
+"""Where rest tells it, at least [rad/s]: a glide that turns is no rest."""
+
+_ROUNDING = 1e-6
+"""Of times [s]."""
 
 _LEAST_GAIN, _UNTOLD = 1e-6, 1.0
 """Share of the information by which an update must add to it; sigma along axes untold [rad/s]."""
@@ -102,6 +111,60 @@ class GyroBiasPrior:
         e = p[precise] * prior / (prior - p[precise])  # squares
         y = (axes.T @ b_g)[precise] * e / p[precise]
         return float(np.max(y**2 - _CLEARLY**2 * e)) - wander
+
+
+class FollowedBiasPrior:
+    """The prior in a filter, and in the sceptic beside it, as what is known asks for it.
+
+    Args:
+        opinion: both.
+        config: settings and noise.
+        start: time of the first state [s].
+
+    Attributes:
+        prior: as it stands in the filter.
+    """
+
+    def __init__(self, opinion: SecondOpinion, config: NavigatorConfig, start: float) -> None:
+        self._opinion, self._config, self._start = opinion, config, start
+        self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, SMALLEST_SIGMA))
+
+    def begin(self) -> None:
+        """Before gravity has told anything."""
+        if self._config.filter.adaptive:
+            self._exchange(self.prior.before_gravity_tells())
+
+    def follow(self, interval: ImuInterval) -> None:
+        """Behind an interval, by what gravity and the data tell of the bias by now."""
+        if not self._config.filter.adaptive:
+            return
+        if not interval.gap and self._halves(interval.stop) == self._halves(interval.start):
+            return
+        levelled = interval.levelled_bias, interval.levelled_bias_sigma
+        s = self._opinion.ekf.state
+        self._exchange(self.prior.wanted(*levelled, s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander))
+
+    def widen_for_rest(self) -> None:
+        """Rest tells the bias, be it what it may."""
+        wide = max(self.prior.variance, _AT_REST**2)
+        self._exchange(replace(self.prior, variance=wide))
+
+    def _exchange(self, wanted: GyroBiasPrior) -> None:
+        """Everything as if it had been the prior from the start."""
+        old, new = self.prior.variance + self._wander, wanted.variance + self._wander
+        ekf = self._opinion.ekf
+        self._opinion.both(lambda: ekf.exchange_gyro_bias_prior(old, new))
+        self.prior = wanted
+
+    def _halves(self, time: float) -> int:
+        """Whole half seconds since the start: what is known of a bias changes no faster."""
+        return math.floor(2.0 * (time - self._start) + _ROUNDING)
+
+    @property
+    def _wander(self) -> float:
+        """Variance by which the bias may have changed since the start."""
+        seconds = max(0.0, self._opinion.ekf.state.time - self._start)
+        return float(self._config.noise.gyro_walk**2 * seconds)
 
 
 def told_of_bias(before: EkfState, after: EkfState) -> tuple[FloatArray, FloatArray] | None:

@@ -73,20 +73,21 @@ class SecondOpinion:
         ekf: the filter; its state is put aside while the sceptic takes its turn.
 
     Attributes:
+        ekf: the filter.
         sceptic: None while all displacements fit.
     """
 
     def __init__(self, ekf: StateCloningEkf) -> None:
-        self._ekf = ekf
+        self.ekf = ekf
         self.sceptic: Sceptic | None = None
 
     def both(self, work: Callable[[], Made]) -> Made:
         """Do it to the filter, then to the sceptic; returns what came of the first."""
         made = work()
         if self.sceptic is not None:
-            mine, self._ekf.state = self._ekf.state, self.sceptic.ekf
+            mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
             work()
-            self.sceptic, self._ekf.state = replace(self.sceptic, ekf=self._ekf.state), mine
+            self.sceptic, self.ekf.state = replace(self.sceptic, ekf=self.ekf.state), mine
         return made
 
     def ask(self, fits: Callable[[], bool], fits_filter: bool) -> None:
@@ -98,8 +99,8 @@ class SecondOpinion:
         """
         if self.sceptic is None:
             return
-        mine, self._ekf.state = self._ekf.state, self.sceptic.ekf
+        mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
         fitted = fits()
-        asked = replace(self.sceptic, ekf=self._ekf.state).judged(fitted, fits_filter)
-        self._ekf.state = asked.ekf if asked.is_convincing else mine
+        asked = replace(self.sceptic, ekf=self.ekf.state).judged(fitted, fits_filter)
+        self.ekf.state = asked.ekf if asked.is_convincing else mine
         self.sceptic = None if asked.is_convincing or asked.is_over else asked

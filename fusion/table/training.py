@@ -14,7 +14,8 @@ from time import process_time
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import Recorded, cached_walks, gather
-from stario.network.training.train import EpochReport, train
+from stario.network.training.run import EpochReport
+from stario.network.training.train import train
 from stario.sequences.batch import Skipped
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence

@@ -1,63 +1,27 @@
-"""Training: on CPU or GPU, in one process or several, resumable from its checkpoint.
-
-What is evaluated and saved is the running average of the weights.
-"""
+"""Training: on CPU or GPU, in one process or several, resumable from its checkpoint."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import logging
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from time import perf_counter
-from typing import Any
 
-import numpy as np
-import torch
-from torch import Tensor, nn
-
-from stario.network.architectures import architecture, build_network
-from stario.network.card import Calibration, Card
-from stario.network.displacement import DisplacementNetwork
-from stario.network.known_motion import KnownMotion, known_motion
-from stario.network.model import DisplacementModel, save_model
+from stario.network.card import Calibration
+from stario.network.known_motion import known_motion
+from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler, reach_of
-from stario.network.training.calibrate import calibrate
-from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
-from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
-from stario.network.training.parallel import Workers, workers
+from stario.network.training.config import TrainingConfig
+from stario.network.training.parallel import workers
+from stario.network.training.run import EpochReport, TrainingRun
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss, leg_samplers
-from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.files import atomic_write
+from stario.network.training.weak_truth import leg_samplers
+from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.windows import WorldStream
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class EpochReport:
-    """What one epoch ended with; errors are mean squared displacement errors [m^2].
-
-    Attributes:
-        epoch: its number, from 1.
-        training_error: of its augmented windows.
-        validation_error: mean over recordings and kinds of weak truth.
-        validation_by_recording: of each of them.
-        windows_per_second: learned from, of this process, with and without full truth.
-        drawing_share: of the time that went into drawing them, the network waiting.
-    """
-
-    epoch: int
-    training_error: float
-    validation_error: float
-    validation_by_recording: dict[str, float]
-    windows_per_second: float = 0.0
-    drawing_share: float = 0.0
 
 
 def train(
@@ -105,7 +69,9 @@ def train(
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
-        run = _Run(config, sampler, leg_samplers(config, legs, sampler), material, folder, these)
+        run = TrainingRun(
+            config, sampler, leg_samplers(config, legs, sampler), material, folder, these
+        )
         if start_from is not None:
             run.start_from(start_from)
         run.resume()
@@ -118,248 +84,6 @@ def train(
             if these.leads:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
-
-
-class _Run:
-    """State of a training run: network, optimiser, averaged weights, history."""
-
-    def __init__(
-        self,
-        config: TrainingConfig,
-        sampler: WindowSampler,
-        legs: list[tuple[LegSampler, int]],
-        material: str,
-        folder: Path,
-        workers: Workers,
-    ) -> None:
-        torch.manual_seed(config.seed)
-        self.config, self.sampler, self.legs, self.folder = config, sampler, legs, folder
-        self.workers, self.device, self._material = workers, workers.device, material
-        self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
-        self._checkpoint = folder / "checkpoint.safetensors"
-        if config.dropout is not None:
-            _set_dropout(self.network, config.dropout)
-        self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
-        self.averaged.load_state_dict(self.network.state_dict())
-        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), config.rate, weight_decay=config.weight_decay
-        )
-        idle = architecture(config.architecture).heads > 1
-        shared = workers.wrapped(self.network, idle=idle)
-        self._shared: Any = torch.compile(shared) if config.compiled else shared
-        self._mixed = config.precision == "bfloat16"
-        if not workers.leads:
-            torch.manual_seed(config.seed + workers.rank)  # dropout of its own
-        self.step = 0
-        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
-        self.history: list[EpochReport] = []
-        folder.mkdir(parents=True, exist_ok=True)
-
-    def start_from(self, model: DisplacementModel) -> None:
-        """Begin with a model's weights.
-
-        Raises:
-            ConfigError: it is of another architecture.
-        """
-        if model.card.architecture != self.config.architecture:
-            raise ConfigError(
-                "architecture", model.card.architecture, f"{self.config.architecture} as trained"
-            )
-        state = model.training_form.state_dict()
-        self.network.load_state_dict(state)
-        self.averaged.load_state_dict(state)
-        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-
-    def epoch(self, on_step: Callable[[int, float], None]) -> float:
-        """One epoch; returns the mean squared error on its (augmented) windows."""
-        self.network.train()
-        self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
-        errors = []
-        for _ in range(self.config.steps_per_epoch):
-            errors.append(self._one_step())
-            on_step(self.step, errors[-1])
-        return self.workers.mean(float(np.mean(errors)))
-
-    def _one_step(self) -> float:
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.config, self.step)
-        begin = perf_counter()
-        drawn = self.sampler.batch(self.config.batch // self.config.successive)
-        windows, target = (self.workers.share(part).to(self.device) for part in drawn)
-        legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
-        ready = perf_counter()
-        loss, error = self._loss(windows, target, legs)
-        self.optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
-        self._check_finite(float(loss.detach()), float(norm))
-        self.optimiser.step()
-        self.step += 1
-        self._average()
-        self._drawing_s += ready - begin
-        self._learning_s += perf_counter() - ready
-        parts = [windows, *(part.windows for part in legs)]
-        self._windows += sum(part[..., 0, 0].numel() for part in parts)
-        return error
-
-    def _loss(
-        self, windows: Tensor, target: Tensor, legs: Sequence[LegBatch]
-    ) -> tuple[Tensor, float]:
-        """Loss of windows with full truth and of legs, and the windows' mean squared error [m^2].
-
-        All sources go through the network in one batch, so that its normalisation sees them all.
-        """
-        if not self.network.remembers:
-            windows = windows.flatten(0, -3)
-        stretches = [self._in_rows(part.windows) for part in legs]
-        whole = torch.cat([windows, *stretches])
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
-            mean, log_sigma = self._shared(whole)
-        sizes = [len(windows), *map(len, stretches)]
-        means, log_sigmas = mean.split(sizes), log_sigma.split(sizes)
-        squared = (means[0].flatten(0, -2) - target.flatten(0, -2)) ** 2
-        if self.step >= self.config.likelihood_from * self.config.steps:
-            loss = loss_with_sigma(squared, log_sigmas[0].flatten(0, -2))
-        else:
-            loss = squared.sum(1).mean()
-        for part, told, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
-            shape = (len(part.known), -1, 3)
-            loss = loss + leg_loss(told.view(shape), sigma.view(shape), part)[0]
-        return loss, float(squared.detach().sum(1).mean())
-
-    def _in_rows(self, stretches: Tensor) -> Tensor:
-        """Windows (S, K, 6, 200) one by one, or as many in a row as a network remembers."""
-        windows, successive = stretches.flatten(0, 1), self.config.successive
-        return windows.view(-1, successive, *windows.shape[1:]) if successive > 1 else windows
-
-    def _check_finite(self, loss: float, norm: float) -> None:
-        """Stop before a step that would spoil every weight.
-
-        The gradient's norm is looked at as well: it is infinite one step before the loss is, and
-        the processes have it in common, so that all of them stop.
-        """
-        if math.isfinite(loss) and math.isfinite(norm):
-            return
-        raise InputError(
-            "loss",
-            f"{loss:g} with a gradient of norm {norm:g} in step {self.step + 1}",
-            "finite numbers",
-            f"train in another folder with a `rate` below {self.config.rate:g}",
-        )
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        decay = min(self.config.average, (1 + self.step) / (10 + self.step))
-        current = self.network.state_dict()
-        for name, value in self.averaged.state_dict().items():
-            if value.is_floating_point():
-                value.lerp_(current[name], 1.0 - decay)
-            else:
-                value.copy_(current[name])
-
-    def epochs_since_best(self) -> int:
-        """Epochs since the smallest validation error; one that is not finite is never smaller.
-
-        Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
-        with it count.
-        """
-        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
-        errors = [_or_infinite(r.validation_error) for r in self.history]
-        if len(errors) >= first:
-            errors = errors[first - 1 :]
-        return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
-
-    def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
-        """Validate an epoch: the leading process alone, the others are told."""
-        errors = held_out.errors(self.averaged) if self.workers.leads else {}
-        return EpochReport(
-            epoch=self.step // self.config.steps_per_epoch,
-            training_error=training_error,
-            validation_error=self.workers.agreed(float(np.mean(list(errors.values()) or [0.0]))),
-            validation_by_recording=errors,
-            windows_per_second=self._windows / (self._drawing_s + self._learning_s),
-            drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
-        )
-
-    def record(self, report: EpochReport) -> None:
-        """Keep the best weights and write checkpoint and log."""
-        self.history.append(report)
-        if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
-            self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-        if not self.workers.leads:
-            return
-        self._write_checkpoint()
-        with atomic_write(self.folder / "log.json") as file:
-            file.write(json.dumps([asdict(r) for r in self.history], indent=1))
-
-    def _write_checkpoint(self) -> None:
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
-        tensors |= {f"best.{k}": v for k, v in self.best.items()}
-        for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{k}": v for k, v in state.items()}
-        tensors["random.sampler"] = self.sampler.generator.get_state()
-        tensors["random.torch"] = torch.get_rng_state()
-        history = [asdict(r) for r in self.history]
-        write_checkpoint(self._checkpoint, self.config, self._material, self.step, history, tensors)
-
-    def resume(self) -> None:
-        """Continue from the folder's checkpoint, if there is one.
-
-        Raises:
-            ConfigError: it was written by another recipe, or learned from other recordings.
-            ReadError: it cannot be read.
-        """
-        if not self._checkpoint.exists():
-            return
-        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
-        self.history = [EpochReport(**report) for report in history]
-        self._restore(tensors)
-        log.info("resumed %s at step %d", self._checkpoint, self.step)
-
-    def _restore(self, tensors: dict[str, Tensor]) -> None:
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-
-        self.network.load_state_dict(part("network."))
-        self.averaged.load_state_dict(part("averaged."))
-        self.best = {k: v.to(self.device) for k, v in part("best.").items()}
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, value in part("optimiser.").items():
-            index, key = name.split(".", 1)
-            state.setdefault(int(index), {})[key] = value
-        whole = self.optimiser.state_dict()
-        self.optimiser.load_state_dict({**whole, "state": state})
-        self.sampler.generator.set_state(tensors["random.sampler"])
-        if self.workers.leads:
-            torch.set_rng_state(tensors["random.torch"])
-        else:
-            torch.manual_seed(self.config.seed + self.workers.rank + self.step)
-
-    def finish(
-        self,
-        held_out: ValidationSet,
-        trained_on: list[str],
-        kept: Calibration | None,
-        known: KnownMotion,
-    ) -> Path:
-        """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
-        path = self.folder / "model.safetensors"
-        if not self.workers.leads:
-            return path
-        self.averaged.load_state_dict(self.best)
-        residuals, log_sigma = held_out.residuals(self.averaged)
-        card = Card(
-            architecture=self.config.architecture,
-            calibration=kept or calibrate(residuals, log_sigma),
-            trained_on=trained_on,
-            recipe=json.loads(json.dumps(asdict(self.config))),
-            figures={"validation_mse_m2": held_out.errors(self.averaged, residuals)},
-            known_motion=known,
-        )
-        save_model(path, self.averaged, card)
-        return path
 
 
 def _sampler(
@@ -387,14 +111,3 @@ def _material(
         start_from.card.sha256 if start_from else "",
     ]
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
-
-
-def _or_infinite(error: float) -> float:
-    """NumPy takes what is not a number for the smallest."""
-    return error if math.isfinite(error) else math.inf
-
-
-def _set_dropout(network: nn.Module, share: float) -> None:
-    for module in network.modules():
-        if isinstance(module, nn.Dropout):
-            module.p = share

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.drawing import save_figure
 from stario.sequences.errors import InputError
 from stario.sequences.plots import (
     error_over_time,
     imu_overview,
     innovations,
     plan_view,
-    save_figure,
 )
 from stario.sequences.sequence import ImuSequence, Trajectory
 

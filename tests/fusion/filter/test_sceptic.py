@@ -97,10 +97,10 @@ def test_two_displacements_that_fit_it_alone_convince() -> None:
     asked.ask(lambda: False, fits_filter=False)
     asked.ask(lambda: True, fits_filter=False)
     assert asked.sceptic is not None
-    assert asked._ekf.state.b_a[0] == 0.0
+    assert asked.ekf.state.b_a[0] == 0.0
     asked.ask(lambda: True, fits_filter=False)
     assert asked.sceptic is None
-    assert asked._ekf.state.b_a[0] == 1.0
+    assert asked.ekf.state.b_a[0] == 1.0
 
 
 def test_it_is_given_up_where_both_agree_and_where_time_is_over() -> None:
@@ -114,4 +114,4 @@ def test_it_is_given_up_where_both_agree_and_where_time_is_over() -> None:
     late.sceptic = replace(late.sceptic, ekf=replace(late.sceptic.ekf, time=16.5))
     late.ask(lambda: False, fits_filter=True)
     assert late.sceptic is None
-    assert late._ekf.state.b_a[0] == 0.0
+    assert late.ekf.state.b_a[0] == 0.0

@@ -21,7 +21,8 @@ from stario.network.training.config import (
     loss_with_sigma,
     training_config,
 )
-from stario.network.training.train import EpochReport, train
+from stario.network.training.run import EpochReport
+from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -89,7 +90,7 @@ def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
 def test_an_epoch_tells_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that goes on by a second whenever it is read."""
     clock = count()
-    monkeypatch.setattr("stario.network.training.train.perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr("stario.network.training.run.perf_counter", lambda: float(next(clock)))
     reports: list[EpochReport] = []
     run(tmp_path, replace(TINY, epochs=1), on_epoch=reports.append)
     assert reports[0].windows_per_second == TINY.batch / 2

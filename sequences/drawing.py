@@ -1,0 +1,136 @@
+"""What figures share: colours, panels, lines that break at gaps, curves through many samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stario.sequences.files import atomic_write
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
+BLUE, ORANGE, GREEN, PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
+RED, SKY, GREY, INK = "#D55E00", "#56B4E9", "#999999", "#333333"
+TRACK_STYLES = {
+    "inertial": ("inertial", GREY),
+    "network": ("network", ORANGE),
+    "network_true_attitude": ("network, true attitude", GREEN),
+    "ekf": ("EKF", BLUE),
+    "graph": ("factor graph", PINK),
+}
+_SPARE_COLOURS = (RED, SKY, "#7F5539", "#6A4C93")
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
+ABOVE_LEFT = {**LEGEND, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "ncols": 3}
+ABOVE_RIGHT = {**LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4}
+_DPI = 150
+_MAX_SAMPLES = 3000
+_BLOCKS = 600
+
+
+def save_figure(fig: Figure, path: Path | str) -> None:
+    """Write a figure as PNG, whole or not at all.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    with atomic_write(path, "wb") as file:
+        fig.savefig(file, format="png", dpi=_DPI)
+
+
+def new_figure(width: float, height: float, title: str) -> Figure:
+    """An empty one with its title, width and height in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(fig)
+    fig.suptitle(title, fontsize=13, color=INK, x=0.02, ha="left")
+    return fig
+
+
+def panels_of(fig: Figure, *heights: float) -> list[Axes]:
+    """Panels above each other with these relative heights and one abscissa; one without any."""
+    ratios = heights or (1,)
+    panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color(GREY)
+        axes.tick_params(colors=INK, labelsize=9)
+        axes.grid(color="#E6E6E6", lw=0.7)
+        axes.set_axisbelow(True)
+        axes.margins(x=0.01)
+    return list(panels)
+
+
+def style_of(name: str, index: int) -> tuple[str, str]:
+    """Legend text and colour of a track; unknown names take spare colours by their position."""
+    return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
+
+
+def broken(
+    time: FloatArray,
+    values: FloatArray,
+    valid: BoolArray | None = None,
+    max_gap: float = MAX_TRUTH_GAP,
+) -> tuple[FloatArray, FloatArray]:
+    """The valid rows of time (N,) and values (N, k), with a row of nan in each gap.
+
+    A gap is longer than `max_gap` [s] and than three usual steps.
+    """
+    if valid is not None:
+        time, values = time[valid], values[valid]
+    steps = np.diff(time)
+    if len(steps) == 0:
+        return time, values
+    gaps = np.flatnonzero(steps > max(max_gap, 3 * float(np.median(steps)))) + 1
+    return (
+        np.insert(time, gaps, 0.5 * (time[gaps] + time[gaps - 1])),
+        np.insert(values, gaps, np.nan, axis=0),
+    )
+
+
+def distance(metres: float) -> str:
+    """In words: metres, or kilometres where there are many."""
+    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
+
+
+def draw_path(
+    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
+) -> None:
+    """A path (N, 2) [m] with its start and its end marked."""
+    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
+    known = path[np.isfinite(path).all(axis=1)]
+    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
+    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
+
+
+def draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
+    """Values (N,) as dots, those gated as crosses."""
+    axes.plot(time[~gated], value[~gated], ".", color=BLUE, ms=3, label="used")
+    # An empty line has no extent; unclipped, it would leave the layout without any bounds.
+    clipped = not gated.any()
+    axes.plot(time[gated], value[gated], "x", color=RED, ms=5, label="gated", clip_on=clipped)
+
+
+def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
+    """A curve through the samples; through block means, within their extremes, if they are many."""
+    block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)
+    starts = np.arange(0, len(time), block)
+    mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
+    extremes = [ufunc.reduceat(value, starts) for ufunc in (np.minimum, np.maximum)]
+    ticks, curves = broken(time[starts], np.column_stack([mean, *extremes]))
+    axes.plot(ticks, curves[:, 0], color=colour, lw=0.8, label=label)
+    if block > 1:
+        axes.fill_between(ticks, curves[:, 1], curves[:, 2], color=colour, alpha=0.3, lw=0.4)
+
+
+def reach_of(*values: FloatArray) -> float:
+    """A little more than the largest finite magnitude."""
+    finite = np.abs(np.concatenate([value[np.isfinite(value)] for value in values]))
+    return 1.1 * float(finite.max(initial=0.0)) or 1.0
