@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from stario.fusion.lie import FloatArray
 from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray
 
 
 def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
+from stario.sequences.sequence import FloatArray
 
 LARGEST_STEP = 0.01
 """Of the correction that is bled in from one state to the next [m]."""

@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.checked import floored, shaped
-from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health
+from stario.sequences.sequence import FloatArray
 
 FixKind = Literal["position", "yaw", "velocity"]
 

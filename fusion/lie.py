@@ -1,4 +1,4 @@
-"""Rotations and extended poses as matrix groups: SO(3), SE(3) and SE_2(3) in closed form.
+"""Extended poses as matrix groups: SE(3) and SE_2(3) in closed form, and the yaw of a rotation.
 
 Every function works on stacks, leading axes first, because the filter corrects all of its clones at
 once. Conventions: X = exp(xi) with xi = (theta, rho_v, rho_p), rotation [rad] first; the left
@@ -14,41 +14,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-FloatArray = NDArray[np.float64]
+from stario.sequences.sequence import FloatArray
+from stario.sequences.so3 import exp_and_left_jacobian, log_so3, series_coefficients, skew
 
-# theta @ _HAT is the skew-symmetric matrix of theta, flattened: one product for a whole stack.
-_HAT = np.zeros((3, 9))
-_HAT[0, [5, 7]] = -1.0, 1.0
-_HAT[1, [2, 6]] = 1.0, -1.0
-_HAT[2, [1, 3]] = -1.0, 1.0
-
-_SERIES_LIMIT = 1e-3  # t^2 [rad^2] up to which three terms of a series are exact to rounding
 _EYE = np.eye(3)
-_ONES = np.ones(3)
-
-
-def skew(vector: FloatArray) -> FloatArray:
-    """Cross-product matrices [x]x (..., 3, 3) of vectors (..., 3)."""
-    return (vector @ _HAT).reshape(*vector.shape[:-1], 3, 3)
-
-
-def exp_and_left_jacobian(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation matrices exp([theta]x) and left Jacobians J_l(theta), sharing their work.
-
-    Args:
-        theta: (..., 3) rotation vectors [rad].
-
-    Returns:
-        Two arrays (..., 3, 3).
-    """
-    K = skew(theta)
-    KK = K @ K
-    b, c = _coefficients(theta)
-    J = _EYE + b * K + c * KK
-    return _EYE + K @ J, J
 
 
 def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
@@ -63,21 +33,11 @@ def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
         X: (n, 3, 3 + m) poses [R | vectors].
     """
     K = skew(theta)
-    b, c = _coefficients(theta)
+    b, c = series_coefficients(theta)
     first = K @ X
     first[:, :, 3:] += rho
     second = K @ first
     return X + first + (b * _EYE + c * K) @ second
-
-
-def exp_so3(theta: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
-    return exp_and_left_jacobian(theta)[0]
-
-
-def log_so3(R: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) [rad], of norm up to pi, of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(R, assume_valid=True).as_rotvec(), dtype=np.float64)
 
 
 def exp_se23(xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -125,16 +85,3 @@ def yaw_rotation(R: FloatArray) -> FloatArray:
     norm = math.hypot(s, c)
     s, c = (s / norm, c / norm) if norm > 0.0 else (0.0, 1.0)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _coefficients(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(1 - cos t)/t^2 and (t - sin t)/t^3 (..., 1, 1), accurate down to zero."""
-    squared = (theta * theta) @ _ONES
-    b = 0.5 - squared * (1.0 / 24.0 - squared / 720.0)
-    c = 1.0 / 6.0 - squared * (1.0 / 120.0 - squared / 5040.0)
-    if np.vdot(theta, theta) > _SERIES_LIMIT:
-        large = squared > _SERIES_LIMIT
-        t = np.sqrt(np.where(large, squared, 1.0))
-        b = np.where(large, 2.0 * (np.sin(0.5 * t) / t) ** 2, b)
-        c = np.where(large, (t - np.sin(t)) / t**3, c)
-    return b[..., None, None], c[..., None, None]

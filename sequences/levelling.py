@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.sequences.rotations import tilt_aligning
 from stario.sequences.sequence import FloatArray
+from stario.sequences.so3 import cross, exp_so3
 
 PERIOD = 0.1
 """Between corrections of the tilt [s]."""
@@ -96,11 +96,11 @@ def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArra
 
     Mean rate and coning (Savage 1998), as in the filter's preintegration.
     """
-    dt = np.diff(time)[:, None]
-    turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * np.cross(gyro[:-1], gyro[1:]))
+    dt = (time[1:] - time[:-1])[:, None]
+    turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * cross(gyro[:-1], gyro[1:]))
     attitudes = np.empty((len(time), 3, 3))
     attitudes[0] = R_NB
-    for k, turn in enumerate(_exp(turns)):
+    for k, turn in enumerate(exp_so3(turns)):
         np.matmul(attitudes[k], turn, out=attitudes[k + 1])
     return attitudes
 
@@ -169,16 +169,16 @@ class LevelledAttitude:
     def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
-        up = (0.5 * np.diff(time)) @ (force_N[1:] + force_N[:-1]) / dt
+        up = (0.5 * (time[1:] - time[:-1])) @ (force_N[1:] + force_N[:-1]) / dt
         up /= max(float(np.linalg.norm(up)), _LEAST_FORCE)
         P = self._propagated(attitudes, dt)
-        gain = P[:, :2] @ np.linalg.inv(P[:2, :2] + _FORCE_NOISE**2 / dt * np.eye(2))
+        gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
         P = P - gain @ P[:2]
         self._P = 0.5 * (P + P.T)
         # The smallest turn that takes `up` to the vertical, to first order; none about it.
         x = gain @ np.array([up[1], -up[0]])
         self.b_g = self.b_g + x[3:]
-        turned: FloatArray = _exp(np.array([x[0], x[1], 0.0])) @ attitudes[-1]
+        turned: FloatArray = exp_so3(np.array([x[0], x[1], 0.0])) @ attitudes[-1]
         return turned
 
     def _propagated(self, attitudes: FloatArray, dt: float) -> FloatArray:
@@ -190,5 +190,7 @@ class LevelledAttitude:
         return P
 
 
-def _exp(theta: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_rotvec(theta).as_matrix())
+def _inverse(P: FloatArray, noise: float) -> FloatArray:
+    """(P + noise I)^-1 of a symmetric P (2, 2)."""
+    a, b, d = float(P[0, 0]) + noise, float(P[0, 1]), float(P[1, 1]) + noise
+    return np.array([[d, -b], [-b, a]]) / (a * d - b * b)

@@ -14,10 +14,9 @@ import numpy as np
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.imu.preintegration import Segment, preintegrate
-from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _DURATION, _IMU_RATE, _UPDATE_RATE, _WINDOW = 5.0, 200.0, 20.0, 1.0
 """Of the data [s], [Hz], [Hz], [s]."""

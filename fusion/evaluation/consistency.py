@@ -23,10 +23,11 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import FloatArray, exp_so3, log_se23, yaw_rotation
+from stario.fusion.lie import log_se23, yaw_rotation
 from stario.sequences.errors import InputError
 from stario.sequences.nees import nees_bounds
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.so3 import exp_so3
 from stario.sequences.windows import WINDOW_SECONDS
 
 RATE = 200.0

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
-from stario.fusion.lie import exp_so3
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.so3 import exp_so3
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,

@@ -14,8 +14,9 @@ from stario.fusion.filter.innovations import is_gated
 from stario.fusion.filter.network_turn import wandered
 from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
 from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
-from stario.fusion.lie import FloatArray, yaw_rotation
+from stario.fusion.lie import yaw_rotation
 from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.sequence import FloatArray
 
 _RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 """While fewer than this share of the displacements of the last seconds were outliers they are the

@@ -33,10 +33,11 @@ from stario.fusion.filter.jacobians import (
     yaw_jacobian,
 )
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import FloatArray, exp_so3, exp_times, yaw_twist
+from stario.fusion.lie import exp_times, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.so3 import exp_so3
 
 _NO_GAIN = np.zeros(3)
 

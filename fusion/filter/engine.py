@@ -18,7 +18,7 @@ from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from stario.fusion.filter.jacobians import CORE, Block
-from stario.fusion.lie import FloatArray
+from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
 

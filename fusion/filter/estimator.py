@@ -108,7 +108,9 @@ class Estimator:
             displacement: None where no window ends, or nothing is known of it.
             fixes: with times up to the interval's end that were not given before, in order.
         """
-        interval = replace(interval, accel_factor=self._displacements.accelerometer.factor)
+        factor = self._displacements.accelerometer.factor
+        if factor != interval.accel_factor:
+            interval = replace(interval, accel_factor=factor)
         self._remember(interval, displacement, fixes)
         if interval.gap or fixes:
             self._opinion.sceptic = None
@@ -242,7 +244,7 @@ class Estimator:
         return [taken]
 
     def _update_bearing(self, interval: ImuInterval) -> tuple[FloatArray, FloatArray] | None:
-        """Returns what it told of the gyroscope's bias, and the covariance of that."""
+        """Returns what it told of the gyroscope's bias, for a stream's graph."""
         if interval.field_B is None or not self._magnetic.due(interval.stop):
             return None
         field_B, before = interval.field_B, self.ekf.state
@@ -250,7 +252,7 @@ class Estimator:
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
         self._counts = self._counts.add_bearing(result)
-        return told_of_bias(before, self.ekf.state)
+        return told_of_bias(before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:
         if len(self._clones) < self.ekf.slots:

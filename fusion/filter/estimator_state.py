@@ -18,7 +18,7 @@ from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import Displacement as Displacement
-from stario.fusion.lie import FloatArray
+from stario.sequences.sequence import FloatArray
 
 
 class IntervalMeasurements(NamedTuple):
@@ -31,7 +31,7 @@ class IntervalMeasurements(NamedTuple):
     """The same with its covariance as inflated, None where it was left out."""
     bias_told: tuple[FloatArray, FloatArray] | None
     """What a bearing of the magnetic field told of the gyroscope's bias: (3,) [rad/s] and its
-    covariance (3, 3); None where it told nothing."""
+    covariance (3, 3); of streams, None where it told nothing."""
     zero_velocity: ZeroVelocity | None
     """None where the device moved, or the measurement was refused."""
     fixes: list[Accepted]

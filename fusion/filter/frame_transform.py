@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.lie import FloatArray, skew
 from stario.fusion.state import NavState, SmoothedPose
-from stario.sequences.sequence import Trajectory
+from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.so3 import skew
 
 _UP = np.array([0.0, 0.0, 1.0])
 

@@ -24,8 +24,9 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
-from stario.fusion.lie import FloatArray, yaw_twist
+from stario.fusion.lie import yaw_twist
 from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.sequence import FloatArray
 
 PERIOD = 0.5
 """Between two bearings [s]."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.lie import FloatArray
+from stario.sequences.sequence import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ import numpy as np
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.stillness import StillnessDetector
-from stario.fusion.lie import FloatArray
 from stario.sequences.noise import PHONE_NOISE
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
 _HIDDEN = 10.0 * PHONE_NOISE.accel_noise

@@ -21,7 +21,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.lie import FloatArray, log_se23, skew, twist, yaw_rotation
+from stario.fusion.lie import log_se23, twist, yaw_rotation
+from stario.sequences.sequence import FloatArray
+from stario.sequences.so3 import skew
 
 _EYE = np.eye(3)
 

@@ -24,8 +24,8 @@ from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.lie import FloatArray
 from stario.fusion.state import Health, NavState
+from stario.sequences.sequence import FloatArray
 
 _WIDER, _NARROWER = 1.2, 0.99
 """Ratios of variances from which on the gyroscope bias's prior is another: a graph begins anew

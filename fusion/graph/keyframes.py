@@ -24,9 +24,9 @@ from stario.fusion.filter.jacobians import CORE
 from stario.fusion.graph.factors import KeyframeState, Prior, Term
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import FloatArray
 from stario.fusion.state import NavState
 from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.sequence import FloatArray
 
 _MOVED = 1e-3
 """A round that moves no keyframe further [m] is the last."""

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from stario.fusion.graph.factors import Displacement, Term
-from stario.fusion.lie import FloatArray
+from stario.sequences.sequence import FloatArray
 
 _FALSE, _FALSE_WAY = 0.5, 0.75
 """Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import FloatArray
+from stario.sequences.sequence import FloatArray
 from stario.sequences.stillness import looks_still, scatter_bound
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.lie import exp_so3
 from stario.sequences.levelling import (
     LevelledAttitude,
     integrate,
@@ -14,6 +13,7 @@ from stario.sequences.levelling import (
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.so3 import exp_so3
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -13,11 +13,11 @@ import pytest
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.consistency import Consistency, analytic_walk, consistency
 from stario.fusion.imu.preintegration import preintegrate
-from stario.fusion.lie import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.so3 import exp_so3
 
 # A first speed that is unknown by metres meets a yaw that is unknown by degrees beyond first order.
 CONFIG = NavigatorConfig(noise=ImuNoise(), filter=FilterConfig(velocity_sigma=0.1))

@@ -15,9 +15,9 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.fixed import fixed_track, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
 from stario.fusion.filter.seen_positions import SeenPositions
-from stario.fusion.lie import exp_so3
 from stario.sequences.metrics import pose_errors
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.so3 import exp_so3
 
 Make = Callable[..., Any]
 TURN = 0.12

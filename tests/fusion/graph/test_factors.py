@@ -19,7 +19,7 @@ from stario.fusion.graph.factors import (
     Velocity,
     Yaw,
 )
-from stario.fusion.lie import exp_so3
+from stario.sequences.so3 import exp_so3
 
 EYE = np.eye(3)
 

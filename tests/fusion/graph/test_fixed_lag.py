@@ -20,10 +20,11 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.lie import exp_so3, yaw_twist
+from stario.fusion.lie import yaw_twist
 from stario.fusion.recording import PreprocessedRecording
 from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.so3 import exp_so3
 
 Make = Callable[..., Any]
 

@@ -16,11 +16,11 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.stillness import StillnessDetector
-from stario.fusion.lie import exp_so3
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU
+from stario.sequences.so3 import exp_so3
 
 DATA = Path(
     os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"
