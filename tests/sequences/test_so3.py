@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences import so3
+
+ANGLES = [0.0, 1e-9, 1e-4, 0.0316, 0.0317, 0.2, 1.0, 2.5, np.pi - 1e-6]
+
+
+def rotation_vectors(angle: float) -> np.ndarray:
+    axes = np.random.default_rng(3).normal(size=(5, 3))
+    return angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def test_skew_is_the_cross_product() -> None:
+    a, b = np.random.default_rng(0).normal(size=(2, 4, 3))
+    np.testing.assert_allclose((so3.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-15)
+    np.testing.assert_allclose(so3.cross(a, b), np.cross(a, b), atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_agrees_with_scipy(angle: float) -> None:
+    theta = rotation_vectors(angle)
+    expected = Rotation.from_rotvec(theta).as_matrix()
+    np.testing.assert_allclose(so3.exp_so3(theta), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_undoes_exp(angle: float) -> None:
+    theta = rotation_vectors(angle)
+    np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-9, atol=1e-14)
+
+
+def test_log_of_half_turns() -> None:
+    theta = np.pi * np.eye(3)
+    turned = so3.log_so3(so3.exp_so3(theta))
+    np.testing.assert_allclose(np.abs(turned), theta, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_left_jacobian_agrees_with_finite_differences(angle: float) -> None:
+    step = 1e-6
+    for theta in rotation_vectors(angle):
+        R = so3.exp_so3(theta)
+        left = np.empty((3, 3))
+        for k, d in enumerate(step * np.eye(3)):
+            plus, minus = so3.exp_so3(theta + d), so3.exp_so3(theta - d)
+            left[:, k] = (so3.log_so3(plus @ R.T) - so3.log_so3(minus @ R.T)) / (2 * step)
+        np.testing.assert_allclose(so3.exp_and_left_jacobian(theta)[1], left, atol=1e-6)
+
+
+def test_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
+    theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
+    singly = np.stack([so3.exp_so3(row) for row in theta])
+    np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-15)
