@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
-from stario.fusion.imu.intervals import SHORT_GAP, ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.outliers import Flags, OutlierDetector
 from stario.sequences.errors import InputError
 from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
@@ -42,6 +42,13 @@ from stario.sequences.windows import (
 
 _TAIL = 4
 """Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
+
+BRIDGED = 0.2
+"""A hole no longer than this [s] is bridged by what was measured at its ends, which a walker's step
+hardly changes; what is longer is a gap, that no window spans."""
+
+_HOLE = 0.05
+"""A step longer than this [s] is a hole: what happened in it is little known."""
 
 _ALONE = 20
 """Samples in a row that stand alone: then their times are not in seconds."""
@@ -80,6 +87,7 @@ class FrontEnd:
         self._window: deque[NDArray[np.float32]] = deque(maxlen=self._blocks)
         self._starts: deque[FloatArray] = deque(maxlen=self._blocks)
         self._flagged: deque[bool] = deque(maxlen=self._blocks)
+        self._hole = (-math.inf, -math.inf)  # the last one, its ends [s]
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
@@ -151,11 +159,14 @@ class FrontEnd:
 
     def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
-        gap = time - self._newest > MAX_IMU_GAP and bool(self._samples)
-        self._newest = time
+        before, self._newest = self._newest, time
         self.counts.used += 1
-        if gap:
-            return self._bridge_gap(sample)
+        if self._samples and time - before > _HOLE:
+            self._hole = before, time
+            if time - before > MAX_IMU_GAP:
+                self.counts.add_gap(before, time - before)
+            if time - before > BRIDGED:
+                return self._span_gap(sample)
         self._samples.append(sample)
         if time < self._next:
             return []
@@ -191,11 +202,10 @@ class FrontEnd:
                 "time", f"samples {step:.3g} s apart", "50 to 1000 in a second", "give times in s"
             )
 
-    def _bridge_gap(self, sample: Sample) -> list[ImuInterval]:
+    def _span_gap(self, sample: Sample) -> list[ImuInterval]:
         """End the interval in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
-        self.counts.add_gap(before[-1][0], sample[0] - before[-1][0])
         self._check_pace()
         self._window.clear()
         self._starts.clear()
@@ -234,6 +244,8 @@ class FrontEnd:
         later = next(k for k, sample in enumerate(self._samples) if sample[0] >= stop)
         table = np.array(self._samples[: later + 1])
         flags = self._flag_outliers(table)
+        if self._hole[1] > table[0, 0] and self._hole[0] < stop:
+            flags = flags._replace(missing=True)
         if flags.spikes:
             self._samples[later] = tuple(table[later].tolist())
         after = self._samples[later]
@@ -255,7 +267,7 @@ class FrontEnd:
         attitude = self._attitude
         assert attitude is not None  # no interval is cut before the start
         self._starts.append(attitude.R_NB)
-        self._flagged.append(flags.gyro or flags.accel)
+        self._flagged.append(flags.gyro or flags.accel or flags.missing)
         # _cut() has counted this interval already.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._field_at(table[-1, 0])
@@ -310,7 +322,7 @@ def _interval(
     table: FloatArray, attitude: LevelledAttitude, gap: bool = False, **measured: Any
 ) -> ImuInterval:
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:7]
-    if gap and time[-1] - time[0] >= SHORT_GAP:
+    if gap:
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)

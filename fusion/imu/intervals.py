@@ -22,10 +22,6 @@ class Start:
     force: float
 
 
-SHORT_GAP = 0.2
-"""A gap shorter than this [s] is bridged by the rates at its ends: a walker's hardly change."""
-
-
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
     """The stretch between two times of the grid.
@@ -36,7 +32,7 @@ class ImuInterval:
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
         anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
-        flags: whether samples of either sensor are saturated or were spikes.
+        flags: whether samples of either sensor are saturated, missing, or were spikes.
         window_flagged: whether samples of the window's are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
@@ -67,11 +63,6 @@ class ImuInterval:
     anew: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False
-
-    @property
-    def short_gap(self) -> bool:
-        """Whether it is a gap over which rates may be taken for linear between its ends."""
-        return self.gap and self.stop - self.start < SHORT_GAP
 
     def without_window(self) -> ImuInterval:
         """What an estimator needs of it, without what only the network sees."""

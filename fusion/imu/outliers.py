@@ -30,12 +30,14 @@ class Flags(NamedTuple):
         accel: likewise of the accelerometer.
         spikes: number of samples replaced.
         saturated: number of samples at the limit.
+        missing: whether samples are missing, and those around were taken for them.
     """
 
     gyro: bool = False
     accel: bool = False
     spikes: int = 0
     saturated: int = 0
+    missing: bool = False
 
 
 class OutlierDetector:

@@ -36,6 +36,10 @@ _POSITION_NOISE = 1e-5
 
 _GAP_STEPS = 10
 
+_MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
+"""Densities where up to a fifth of a second is missing and what was measured around it is taken for
+it [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]: a walker's rates change by some tenths of a rad/s in it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Segment:
@@ -136,10 +140,7 @@ def _unseen(
     b_a: FloatArray,
     config: NavigatorConfig,
 ) -> Segment:
-    """Through a gap: constant velocity, under noise wide enough for a walker.
-
-    The attitude stays, or turns as at both ends of a short one.
-    """
+    """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
     hover = R_WB.T @ [0.0, 0.0, config.gravity] + b_a
     noise = replace(
         config.noise,
@@ -149,14 +150,11 @@ def _unseen(
     # In one step position and velocity would be in error together: no graph can invert that.
     time = np.linspace(interval.start, interval.stop, _GAP_STEPS + 1)
     gyro, accel = np.tile(b_g, (len(time), 1)), np.tile(hover, (len(time), 1))
-    if interval.short_gap:
-        share = np.linspace(0.0, 1.0, len(time))[:, None]
-        gyro = (1.0 - share) * interval.gyro[0] + share * interval.gyro[-1]
     return preintegrate(time, gyro, accel, b_g, b_a, noise, config.gravity)
 
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
-    """White noise, wider where a sensor was saturated."""
+    """White noise, wider where a sensor was saturated and where samples are missing."""
     noise, f = config.noise, config.filter
     if interval.accel_factor != 1.0:
         noise = replace(noise, accel_noise=interval.accel_factor * noise.accel_noise)
@@ -165,6 +163,12 @@ def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
         noise = replace(noise, gyro_noise=max(noise.gyro_noise, f.gap_gyro_noise))
     if interval.flags.accel:
         noise = replace(noise, accel_noise=max(noise.accel_noise, f.gap_accel_noise))
+    if interval.flags.missing:
+        noise = replace(
+            noise,
+            gyro_noise=max(noise.gyro_noise, _MISSING_GYRO),
+            accel_noise=max(noise.accel_noise, _MISSING_ACCEL),
+        )
     return noise
 
 

@@ -156,7 +156,7 @@ def cut(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
     return (walk.time > start) & (walk.time < stop)
 
 
-@pytest.mark.parametrize("length", [0.15, 0.5, 5.0])
+@pytest.mark.parametrize("length", [0.25, 0.5, 5.0])
 def test_a_gap_is_one_epoch_and_no_window_spans_it(
     walk: ImuSequence, without: Callable[..., ImuSequence], length: float
 ) -> None:
@@ -172,6 +172,23 @@ def test_a_gap_is_one_epoch_and_no_window_spans_it(
     assert not any(a < gap.stop - 1e-9 and b > gap.start + 1e-9 for a, b in spans)
     after = [b for a, b in spans if a > gap.start]
     assert min(after) == pytest.approx(stop + WINDOW_SECONDS)
+
+
+def test_a_hole_is_bridged_and_what_touches_it_is_flagged(
+    walk: ImuSequence, without: Callable[..., ImuSequence]
+) -> None:
+    start, stop = 6.02, 6.17
+    holed = without(walk, cut(walk, start + 1e-9, stop - 1e-9))
+    intervals, front_end = cut_recording(holed, CONFIG)
+    assert not any(e.gap for e in intervals)
+    assert front_end.counts.gaps == [(pytest.approx(start), pytest.approx(stop - start))]
+    assert_seamless(intervals, walk.time[0])
+    missing = [e for e in intervals if e.flags.missing]
+    assert missing == [e for e in intervals if e.start < stop - 1e-9 and e.stop > start + 1e-9]
+    for e in intervals:
+        if e.window is not None:
+            touches = e.stop - WINDOW_SECONDS < missing[-1].stop - 1e-9
+            assert e.window_flagged == (touches and e.stop > missing[0].start + 1e-9)
 
 
 def test_a_tenth_of_a_second_is_bridged(
