@@ -19,11 +19,13 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.linalg import norm
 
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform
+from stario.fusion.filter.innovations import is_gated
 from stario.fusion.filter.network_turn import begun
 from stario.fusion.filter.seen_positions import SeenPositions
 from stario.fusion.fixes import Fix
@@ -43,6 +45,10 @@ FAR_ENOUGH = 0.3
 """Two positions tell the yaw when it is then known to this [rad]; half its square, what the
 linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
+_CONVINCING, _ALIKE = 3, 0.8
+"""Positions in a row taken for outliers whose residuals point the same way (cosine above this) are
+right, and the track is not."""
+
 _MUCH_LARGER, _LARGEST = 1e3, 1e5
 """An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
 beyond, the covariance keeps no digits for the fix."""
@@ -59,6 +65,7 @@ class MapFrameState:
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
         seen: positions since it was placed, from the pivot, while its yaw is not known.
+        off: (3,) residuals of the last positions, if they were outliers [m].
     """
 
     placed: bool
@@ -67,6 +74,7 @@ class MapFrameState:
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
     seen: SeenPositions = field(default_factory=SeenPositions)
+    off: tuple[FloatArray, ...] = ()
 
 
 class MapFrame:
@@ -161,10 +169,26 @@ class MapFrame:
             ekf.state = begun(ekf.state, self._turn_sigma)
         gate = chi2_quantile(self._gate, len(fix.value))
         if fix.kind == "position":
-            return ekf.update_position_W(fix.value, fix.covariance, gate)
+            return self._update_position(ekf, fix, gate)
         if fix.kind == "velocity":
             return ekf.update_velocity_W(fix.value, fix.covariance, gate)
         return ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+
+    def _update_position(self, ekf: StateCloningEkf, fix: Fix, gate: float) -> UpdateResult:
+        """Outliers are inflated; some in a row that are off alike say that the track is."""
+        before = ekf.state
+        result = ekf.update_position_W(fix.value, fix.covariance, gate)
+        off = result.residual
+        if off is None or not is_gated(result):
+            self.state = replace(self.state, off=())
+            return result
+        alike = tuple(r for r in self.state.off if r @ off > _ALIKE * norm(r) * norm(off))
+        self.state = replace(self.state, off=(*alike, off))
+        if len(self.state.off) < _CONVINCING:
+            return result
+        self.state = replace(self.state, off=())
+        ekf.state = before.with_position_inflated(float(norm(off)))
+        return ekf.update_position_W(fix.value, fix.covariance, gate)
 
 
 def _nav_state(ekf: StateCloningEkf) -> NavState:

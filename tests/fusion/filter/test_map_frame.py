@@ -109,6 +109,31 @@ def test_a_heading_alone_does_not_free_the_position(make_walk: Make, make_oracle
     assert track.covariance[0, 6:9, 6:9].trace() < 0.01
 
 
+class Level:
+    """A network that does not know stairs."""
+
+    def __init__(self, inner: Any) -> None:
+        self.inner = inner
+
+    def predict(self, windows: Any) -> Any:
+        mean, covariance = self.inner.predict(windows)
+        return mean + np.array([0.0, 0.0, 0.4]), covariance
+
+
+def test_fixes_that_agree_win_against_a_track_that_is_sure_of_itself(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Else it ends twenty metres too high: each fix looks like an outlier."""
+    walk = make_walk(3, 60.0)
+    level = Level(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
+    fixes = fixes_of(walk, np.arange(3.0, 59.0, 2.0), np.zeros(3))
+    track = Navigator(level, CONFIG).run(walk, fixes=fixes)
+    truth = walk.truth.at(np.clip(track.time, walk.time[0], walk.time[-1]))
+    error = track.trajectory.position_W - about_z(2.0).apply(truth.position_W)
+    assert np.linalg.norm(error[track.time > 20.0], axis=1).max() < 4.0
+    assert track.health.fixes["gated"] > 3
+
+
 def test_neither_gaps_nor_fixes_let_a_streams_graph_grow(
     make_walk: Make, make_oracle: Make, without: Make
 ) -> None:
