@@ -105,13 +105,15 @@ def _noted(note: str) -> Finding:
 def _samples(health: Health) -> list[Finding]:
     used = health.samples.get("used", 0)
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
-    share = sum(dropped.values()) / max(1, used + sum(dropped.values()))
+    gone = sum(dropped.values())
+    share = gone / max(1, used + gone)
     found = []
     if dropped:
         reasons = _counted(dropped)
         advice = "Log gyroscope and accelerometer at one rate, and close other apps."
         bad = share > DROPPED_SHARE
-        text = f"{share:.1%} of the samples were dropped ({reasons})."
+        amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
+        text = f"{amount} of the samples were dropped ({reasons})."
         found.append(Finding("warning" if bad else "note", text, advice if bad else ""))
     return found
 

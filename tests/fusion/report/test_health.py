@@ -53,6 +53,15 @@ SHAKEN = Health(
 )
 
 
+def test_one_dropped_sample_of_thousands_is_not_none() -> None:
+    (found,) = [
+        finding.text
+        for finding in findings(Health(samples={"used": 9999, "not finite": 1}, updates=100))
+        if "dropped" in finding.text
+    ]
+    assert found == "Fewer than 0.1% of the samples were dropped (1 not finite)."
+
+
 def test_only_sensor_weights_and_filter_together_condemn_the_data() -> None:
     [verdict] = told(SHAKEN)
     assert verdict.startswith("! This track is not to be trusted")
