@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.groups import by_group
 from stario.fusion.evaluation.worth import LEAST_SIGMA
@@ -72,7 +71,6 @@ def fixed_track(
     group: str,
     every: float = 5.0,
     sigma: float = 0.3,
-    backend: BackendName = "ekf",
     seed: int = 0,
 ) -> FixedTrack:
     """Run a recording with fixes.
@@ -85,8 +83,8 @@ def fixed_track(
     fixes = true_fixes(sequence.truth, every, sigma, seed)
     if len(fixes) < _FEWEST:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_FEWEST} or more")
-    track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
-    assert track.covariance is not None  # both back ends give it
+    track = Navigator(model, config).run(sequence, fixes=fixes)
+    assert track.covariance is not None  # a filter gives both
     assert track.health is not None
     errors = pose_errors(track.trajectory, sequence.truth)
     middle = 0.5 * (sequence.truth.time[0] + sequence.truth.time[-1])

@@ -252,6 +252,22 @@ class EkfState:
         return [(0, 6), *((first, first + 3) for first in taken)]
 
 
+def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:
+    """A covariance (n, n) after the error of a row has forgotten all but `kept` of itself.
+
+    Args:
+        P: before.
+        row: of an error that wanders about zero with deviation `sigma`.
+        kept: correlation with what it was.
+        sigma: its deviation in the long run.
+    """
+    P = P.copy()
+    P[row] *= kept
+    P[:, row] *= kept
+    P[row, row] += (1.0 - kept**2) * sigma**2
+    return P
+
+
 def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
     """(N, n, n) of errors about W's axes, each true minus estimate."""
     P, X = (np.array([getattr(e, name) for e in estimates]) for name in ("P", "X"))

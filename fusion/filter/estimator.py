@@ -15,14 +15,14 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
     IntervalMeasurements,
     Step,
 )
-from stario.fusion.filter.gyro_bias import FollowedBiasPrior, GyroBiasPrior, told_of_bias
+from stario.fusion.filter.gyro_bias import FollowedBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
@@ -119,12 +119,12 @@ class Estimator:
         # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
-        bias_told = self._update_bearing(interval)
+        bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self._bias.follow(interval)
         if interval.update or interval.gap:
             self._clone()
-        return IntervalMeasurements(interval, offered, taken, bias_told, at_rest, accepted, segment)
+        return IntervalMeasurements(interval, offered, taken, bearing, at_rest, accepted, segment)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Take in a fix at a time before now; None where it is more than a window late.
@@ -243,8 +243,8 @@ class Estimator:
         self._opinion.sceptic = None  # its frame is no more
         return [taken]
 
-    def _update_bearing(self, interval: ImuInterval) -> tuple[FloatArray, FloatArray] | None:
-        """Returns what it told of the gyroscope's bias, for a stream's graph."""
+    def _update_bearing(self, interval: ImuInterval) -> tuple[EkfState, EkfState] | None:
+        """Returns the filter before and after, of a stream."""
         if interval.field_B is None or not self._magnetic.due(interval.stop):
             return None
         field_B, before = interval.field_B, self.ekf.state
@@ -252,7 +252,7 @@ class Estimator:
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
         self._counts = self._counts.add_bearing(result)
-        return told_of_bias(before, self.ekf.state) if self._streaming else None
+        return (before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:
         if len(self._clones) < self.ekf.slots:

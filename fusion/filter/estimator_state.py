@@ -29,9 +29,9 @@ class IntervalMeasurements(NamedTuple):
     """What the network said of the window that ends here; None where there is none, or at rest."""
     displacement: Displacement | None
     """The same with its covariance as inflated, None where it was left out."""
-    bias_told: tuple[FloatArray, FloatArray] | None
-    """What a bearing of the magnetic field told of the gyroscope's bias: (3,) [rad/s] and its
-    covariance (3, 3); of streams, None where it told nothing."""
+    bearing: tuple[EkfState, EkfState] | None
+    """The filter before and after a bearing of the magnetic field; None where there was none, and
+    of recordings, whose measurements are kept."""
     zero_velocity: ZeroVelocity | None
     """None where the device moved, or the measurement was refused."""
     fixes: list[Accepted]

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, FieldState
+from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.lie import yaw_twist
@@ -132,10 +132,7 @@ def wandered(s: EkfState, seconds: float) -> EkfState:
     assert s.field is not None  # there is one since `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P, g = s.P.copy(), s.first_field + 1
-    P[g] *= kept
-    P[:, g] *= kept
-    P[g, g] += (1.0 - kept**2) * WANDER_SIGMA**2
+    P = gauss_markov(s.P, s.first_field + 1, kept, WANDER_SIGMA)
     return replace(s, P=P, field=replace(s.field, wander=kept * s.field.wander))
 
 

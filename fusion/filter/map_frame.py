@@ -4,10 +4,10 @@ A track that starts without a pose calls its first position zero and its first y
 position fix moves this frame so that the track passes through the fix; what is known of the
 absolute position is then the fix's covariance. The first fix that tells the direction turns it
 about that point: a second position far enough away, several nearer ones together, a velocity, or a
-yaw. Neither is a small
-correction, so neither goes through the filter's linearisation: the frame is transformed exactly
-(the right-invariant error turns with it), then the covariance is inflated as if nothing were known
-of this shift or turn, then the fix is an ordinary measurement (README.md, "Fixes").
+yaw. Neither is a small correction, so neither goes through the filter's linearisation: the frame is
+transformed exactly (the right-invariant error turns with it), then the covariance is inflated as if
+nothing were known of this shift or turn, then the fix is an ordinary measurement (README.md,
+"Fixes").
 
 Behind a gap in which the direction was lost the same holds of the track from there on: the next
 position places it, the next direction turns it, and what was before the gap stays where it is.
@@ -90,7 +90,7 @@ class MapFrame:
         state: what is known of the frame.
     """
 
-    def __init__(self, placed: bool, oriented: bool, gate: float, turn_sigma: float = 0.0) -> None:
+    def __init__(self, placed: bool, oriented: bool, gate: float, turn_sigma: float) -> None:
         self.state = MapFrameState(placed, oriented)
         self._gate, self._turn_sigma = gate, turn_sigma
 
@@ -134,9 +134,11 @@ class MapFrame:
         turn, sigma = _turn(_nav_state(ekf), pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
         if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "yaw")):
+            if fix.kind != "position":
+                return None
             turn, inflation = self.state.seen.turn
-            self._remember(ekf, fix)
-            if fix.kind != "position" or inflation > FAR_ENOUGH:
+            if inflation > FAR_ENOUGH:
+                self._remember(ekf, fix)
                 return None
         R = exp_so3(np.array([0.0, 0.0, turn]))
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since)
@@ -146,8 +148,7 @@ class MapFrame:
         return transform
 
     def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
-        if fix.kind != "position":
-            return
+        """A position, for the direction that several tell together."""
         now, pivot = _nav_state(ekf), self.state.pivot
         track, seen = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))

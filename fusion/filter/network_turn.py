@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 
 SECONDS = 60.0
 """After which a turn is forgotten."""
@@ -33,8 +33,6 @@ def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
     row = s.turn_row
     if s.P[row, row] == 0.0:
         return s
-    kept, P = math.exp(-seconds / SECONDS), s.P.copy()
-    P[row] *= kept
-    P[:, row] *= kept
-    P[row, row] += (1.0 - kept**2) * sigma**2
+    kept = math.exp(-seconds / SECONDS)
+    P = gauss_markov(s.P, row, kept, sigma)
     return replace(s, P=P, network_turn=kept * s.network_turn)

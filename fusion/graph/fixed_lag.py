@@ -18,6 +18,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
+from stario.fusion.filter.gyro_bias import told_of_bias
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
@@ -93,8 +94,8 @@ class FixedLagEstimator:
         if self._stale or interval.anew is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bias_told is not None:
-            self._tell_gyro_bias(*taken.bias_told)
+        if taken.bearing and (told := told_of_bias(*taken.bearing)):
+            self._tell_gyro_bias(*told)
         near = [self._near(accepted) for accepted in taken.fixes]
         if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
