@@ -42,12 +42,13 @@ class DenseEkf(StateCloningEkf):
         HP: FloatArray,
         HPH: FloatArray,
         whitener: FloatArray,
-    ) -> None:
+    ) -> FloatArray:
         H = np.zeros((len(residual), self.dim_x))
         for first, block in blocks:
             H[:, first : first + block.shape[1]] = block
         self.R = covariance
         self.update(residual[:, None], lambda x: H, lambda x: H @ x)
+        return self.P
 
 
 @dataclass(frozen=True)

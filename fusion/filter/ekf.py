@@ -295,12 +295,11 @@ class StateCloningEkf(ErrorStateEngine):
             S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
             K = np.linalg.solve(S, rows).T
             P = P - K @ rows
-            self.P = 0.5 * (P + P.T)
             self.x = (K @ -self.state.b_g)[:, None]
-            self._inject()
+            self._inject(0.5 * (P + P.T))
             old = step
 
-    def _inject(self) -> None:
+    def _inject(self, P: FloatArray) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
         s, dx = self.state, self.x[:, 0]
         xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
@@ -310,7 +309,7 @@ class StateCloningEkf(ErrorStateEngine):
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
         field = None if s.field is None else _moved(s.field, dx[s.first_field :])
         turn = s.network_turn + float(dx[s.turn_row])
-        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, network_turn=turn, field=field)
+        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
 
 

@@ -244,6 +244,8 @@ class EkfState:
     def _estimate(
         self, time: float, X: FloatArray, P: FloatArray, in_gap: bool, map_frame: int
     ) -> Estimate:
+        # Copies: a view would keep the whole covariance alive for as long as the estimate.
+        X, P = X.copy(), P.copy()
         return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
 
     def _poses(self) -> list[tuple[int, int]]:

@@ -110,12 +110,11 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             whitener = _whitener(HPH + covariance)
         if not math.isfinite(nis):
             return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        self._correct(residual, blocks, covariance, HP, HPH, whitener)
-        self._inject()
+        self._inject(self._correct(residual, blocks, covariance, HP, HPH, whitener))
         return UpdateResult(nis, m, True, scale, "", residual, sigma)
 
-    def _inject(self) -> None:
-        """Move the error's mean `x` into the state and set it to zero."""
+    def _inject(self, P: FloatArray) -> None:
+        """Move the error's mean `x` into the state and set it to zero; P is its new covariance."""
         raise NotImplementedError
 
     @property
@@ -145,7 +144,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         HP: FloatArray,
         HPH: FloatArray,
         whitener: FloatArray,
-    ) -> None:
+    ) -> FloatArray:
         """P - K S K^T as P - W^T W with W = L^-1 H P: symmetric, of the measurement's rank."""
         W = whitener @ HP
         self.R, self.S = covariance, HPH + covariance
@@ -154,20 +153,20 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
-        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
-            self._correct_as_joseph(blocks)
-        else:
-            # P is symmetric: its transpose is the same matrix in the order of BLAS.
-            self.P = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
         self._log_likelihood = self._likelihood = self._mahalanobis = None
+        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
+            return self._correct_as_joseph(blocks)
+        # P is symmetric: its transpose is the same matrix in the order of BLAS.
+        P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
+        return P
 
-    def _correct_as_joseph(self, blocks: Sequence[Block]) -> None:
+    def _correct_as_joseph(self, blocks: Sequence[Block]) -> FloatArray:
         """(I - K H) P (I - K H)^T + K R K^T: slower, but without differences of large numbers."""
         A = np.eye(len(self.P))
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H
         P = A @ self.P @ A.T + self.K @ self.R @ self.K.T
-        self.P = 0.5 * (P + P.T)
+        return np.asarray(0.5 * (P + P.T))
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

@@ -25,6 +25,7 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.outliers import Flags
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
@@ -154,22 +155,30 @@ def _unseen(
 
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
+    f = config.filter
+    return _widened(
+        config.noise,
+        interval.accel_factor,
+        interval.flags,
+        f.gap_gyro_noise,
+        f.gap_accel_noise,
+    )
+
+
+@lru_cache(maxsize=64)  # intervals in a row are alike, and checked settings take long to make
+def _widened(
+    noise: ImuNoise, accel_factor: float, flags: Flags, gap_gyro: float, gap_accel: float
+) -> ImuNoise:
     """White noise, wider where a sensor was saturated and where samples are missing."""
-    noise, f = config.noise, config.filter
-    if interval.accel_factor != 1.0:
-        noise = replace(noise, accel_noise=interval.accel_factor * noise.accel_noise)
+    gyro, accel = noise.gyro_noise, accel_factor * noise.accel_noise
     # What a saturated sensor missed is as unknown as what happens in a gap.
-    if interval.flags.gyro:
-        noise = replace(noise, gyro_noise=max(noise.gyro_noise, f.gap_gyro_noise))
-    if interval.flags.accel:
-        noise = replace(noise, accel_noise=max(noise.accel_noise, f.gap_accel_noise))
-    if interval.flags.missing:
-        noise = replace(
-            noise,
-            gyro_noise=max(noise.gyro_noise, _MISSING_GYRO),
-            accel_noise=max(noise.accel_noise, _MISSING_ACCEL),
-        )
-    return noise
+    if flags.gyro:
+        gyro = max(gyro, gap_gyro)
+    if flags.accel:
+        accel = max(accel, gap_accel)
+    if flags.missing:
+        gyro, accel = max(gyro, _MISSING_GYRO), max(accel, _MISSING_ACCEL)
+    return replace(noise, gyro_noise=gyro, accel_noise=accel)
 
 
 def preintegrate(
