@@ -42,6 +42,7 @@ from stario.sequences.sequence import (
     BoolArray,
     FloatArray,
     ImuSequence,
+    PositionTrack,
     Trajectory,
     second_ticks,
 )
@@ -55,7 +56,12 @@ _CLIP_FACTOR = 3.0
 _CROWDED = 12.0  # rounds from which lines are drawn finer
 
 
-def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title: str) -> Figure:
+def plan_view(
+    tracks: Mapping[str, Trajectory],
+    truth: Trajectory | None,
+    title: str,
+    known: PositionTrack | None = None,
+) -> Figure:
     """All tracks from above, on equal axes that fit the truth and the tracks near it.
 
     A track that drifts far beyond these is cut at the frame and the legend says how far it goes.
@@ -66,6 +72,7 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
             fixed colours.
         truth: the true track in the same frame, or None.
         title: of the figure.
+        known: positions or waypoints in the same frame, (n, 2), where there is no true track.
 
     Raises:
         InputError: there is nothing to draw.
@@ -83,6 +90,8 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
     home = box_of(typical)
     near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
+    if known is not None and len(known):
+        near.append(box_of(known.position_W))
     frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
@@ -96,6 +105,11 @@ def plan_view(tracks: Mapping[str, Trajectory], truth: Trajectory | None, title:
         if far > 0.5 * size_of(home):
             label += f" (leaves the figure, by {distance(far)})"
         draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+    if known is not None and len(known):
+        size = 7.0 if known.kind == "waypoints" else 3.0
+        label = f"{known.kind}, fitted"
+        x, y = known.position_W.T
+        axes.plot(x, y, "x", color="black", ms=size, mew=1.6, label=label, zorder=4)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=INK, label="start")
     axes.plot([], [], "s", mfc=INK, mec="white", label="end")

@@ -77,6 +77,7 @@ def _run(
     import numpy as np
 
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
+    from stario.fusion.evaluation.known_positions import position_error_words, shown_positions
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import told
@@ -91,8 +92,9 @@ def _run(
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, alignment)
     words = metric_words(alignment)
     written = write_run(
-        folder, sequence.name, track, truth, aligned, metrics, words, navigator.config, backend
-    )
+        folder, sequence.name, track, truth, aligned, metrics, words, navigator.config, backend,
+        shown_positions(sequence, track),
+    )  # fmt: skip
     if shown.report:
         from stario.fusion.report.page import write_report
 
@@ -118,8 +120,6 @@ def _run(
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     elif sequence.positions is not None:
-        from stario.fusion.evaluation.known_positions import position_error_words
-
         typer.echo(position_error_words(track, sequence.positions))
     if track.health is not None:
         typer.echo("\n".join([*track.health.lines(), *told(track.health)]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
-from stario.sequences.sequence import PositionTrack
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack
 
 LEAST = 2
 """One position is met by a shift alone; of two the distance is compared."""
@@ -22,14 +22,51 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     Returns:
         Root mean square [m], NaN where fewer than `LEAST` lie within the track; and how many do.
     """
-    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
+    inside = _within(track, known)
+    count = int(inside.sum())
+    if count < LEAST:
+        return float("nan"), count
+    away = placed(track, known).position_W - _track_at(track, known.time[inside])
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), count
+
+
+def placed(track: Track, known: PositionTrack) -> PositionTrack:
+    """Those of the known positions that lie within a track, seen from above.
+
+    They are turned about the vertical and shifted to where they fit the track best, in its frame.
+
+    Args:
+        track: of the same recording.
+        known: positions or waypoints.
+
+    Returns:
+        The positions (n, 2) [m]; a single one lies on the track.
+    """
+    inside = _within(track, known)
     time, truth = known.time[inside], known.position_W[inside]
-    if len(time) < LEAST:
-        return float("nan"), len(time)
-    x, y = (np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1))
-    truth_xy = truth[:, 0] + 1j * truth[:, 1]
-    away = fit_yaw_and_position(x + 1j * y, truth_xy) - truth_xy
-    return float(np.sqrt(np.mean(np.abs(away) ** 2))), len(time)
+    if not len(time):
+        return PositionTrack(time, truth[:, :2], known.kind)
+    ours = _track_at(track, time)
+    moved = fit_yaw_and_position(truth[:, 0] + 1j * truth[:, 1], ours[:, 0] + 1j * ours[:, 1])
+    return PositionTrack(time, np.column_stack([moved.real, moved.imag]), known.kind)
+
+
+def _within(track: Track, known: PositionTrack) -> BoolArray:
+    inside: BoolArray = (known.time >= track.time[0]) & (known.time <= track.time[-1])
+    return inside & known.valid
+
+
+def _track_at(track: Track, time: FloatArray) -> FloatArray:
+    """The track from above (n, 2) [m]."""
+    at = [np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1)]
+    return np.column_stack(at)
+
+
+def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None:
+    """What is drawn beside a track: known positions as `placed`, where there is no true track."""
+    if sequence.truth is not None or sequence.positions is None:
+        return None
+    return placed(track, sequence.positions)
 
 
 def position_error_words(track: Track, known: PositionTrack) -> str:

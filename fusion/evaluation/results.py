@@ -15,7 +15,7 @@ from stario.sequences.drawing import save_figure
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
 from stario.sequences.plots import error_over_time, innovations, plan_view
-from stario.sequences.sequence import Trajectory
+from stario.sequences.sequence import PositionTrack, Trajectory
 
 
 def write_run(
@@ -28,11 +28,13 @@ def write_run(
     words: dict[str, str],
     config: NavigatorConfig,
     backend: BackendName = "ekf",
+    known: PositionTrack | None = None,
 ) -> list[Path]:
     """Write one fused track; returns the files.
 
     `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
-    `config.json`, `health.json`, and the figures; the graph's track is called `graph`.
+    `config.json`, `health.json`, and the figures; the graph's track is called `graph`. Known
+    positions in the track's frame (`known_positions.placed`) are drawn where there is no truth.
 
     Raises:
         InputError: the folder cannot be made.
@@ -47,7 +49,8 @@ def write_run(
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    return written + _figures(folder, name, {backend: aligned}, truth, track.innovations, config)
+    filtered = track.innovations
+    return written + _figures(folder, name, {backend: aligned}, truth, filtered, config, known)
 
 
 def write_comparison(
@@ -95,7 +98,7 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
     filtered = comparison.tracks["ekf"].innovations
-    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config)
+    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config, None)
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
@@ -139,8 +142,9 @@ def _figures(
     truth: Trajectory | None,
     filtered: Innovations | None,
     config: NavigatorConfig,
+    known: PositionTrack | None,
 ) -> list[Path]:
-    figures = {"plan.png": plan_view(tracks, truth, name)}
+    figures = {"plan.png": plan_view(tracks, truth, name, known)}
     if truth is not None:
         shown = {k: v for k, v in tracks.items() if k != "inertial"}
         figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")

@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 
 from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, style
 from stario.fusion.report.series import Series, ellipse
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import FloatArray, PositionTrack
 
 PANEL_HEIGHT = 190
 """Of a panel over time [px]."""
@@ -23,8 +23,16 @@ _LEFT = 58
 """Left margin [px]: the panels' labels need no more, and a phone has no more to give."""
 
 
-def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
-    """All tracks from above on equal axes, with 3-sigma ellipses along those that state them."""
+def map_figure(
+    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None = None
+) -> go.Figure:
+    """All tracks from above on equal axes, with 3-sigma ellipses along those that state them.
+
+    Args:
+        tracks: by name.
+        truth: in the same frame, None where there is no true track.
+        known: positions or waypoints, likewise, that there are instead.
+    """
     figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
         figure.add_trace(_path(TRUTH, truth, 3.0))
@@ -35,6 +43,8 @@ def map_figure(tracks: Mapping[str, Series], truth: Series | None) -> go.Figure:
         figure.add_trace(_path(name, series, 2.0))
     for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
         figure.add_trace(_ends(name, series))
+    if known is not None and len(known):
+        figure.add_trace(_known(known))
     figure.update_layout(
         font=_FONT,
         paper_bgcolor="white",
@@ -171,6 +181,19 @@ def _ends(name: str, series: Series) -> go.Scatter:
             "line": {"width": 2},
         },
         hoverinfo="skip",
+    )
+
+
+def _known(known: PositionTrack) -> go.Scatter:
+    """Crosses where somebody, or a satellite, said the device was."""
+    return go.Scatter(
+        x=known.position_W[:, 0].round(3),
+        y=known.position_W[:, 1].round(3),
+        name=known.kind,
+        mode="markers",
+        marker={"symbol": "x-thin-open", "color": "#000000", "size": 10, "line": {"width": 2}},
+        hovertemplate=f"{known.kind}: x %{{x:.2f}} m, y %{{y:.2f}} m, fitted to the track"
+        "<extra></extra>",
     )
 
 

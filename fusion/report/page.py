@@ -87,6 +87,7 @@ def report_html(
     """The report's text; arguments as of `write_report`."""
     from plotly.offline import get_plotlyjs
 
+    from stario.fusion.evaluation.known_positions import shown_positions
     from stario.fusion.report.figures import map_figure, time_figure
     from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels
     from stario.fusion.report.series import track_series, trajectory_series
@@ -112,7 +113,11 @@ def report_html(
     if innovations is not None and len(innovations.time):
         panels += innovation_panels(innovations, start, config.filter.gate, "m")
     figures = {
-        "map": json.loads(map_figure(steady if truth is None else series, known).to_json()),
+        "map": json.loads(
+            map_figure(
+                steady if truth is None else series, known, shown_positions(sequence, tracks[main])
+            ).to_json()
+        ),
         "time": json.loads(time_figure(panels).to_json()),
     }
     health = tracks[main].health

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.known_positions import position_error, position_error_words
+from stario.fusion.evaluation.known_positions import placed, position_error, position_error_words
 from stario.sequences import PositionTrack, Trajectory
 
 TIME = np.linspace(0.0, 20.0, 201)
@@ -39,3 +39,10 @@ def test_waypoints_beyond_the_track_are_left_out():
     assert words == "1 of 6 waypoints lie within the track: too few to compare with"
     words = position_error_words(track(PATH), waypoints(PATH))
     assert words.startswith("6 of 6 waypoints lie within the track: 0.00 m rms")
+
+
+def test_positions_are_drawn_where_they_fit_the_track_in_its_own_frame():
+    turned = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
+    shown = placed(track(turned), waypoints(PATH, later=0.0))
+    np.testing.assert_allclose(shown.position_W, turned[::40, :2], atol=1e-9)
+    assert len(placed(track(PATH), waypoints(PATH, later=100.0))) == 0
