@@ -90,7 +90,7 @@ def plan_view(
         raise InputError("tracks", "no valid pose", "at least one track to draw")
     home = box_of(typical)
     near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
-    if known is not None and len(known):
+    if known is not None:
         near.append(box_of(known.position_W))
     frame = frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
@@ -105,7 +105,7 @@ def plan_view(
         if far > 0.5 * size_of(home):
             label += f" (leaves the figure, by {distance(far)})"
         draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
-    if known is not None and len(known):
+    if known is not None:
         size = 7.0 if known.kind == "waypoints" else 3.0
         label = f"{known.kind}, fitted"
         x, y = known.position_W.T

@@ -23,14 +23,14 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
         Root mean square [m], NaN where fewer than `LEAST` lie within the track; and how many do.
     """
     inside = _within(track, known)
-    count = int(inside.sum())
-    if count < LEAST:
+    shown, count = placed(track, known), int(inside.sum())
+    if shown is None or count < LEAST:
         return float("nan"), count
-    away = placed(track, known).position_W - _track_at(track, known.time[inside])
+    away = shown.position_W - _track_at(track, shown.time)
     return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), count
 
 
-def placed(track: Track, known: PositionTrack) -> PositionTrack:
+def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
     """Those of the known positions that lie within a track, seen from above.
 
     They are turned about the vertical and shifted to where they fit the track best, in its frame.
@@ -40,12 +40,13 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack:
         known: positions or waypoints.
 
     Returns:
-        The positions (n, 2) [m]; a single one lies on the track.
+        The positions (n, 2) [m], of which a single one lies on the track; None where none does
+        in time.
     """
     inside = _within(track, known)
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
-        return PositionTrack(time, truth[:, :2], known.kind)
+        return None
     ours = _track_at(track, time)
     moved = fit_yaw_and_position(truth[:, 0] + 1j * truth[:, 1], ours[:, 0] + 1j * ours[:, 1])
     return PositionTrack(time, np.column_stack([moved.real, moved.imag]), known.kind)

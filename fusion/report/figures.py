@@ -43,7 +43,7 @@ def map_figure(
         figure.add_trace(_path(name, series, 2.0))
     for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
         figure.add_trace(_ends(name, series))
-    if known is not None and len(known):
+    if known is not None:
         figure.add_trace(_known(known))
     figure.update_layout(
         font=_FONT,
