@@ -104,6 +104,23 @@ def cached(
     return (_opened(file) if _written(file, built) else None) or built
 
 
+def recording_key(path: Path, options: Mapping[str, object]) -> str:
+    """Digest of what is made of a recording: of its files, what they are read with, the code.
+
+    Args:
+        path: that exists.
+        options: what the result depends on besides the files and this package's code.
+    """
+    stamps = [
+        (str(file), stat.st_size, stat.st_mtime_ns)
+        for file in recording_files(path)
+        for stat in (file.stat(),)
+    ]
+    return _digest(
+        {"path": str(path.resolve()), "files": stamps, "options": options, "code": _code()}
+    )
+
+
 def recording_files(path: Path) -> list[Path]:
     """The files that a recording's content comes from, and perhaps others beside them."""
     path, member = split_name(path)
@@ -139,9 +156,7 @@ def _stored(
     """The cache's file of a recording, or its streams where nothing can be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
-    key = {"path": str(path.resolve()), "files": _stamps(path), "options": dict(options)}
-    key["attitude"] = attitude
-    file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
+    file = folder / (recording_key(path, {**options, "attitude": attitude}) + _SUFFIX)
     if _opened(file) is not None:
         return file
     streams = _streams(read(path), attitude)
@@ -168,16 +183,8 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     return streams
 
 
-def _stamps(path: Path) -> list[tuple[str, int, int]]:
-    return [
-        (str(file), stat.st_size, stat.st_mtime_ns)
-        for file in recording_files(path)
-        for stat in (file.stat(),)
-    ]
-
-
 def _digest(key: Mapping[str, object]) -> str:
-    text = json.dumps(key, sort_keys=True)
+    text = json.dumps(key, sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
 
 

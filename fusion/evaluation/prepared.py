@@ -20,14 +20,12 @@ import safetensors
 import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
-import stario.sequences
 from stario.sequences.batch import Skipped, each
 from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.legs import broken_steps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
-from stario.sequences.readers.archive import split_name
 from stario.sequences.rotations import yaw_of
 from stario.sequences.sequence import (
     BoolArray,
@@ -37,7 +35,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.stream_cache import recording_files
+from stario.sequences.stream_cache import recording_key
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +144,8 @@ def prepared_recordings(
 def _kept(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
 ) -> Prepared:
-    file = folder / f"{_key(path, options)}.judged"
+    key = recording_key(path, {**options, "preparation": _code()})
+    file = folder / f"{key}.judged"
     found = _load(file, path)
     if found is None:
         found = prepare(read(path), path)
@@ -199,22 +198,10 @@ def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPie
     )
 
 
-def _key(path: Path, options: dict[str, object]) -> str:
-    """Digest of what the preparation depends on: files, options, and the code that does it."""
-    file, member = split_name(path)
-    files = [file] if member is not None else recording_files(path)
-    stamps = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-    text = json.dumps([str(member), stamps, options, _code()], sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
-
-
 @cache
 def _code() -> str:
-    digest = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20)
-    folder = Path(stario.sequences.__file__).parent
-    for name in ("levelled_stream.py", "levelling.py", "legs.py", "windows.py", "readers/oxiod.py"):
-        digest.update((folder / name).read_bytes())
-    return digest.hexdigest()
+    """Digest of this module: what other code has prepared is not found again."""
+    return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 
 def _store(file: Path, prepared: Prepared) -> None:
