@@ -97,3 +97,8 @@ def _print_comparison(comparison: Comparison) -> None:
     time = comparison.tracks["ekf"].time
     words = metric_words(comparison.alignment)
     typer.echo(track_table(comparison.metrics, time, sequence.truth, words))
+    if sequence.truth is None and sequence.positions is not None:
+        from stario.fusion.evaluation.known_positions import position_error_words
+
+        for name, track in comparison.tracks.items():
+            typer.echo(f"{name}: {position_error_words(track, sequence.positions)}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, Metrics
+from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.fusion.state import Innovations, Track
 from stario.sequences.drawing import save_figure
@@ -97,8 +98,10 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
     if truth is not None:
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
-    filtered = comparison.tracks["ekf"].innovations
-    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config, None)
+    filter_track = comparison.tracks["ekf"]
+    known = shown_positions(comparison.sequence, filter_track)
+    filtered = filter_track.innovations
+    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config, known)
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:

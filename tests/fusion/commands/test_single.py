@@ -260,10 +260,11 @@ def test_positions_and_waypoints_are_no_pose_truth_and_are_told(stario, tmp_path
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
     taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
     write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=taps)])
-    for command in ("run", "inspect", "compare"):
+    for command, tracks in (("run", 1), ("inspect", 0), ("compare", 5)):
         done = stario(command, "taps.h5")
         assert done.code == 0, done.err
         assert "truth: 2 waypoints" in done.out
+        assert done.out.count("2 of 2 waypoints lie within the track") == tracks
     stario("evaluate", "taps.h5").assert_one_line_error("2 waypoints, no poses")
     done = stario("convert", "taps.h5", "taps.csv")
     assert done.code == 0
