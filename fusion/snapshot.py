@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 10
+FORMAT, VERSION = "stario snapshot", 11
 
 
 @cache

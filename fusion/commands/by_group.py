@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stario.fusion.commands.common import leave_with_skipped, print_json, result_of_each
-from stario.fusion.commands.options import ByOption, Estimating, JsonOption, Reading, grouped
+from stario.fusion.commands.options import (
+    BackendOption,
+    ByOption,
+    Estimating,
+    JsonOption,
+    Reading,
+    grouped,
+)
 
 if TYPE_CHECKING:
     from stario.fusion.backends import BackendName
@@ -55,6 +62,7 @@ def fixes(
     estimating: Estimating,
     every: Annotated[float, typer.Option(min=0.1, help="Seconds between two fixes.")] = 5.0,
     sigma: Annotated[float, typer.Option(min=0.001, help="Their error per axis [m].")] = 0.3,
+    backend: BackendOption = "ekf",
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
@@ -65,7 +73,7 @@ def fixes(
         "check fixes",
         (reading, paths, estimating, by, as_json),
         lambda model, recording, config, group: [
-            fixed_track(model, recording, config, group, every, sigma)
+            fixed_track(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
         ],
         fixed_table,
     )

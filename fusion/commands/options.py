@@ -33,6 +33,7 @@ FixesOption = Annotated[
         help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or yaw.",
     ),
 ]
+BackendOption = Annotated[str, typer.Option(help="What fuses: ekf, or graph.")]
 ByOption = Annotated[
     str, typer.Option(help="Group by set, or by an attribute such as person, device, carry.")
 ]

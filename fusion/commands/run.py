@@ -12,6 +12,7 @@ import typer
 
 from stario.fusion.commands.common import one_by_one, progress_bar, track_table
 from stario.fusion.commands.options import (
+    BackendOption,
     Estimating,
     FixesOption,
     JsonOption,
@@ -33,7 +34,7 @@ def run(
     reading: Reading,
     estimating: Estimating,
     fixes: FixesOption = None,
-    backend: Annotated[str, typer.Option(help="What fuses: ekf, or graph.")] = "ekf",
+    backend: BackendOption = "ekf",
     out: OutOption = None,
     report: ReportOption = False,
     view: Annotated[

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.groups import by_group
 from stario.fusion.evaluation.worth import LEAST_SIGMA
@@ -72,6 +73,7 @@ def fixed_track(
     every: float = 5.0,
     sigma: float = 0.3,
     seed: int = 0,
+    backend: BackendName = "ekf",
 ) -> FixedTrack:
     """Run a recording with fixes.
 
@@ -83,7 +85,7 @@ def fixed_track(
     fixes = true_fixes(sequence.truth, every, sigma, seed)
     if len(fixes) < _FEWEST:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_FEWEST} or more")
-    track = Navigator(model, config).run(sequence, fixes=fixes)
+    track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
     assert track.covariance is not None  # a filter gives both
     assert track.health is not None
     errors = pose_errors(track.trajectory, sequence.truth)

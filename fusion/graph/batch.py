@@ -46,6 +46,7 @@ def smooth(
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
+    turn_sigma: float = 0.0,
 ) -> Smoothed:
     """Optimise a filtered track as a whole.
 
@@ -57,6 +58,7 @@ def smooth(
         config: noise, filter and graph settings.
         gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as the filter knows it by the
             magnetic field, which the graph does not see; None without one.
+        turn_sigma: of the network's turn [rad], where the filter came to know of one.
 
     Returns:
         The graph's states with their marginal covariances; those given where the graph does not
@@ -64,7 +66,8 @@ def smooth(
     """
     origin = filtered[0].p_W  # near the track: see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
-    builder = GraphBuilder(config, _inflated(local[0], prior, transforms))
+    first = _inflated(local[0], prior, transforms)
+    builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
     for taken, state in zip(measurements, local[1:], strict=True):
         near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
         builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)

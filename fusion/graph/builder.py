@@ -10,6 +10,7 @@ from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import Displacement as Measured
+from stario.fusion.filter.network_turn import SECONDS as TURN_SECONDS
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
@@ -42,6 +43,8 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: intervals since the start or the last gap, where a graph is begun anew.
+        turn_sigma: of the network's turn, where fixes tell it from the yaw [rad]; 0: none. Only for
+            whole tracks.
         streaming: take fixes as the filter judged them; displacements too, where it gives them the
             same weight. A loss of the graph's own starts from what the IMU says: while the speed is
             not yet known it took right displacements for outliers, one after the other, in 2 of 100
@@ -55,9 +58,14 @@ class GraphBuilder:
     """
 
     def __init__(
-        self, config: NavigatorConfig, first: NavState, count: int = 0, streaming: bool = False
+        self,
+        config: NavigatorConfig,
+        first: NavState,
+        count: int = 0,
+        turn_sigma: float = 0.0,
+        streaming: bool = False,
     ) -> None:
-        self._config = config
+        self._config, self._turn_sigma = config, turn_sigma
         self.graph = KeyframeGraph(first, config.filter.gate)
         self.starts = [0]
         self.segments: dict[int, list[Segment]] = {0: []}
@@ -191,7 +199,10 @@ class GraphBuilder:
         if not _usable(d_N, covariance):
             return
         assert interval.R_NB_window is not None  # a window always comes with its first attitude
-        term = Displacement(i, self.graph.last, d_N, interval.R_NB_window, covariance)
+        turned = self._turn_sigma > 0.0
+        if turned:
+            self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
+        term = Displacement(i, self.graph.last, d_N, interval.R_NB_window, covariance, turned)
         self.graph.add(term, gated=not self._judged)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:

@@ -7,7 +7,7 @@ alone: no factor of its has a displacement that turns with the yaw of a pose and
 (README.md, "Graph factors").
 
 Tangent of a keyframe, as gtsam's: pose R exp(w), p + R dp in the order w, dp; velocity additive;
-biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
+biases additive, accelerometer first. Keys: x pose, v velocity, b biases, t the network's turn (1,).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, T, V, X
 
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.lie import log_se23, twist, yaw_rotation
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import skew
+from stario.sequences.so3 import exp_so3, skew
 
 _EYE = np.eye(3)
 
@@ -162,6 +162,8 @@ class Displacement:
         d_N: (3,) [m].
         R_NB: (3, 3) levelled attitude at the window's start.
         covariance: (3, 3) [m^2] in N.
+        turned: whether the network's turn at keyframe j is a state: d_N = R_z(tau) R_z(psi)^T
+            (p_j - p_i) - n then, as in the filter (README.md, "Fixes").
     """
 
     i: int
@@ -169,6 +171,7 @@ class Displacement:
     d_N: FloatArray
     R_NB: FloatArray
     covariance: FloatArray
+    turned: bool = False
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -179,13 +182,48 @@ class Displacement:
         """In the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
+        if self.turned:
+            R_NW = exp_so3(np.array([0.0, 0.0, turn_at(values, self.j)])) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
         sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)
         H_i[:, :3] = -np.outer(R_NW @ sideways, R_i[2])
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
-        return Linearised(self.d_N - R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)])
+        predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
+        if self.turned:
+            blocks.append((T(self.j), np.array([[-predicted[1]], [predicted[0]], [0.0]])))
+        return Linearised(self.d_N - predicted, blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class TurnWander:
+    """The network's turn is forgotten as a Gauss-Markov error: tau_j = kept tau_i + n.
+
+    Attributes:
+        i: keyframe of the turn before.
+        j: of this one.
+        kept: correlation of the two; 0 for the first, whose i is j.
+        covariance: (1, 1) of n [rad^2].
+    """
+
+    i: int
+    j: int
+    kept: float
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Of both turns."""
+        return self.i, self.j
+
+    def linearise(self, values: Any) -> Linearised:
+        """About the vertical."""
+        now, before = turn_at(values, self.j), turn_at(values, self.i)
+        blocks = [(T(self.j), np.eye(1))]
+        if self.i != self.j:
+            blocks.append((T(self.i), -self.kept * np.eye(1)))
+        return Linearised(np.array([self.kept * before - now]), blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,8 +339,13 @@ class GyroBias:
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
 
 
-KINDS: tuple[type, ...] = (Prior, Displacement, Position, Velocity, Yaw, GyroBias)
+KINDS: tuple[type, ...] = (Prior, Displacement, TurnWander, Position, Velocity, Yaw, GyroBias)
 """Every kind of term."""
+
+
+def turn_at(values: Any, k: int) -> float:
+    """The network's turn at a keyframe [rad]."""
+    return float(values.atVector(T(k))[0])
 
 
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:

@@ -17,11 +17,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.graph.factors import KeyframeState, Prior, Term
+from stario.fusion.graph.factors import KeyframeState, Prior, Term, TurnWander, turn_at
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
@@ -38,7 +38,7 @@ _LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
-_NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
+_NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class KeyframeGraph:
         self._time: dict[int, float] = {}
         self._segments: dict[int, Segment] = {}  # by the keyframe each begins at
         self._terms: list[Whitened] = []
+        self._turns: dict[int, float] = {}  # of the network, by keyframe
         self._tree: Any = None  # of the last solution
         self.last = -1
         self._insert(first)
@@ -105,6 +106,23 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._tree = None
 
+    def add_turn(self, sigma: float, memory: float) -> None:
+        """Make the network's turn at the last keyframe a state.
+
+        It is only for whole tracks: `marginalise` does not keep it.
+
+        Args:
+            sigma: of it in the long run [rad].
+            memory: after which it is forgotten [s].
+        """
+        j, kept = self.last, 0.0
+        i = max(self._turns, default=j)
+        if i != j:
+            kept = math.exp((self._time[i] - self._time[j]) / memory)
+        self._turns[j] = 0.0
+        covariance = np.array([[(1.0 - kept**2) * sigma**2]])
+        self.add(TurnWander(i, j, kept, covariance), gated=False)
+
     def solve(self, most_rounds: int = 10) -> Solution:
         """Move the keyframes to where everything known fits best.
 
@@ -119,6 +137,7 @@ class KeyframeGraph:
         try:
             rounds, values = self._optimise(most_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
+            self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
             light = sum(term.weigh(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
@@ -171,6 +190,8 @@ class KeyframeGraph:
         values = gtsam.Values()
         for k, state in self._states.items():
             state.insert_into(values, k)
+        for k, turn in self._turns.items():
+            values.insert(T(k), np.array([turn]))
         return values
 
     def _imu_factors(self, before: float = math.inf) -> Any:
@@ -225,7 +246,11 @@ class KeyframeGraph:
 
     def _ordering(self) -> Any:
         """Time's: the graph is a chain whose longest link is a window."""
-        return _ordering([key(k) for k in self._time for key in (X, V, B)])
+        return _ordering([key for k in self._time for key in self._keys(k)])
+
+    def _keys(self, k: int) -> list[int]:
+        turn = [T(k)] if k in self._turns else []
+        return [*turn, X(k), V(k), B(k)]
 
     def _check_determined(self) -> None:
         for k in (next(iter(self._time)), self.last):
@@ -236,7 +261,7 @@ class KeyframeGraph:
 
     def _named(self, message: str) -> str:
         """The state that gtsam's message is about."""
-        found = re.search(r"Symbol: ([xvb])(\d+)", message)
+        found = re.search(r"Symbol: ([xvbt])(\d+)", message)
         if found is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"

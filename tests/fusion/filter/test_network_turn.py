@@ -11,6 +11,7 @@ import pytest
 from support import GRAPH as CONFIG
 
 from stario.fusion import Navigator
+from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.fixed import fixed_track, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
@@ -48,21 +49,28 @@ def test_jacobian_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(H[:, 0], (ends[0] - ends[1]) / (2.0 * step), atol=1e-9)
 
 
-def test_a_track_without_fixes_does_not_know_of_it(walk: ImuSequence, make_oracle: Make) -> None:
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_track_without_fixes_does_not_know_of_it(
+    backend: BackendName, walk: ImuSequence, make_oracle: Make
+) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
-    one, other = (Navigator(oracle, with_turn(sigma)).run(walk) for sigma in (0.05, 0.0))
+    one, other = (
+        Navigator(oracle, with_turn(sigma), backend=backend).run(walk) for sigma in (0.05, 0.0)
+    )
     np.testing.assert_array_equal(one.trajectory.position_W, other.trajectory.position_W)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_turned_network_does_not_make_the_yaw_overconfident(
-    make_walk: Make, make_oracle: Make
+    backend: BackendName, make_walk: Make, make_oracle: Make
 ) -> None:
     """The fixes tell where the track leads; which part of the difference is whose, nothing does."""
     walk = make_walk(11, 120.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     told, ignored = (
-        fixed_track(model, walk, with_turn(sigma), "walks", 3.0, 0.1) for sigma in (0.1, 0.0)
+        fixed_track(model, walk, with_turn(sigma), "walks", 3.0, 0.1, backend=backend)
+        for sigma in (0.1, 0.0)
     )
     assert told.yaw_covered > 0.95
     assert told.yaw_nees < 3.0

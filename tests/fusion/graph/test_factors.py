@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, T, V, X
 
 from stario.fusion.graph.factors import (
     Displacement,
@@ -16,6 +16,7 @@ from stario.fusion.graph.factors import (
     Position,
     Prior,
     Term,
+    TurnWander,
     Velocity,
     Yaw,
 )
@@ -31,6 +32,7 @@ def random_values(rng: np.random.Generator) -> Any:
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(R), rng.normal(size=3)))
         values.insert(V(k), rng.normal(size=3))
         values.insert(B(k), gtsam.imuBias.ConstantBias(rng.normal(size=3), rng.normal(size=3)))
+        values.insert(T(k), rng.normal(size=1))
     return values
 
 
@@ -51,10 +53,13 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Yaw(0, exp_so3(np.array([0.0, 0.0, 0.3])) @ state.R_WB, np.eye(1)),
         GyroBias(0, rng.normal(size=3), EYE),
         Prior(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
+        Displacement(0, 1, rng.normal(size=3), R_NB, EYE, turned=True),
+        TurnWander(0, 1, 0.6, np.eye(1)),
+        TurnWander(1, 1, 0.0, np.eye(1)),
     ]
 
 
-@pytest.mark.parametrize("which", range(6))
+@pytest.mark.parametrize("which", range(9))
 def test_jacobians_are_those_of_the_prediction(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -64,7 +69,7 @@ def test_jacobians_are_those_of_the_prediction(which: int) -> None:
         given = {key: H for key, H in blocks}
         assert residual.shape == (len(term.covariance),)
         for key in values.keys():  # noqa: SIM118
-            width = 3 if key in (V(0), V(1)) else 6
+            width = {V(0): 3, V(1): 3, T(0): 1, T(1): 1}.get(key, 6)
             for column in range(width):
                 step = np.zeros(width)
                 step[column] = 1e-5
