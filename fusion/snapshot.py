@@ -56,7 +56,14 @@ def _classes() -> dict[str, type]:
         seen_positions,
         zero_velocity,
     )
-    from stario.fusion.graph import builder, factors, fixed_lag, keyframes, whitening
+    from stario.fusion.graph import (
+        builder,
+        factors,
+        fixed_lag,
+        keyframe_state,
+        keyframes,
+        whitening,
+    )
     from stario.fusion.imu import front_end, gyro_unit, intervals, outliers, preintegration
     from stario.sequences import levelling, noise
 
@@ -81,7 +88,7 @@ def _classes() -> dict[str, type]:
         *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
         seen_positions.SeenPositions,
         *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
-        *(keyframes.KeyframeGraph, whitening.Whitened, factors.KeyframeState),
+        *(keyframes.KeyframeGraph, whitening.Whitened, keyframe_state.KeyframeState),
         *factors.KINDS,
     )
     return {each.__name__: each for each in classes}

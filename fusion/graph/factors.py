@@ -16,14 +16,14 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.lie import log_se23, twist, yaw_rotation
+from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.lie import twist, yaw_rotation
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3, skew
+from stario.sequences.so3 import exp_so3
 
 _EYE = np.eye(3)
 
@@ -51,57 +51,6 @@ class Term(Protocol):
     def linearise(self, values: Any) -> Linearised:
         """At gtsam `Values`."""
         ...
-
-
-class KeyframeState(NamedTuple):
-    """A keyframe's state."""
-
-    R_WB: FloatArray
-    """(3, 3)."""
-    v_W: FloatArray
-    """(3,) [m/s]."""
-    p_W: FloatArray
-    """(3,) [m]."""
-    b_g: FloatArray
-    """(3,) [rad/s]."""
-    b_a: FloatArray
-    """(3,) [m/s^2]."""
-
-    @classmethod
-    def of(cls, values: Any, k: int) -> KeyframeState:
-        """Keyframe k in gtsam `Values`."""
-        pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
-        return cls(
-            pose.rotation().matrix(),
-            values.atVector(V(k)),
-            pose.translation(),
-            bias.gyroscope(),
-            bias.accelerometer(),
-        )
-
-    def insert_into(self, values: Any, k: int) -> None:
-        """Make this keyframe k of gtsam `Values`."""
-        values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
-        values.insert(V(k), self.v_W)
-        values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
-
-    def error_from(self, other: KeyframeState) -> FloatArray:
-        """Right-invariant error (15,) about another: theta, rho_v, rho_p, b_g, b_a."""
-        R = self.R_WB @ other.R_WB.T
-        pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
-        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
-
-    def invariant_from_local(self) -> FloatArray:
-        """(15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
-        matrix = np.zeros((CORE, CORE))
-        matrix[0:3, 0:3] = self.R_WB
-        matrix[3:6, 0:3] = skew(self.v_W) @ self.R_WB
-        matrix[3:6, 6:9] = _EYE
-        matrix[6:9, 0:3] = skew(self.p_W) @ self.R_WB
-        matrix[6:9, 3:6] = self.R_WB
-        matrix[9:12, 12:15] = _EYE
-        matrix[12:15, 9:12] = _EYE
-        return matrix
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,8 @@ from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.graph.factors import KeyframeState, Prior, Term, TurnWander, turn_at
+from stario.fusion.graph.factors import Prior, Term, TurnWander, turn_at
+from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState

@@ -12,7 +12,6 @@ from gtsam.symbol_shorthand import B, T, V, X
 from stario.fusion.graph.factors import (
     Displacement,
     GyroBias,
-    KeyframeState,
     Position,
     Prior,
     Term,
@@ -20,6 +19,7 @@ from stario.fusion.graph.factors import (
     Velocity,
     Yaw,
 )
+from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.sequences.so3 import exp_so3
 
 EYE = np.eye(3)
