@@ -133,9 +133,7 @@ class GraphBackend:
         bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
         own = in_last_frame(states, transforms)
         first = _with_bias_prior(states[0], estimator.bias_prior.variance)
-        s = estimator.ekf.state
-        turned = s.P[s.turn_row, s.turn_row] > 0.0
-        sigma = config.filter.network_turn_sigma if turned else 0.0
+        sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
         whole = smooth(own, first, filtered.measurements, transforms, config, bias, sigma)
         return Solution(own if whole.fell_back else whole.states, None, [whole.note])
 

@@ -72,8 +72,8 @@ def fixed_track(
     group: str,
     every: float = 5.0,
     sigma: float = 0.3,
-    seed: int = 0,
     backend: BackendName = "ekf",
+    seed: int = 0,
 ) -> FixedTrack:
     """Run a recording with fixes.
 
@@ -86,7 +86,7 @@ def fixed_track(
     if len(fixes) < _FEWEST:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_FEWEST} or more")
     track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
-    assert track.covariance is not None  # a filter gives both
+    assert track.covariance is not None  # both back ends give it
     assert track.health is not None
     errors = pose_errors(track.trajectory, sequence.truth)
     middle = 0.5 * (sequence.truth.time[0] + sequence.truth.time[-1])

@@ -6,7 +6,7 @@ import numpy as np
 
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
 LEAST = 2
 """One position is met by a shift alone; of two the distance is compared."""
@@ -22,12 +22,11 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     Returns:
         Root mean square [m], NaN where fewer than `LEAST` lie within the track; and how many do.
     """
-    inside = _within(track, known)
-    shown, count = placed(track, known), int(inside.sum())
-    if shown is None or count < LEAST:
-        return float("nan"), count
+    shown = placed(track, known)
+    if shown is None or len(shown) < LEAST:
+        return float("nan"), 0 if shown is None else len(shown)
     away = shown.position_W - _track_at(track, shown.time)
-    return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), count
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), len(shown)
 
 
 def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
@@ -43,18 +42,13 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
         The positions (n, 2) [m], of which a single one lies on the track; None where none does
         in time.
     """
-    inside = _within(track, known)
+    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
         return None
     ours = _track_at(track, time)
     moved = fit_yaw_and_position(truth[:, 0] + 1j * truth[:, 1], ours[:, 0] + 1j * ours[:, 1])
     return PositionTrack(time, np.column_stack([moved.real, moved.imag]), known.kind)
-
-
-def _within(track: Track, known: PositionTrack) -> BoolArray:
-    inside: BoolArray = (known.time >= track.time[0]) & (known.time <= track.time[-1])
-    return inside & known.valid
 
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:

@@ -189,7 +189,7 @@ class StateCloningEkf(ErrorStateEngine):
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
         residual = d_W - (p_j - p_i)
-        if self.state.P[turn_row, turn_row] > 0.0:
+        if self.state.has_turn:
             residual = exp_so3(np.array([0.0, 0.0, -self.state.network_turn])) @ d_W - (p_j - p_i)
             blocks.append(turn_jacobian(p_j - p_i, turn_row))
         return self.update_linear(residual, blocks, covariance, gate, gate_mode, power)

@@ -145,6 +145,11 @@ class EkfState:
         return CORE + CLONE * len(self.clone_times)
 
     @property
+    def has_turn(self) -> bool:
+        """Whether the network's turn is a state: before fixes tell it is known to be zero."""
+        return bool(self.P[self.turn_row, self.turn_row] > 0.0)
+
+    @property
     def first_field(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
         return self.turn_row + 1

@@ -20,19 +20,17 @@ SECONDS = 60.0
 
 def begun(s: EkfState, sigma: float) -> EkfState:
     """The state with a turn of which no more is known than its deviation [rad]."""
-    row = s.turn_row
-    if s.P[row, row] > 0.0 or sigma == 0.0:
+    if s.has_turn or sigma == 0.0:
         return s
     P = s.P.copy()
-    P[row, row] = sigma**2
+    P[s.turn_row, s.turn_row] = sigma**2
     return replace(s, P=P)
 
 
 def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """The state after a time [s]; as it is where no turn has begun."""
-    row = s.turn_row
-    if s.P[row, row] == 0.0:
+    if not s.has_turn:
         return s
     kept = math.exp(-seconds / SECONDS)
-    P = gauss_markov(s.P, row, kept, sigma)
+    P = gauss_markov(s.P, s.turn_row, kept, sigma)
     return replace(s, P=P, network_turn=kept * s.network_turn)

@@ -134,7 +134,7 @@ class KeyframeGraph:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
                 keyframes stay as they were.
         """
-        start = self._states
+        start = self._states, self._turns
         try:
             rounds, values = self._optimise(most_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
@@ -142,7 +142,7 @@ class KeyframeGraph:
             self._check_determined()
             light = sum(term.weigh(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
-            self._states, self._tree = start, None
+            (self._states, self._turns), self._tree = start, None
             if isinstance(error, IndeterminateError):
                 raise
             raise IndeterminateError(self._named(str(error))) from error  # gtsam's way to tell
