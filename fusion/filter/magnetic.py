@@ -6,9 +6,10 @@ README.md, "Magnetometer". Where the field points in the world is unknown, and i
 
 The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. Yaw and azimuth turn
 together unseen, so that yaw stays as unobservable as it was; its rate, the gyroscope's vertical
-bias, does not. A field whose size or dip is not the place's usual counts for less, and one that
-contradicts the rest is an outlier as any other. Only where a declination is given it says once
-where north is, as a fix of yaw.
+bias, does not. Steel that turns the field changes its size and dip as well: how much these vary
+along the way says how far the azimuth wanders there. A field whose size or dip is not the place's
+usual counts for less, and one that contradicts the rest is an outlier as any other. Only where a
+declination is given it says once where north is, as a fix of yaw.
 
 The field is slow and its errors alike for metres: two bearings a second are all there is to learn.
 """
@@ -32,7 +33,14 @@ PERIOD = 0.5
 """Between two bearings [s]."""
 
 WANDER_SIGMA = 0.4
-"""Of g, the field's azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees."""
+"""Of g, the field's azimuth about its mean, at most [rad]: buildings turn it by 5 to 30 degrees."""
+
+_LEAST_WANDER = 0.1
+"""The same in a field that hardly varies [rad]."""
+
+_WANDER_PER_SPREAD = 2.0
+"""Radians of g per unit of `MagneticReference.spread`: 1 to 2 by the true attitude of OxIOD, RIDI,
+KIPD and tyrex."""
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
 """Over which g is forgotten: the reach of a beam or a radiator, and of what else changes."""
@@ -41,7 +49,8 @@ HARD_IRON_SIGMA = 10.0
 """Of a phone's own field as its calibration leaves it, per axis [uT]."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad]: steel within a step, late samples while the device turns."""
+"""White noise of one bearing [rad] where g wanders by `WANDER_SIGMA`, else in proportion: steel
+within a step, late samples while the device turns."""
 
 _UNKNOWN = math.pi
 """Standard deviation of c at first [rad]."""
@@ -62,7 +71,13 @@ _NORTH_AFTER = 20
 """Bearings from which on north is told: those of ten seconds."""
 
 _MEMORY = 120
-"""Bearings that make the place's usual size and dip: a minute of them."""
+"""Bearings that make the place's usual size, dip and spread: a minute of them."""
+
+_FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
+"""Spread before anything is known, and as how many bearings it counts: as in a building."""
+
+_WALKING = 0.3
+"""Speed below which the spread is not looked at [m/s]: in one spot the field is always quiet."""
 
 
 @dataclass(frozen=True)
@@ -74,27 +89,55 @@ class MagneticReference:
         count: of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
+        spread: mean distance of size (as a share) and dip [rad] from the usual, where one walked.
+        walked: bearings that it is the mean of.
     """
 
     time: float = -math.inf
     count: int = 0
     size: float = 0.0
     dip: float = 0.0
+    spread: float = _FIRST_SPREAD
+    walked: int = 0
+
+    @property
+    def wander_sigma(self) -> float:
+        """Of the azimuth about its mean, by how much size and dip vary [rad]."""
+        return min(max(_WANDER_PER_SPREAD * self.spread, _LEAST_WANDER), WANDER_SIGMA)
+
+    @property
+    def bearing_sigma(self) -> float:
+        """White noise of a bearing in a field of usual size and dip [rad]."""
+        return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
 
     def due(self, time: float) -> bool:
         """Whether a bearing may be taken in."""
         return time - self.time > PERIOD - 1e-6
 
-    def seen(self, time: float, size: float, dip: float) -> MagneticReference:
-        """With one more bearing: means of what is clipped to near them, as robust as medians."""
+    def seen(self, time: float, size: float, dip: float, speed: float) -> MagneticReference:
+        """With one more bearing: means of what is clipped to near them, as robust as medians.
+
+        Args:
+            time: of the bearing [s].
+            size: of the field [uT].
+            dip: angle below the horizontal [rad].
+            speed: of the device [m/s].
+        """
         count = self.count + 1
         if count == 1:
-            return MagneticReference(time, 1, size, dip)
+            return replace(self, time=time, count=1, size=size, dip=dip)
         share = 1.0 / min(count, _MEMORY)
         near = 2.0 * _USUAL_SIZE * self.size
-        size = self.size + share * min(max(size - self.size, -near), near)
-        dip = self.dip + share * min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
-        return MagneticReference(time, count, size, dip)
+        usual_size = self.size + share * min(max(size - self.size, -near), near)
+        off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
+        usual_dip = self.dip + share * off
+        found = MagneticReference(time, count, usual_size, usual_dip, self.spread, self.walked)
+        if speed < _WALKING:
+            return found
+        distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
+        walked = self.walked + 1
+        late = 1.0 / min(walked + _FIRST_COUNT, _MEMORY)
+        return replace(found, spread=self.spread + late * (distance - self.spread), walked=walked)
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -127,12 +170,18 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
     return replace(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
-def wandered(s: EkfState, seconds: float) -> EkfState:
-    """The state after the azimuth has wandered for a time [s] at the speed of now."""
+def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
+    """The state after the azimuth has wandered for a time [s] at the speed of now.
+
+    Args:
+        s: before.
+        seconds: [s].
+        sigma: of the azimuth about its mean [rad].
+    """
     assert s.field is not None  # there is one since `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.P, s.first_field + 1, kept, WANDER_SIGMA)
+    P = gauss_markov(s.P, s.first_field + 1, kept, sigma)
     return replace(s, P=P, field=replace(s.field, wander=kept * s.field.wander))
 
 
@@ -148,7 +197,7 @@ def update_bearing(
     if ekf.state.field is None:
         ekf.state = first_field(ekf.state, m_B)
     elif math.isfinite(reference.time):
-        ekf.state = wandered(ekf.state, now - reference.time)
+        ekf.state = wandered(ekf.state, now - reference.time, reference.wander_sigma)
     s = ekf.state
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
@@ -158,9 +207,9 @@ def update_bearing(
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), replace(
             reference, time=now
         )
-    reference = reference.seen(now, size, dip)
+    reference = reference.seen(now, size, dip, math.hypot(s.v_W[0], s.v_W[1]))
     unusual = math.hypot(
         (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
     )
-    variance = BEARING_SIGMA**2 * (1.0 + unusual**2)
+    variance = reference.bearing_sigma**2 * (1.0 + unusual**2)
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

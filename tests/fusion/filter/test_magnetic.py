@@ -21,6 +21,7 @@ from stario.sequences.errors import ConfigError
 from stario.sequences.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
+from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.so3 import exp_so3
 
@@ -99,7 +100,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
 def test_a_field_of_another_size_counts_for_less() -> None:
     reference = MagneticReference()
     for k in range(20):
-        reference = reference.seen(0.5 * k, 45.0, 1.0)
+        reference = reference.seen(0.5 * k, 45.0, 1.0, speed=1.0)
     gains = []
     for scale in (1.0, 1.5):
         ekf = StateCloningEkf(2)
@@ -108,6 +109,33 @@ def test_a_field_of_another_size_counts_for_less() -> None:
         update_bearing(ekf, replace(reference, size=float(np.linalg.norm(FIELD_W))), m_B)
         gains.append(float(np.trace(ekf.state.P[27:, 27:])))
     assert gains[1] > gains[0]
+
+
+def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> None:
+    rng = np.random.default_rng(1)
+    wander = {}
+    for place, spread, speed in (("quiet", 0.01, 1.0), ("steel", 0.4, 1.0), ("table", 0.01, 0.0)):
+        reference = MagneticReference()
+        for k in range(120):
+            size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
+            reference = reference.seen(0.5 * k, size, dip, speed)
+        wander[place] = reference.wander_sigma
+    assert wander["quiet"] < 0.15
+    assert wander["steel"] == wander["table"] == 0.4  # one spot says nothing of the others
+
+
+def test_a_quiet_place_tells_more_and_neither_more_than_it_can(make_oracle: Make) -> None:
+    walk = generate_walk(3, 120.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
+    sigmas = []
+    for disturbance in (0.5, 8.0):
+        field = MagneticField(disturbance=disturbance)
+        clean = simulate_imu(walk, 100.0, ImuErrors(), 3, magnetic_field=field)
+        sequence = replace(clean, gyro=clean.gyro + np.array([0.0, 0.0, 0.006]))
+        oracle = make_oracle(sequence, sequence.truth, CONFIG, noise=0.1, sigma=0.1)
+        track = Navigator(oracle, CONFIG).run(sequence)
+        sigmas.append(math.sqrt(track.covariance[-1, 11, 11]))
+        assert abs(track.b_g[-1, 2] - 0.006) < 3.0 * sigmas[-1]
+    assert sigmas[0] < 0.7 * sigmas[1]
 
 
 def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
