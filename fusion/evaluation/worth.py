@@ -23,11 +23,15 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.metrics import evaluate_track, pose_errors
+from stario.sequences.nees import position_nees
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 from stario.sequences.text_table import aligned
 
 LEAST_SIGMA = 3.0
 """Deviations that an honest yaw error stays within."""
+
+GOOD_YAW = math.radians(10.0)
+"""What the yaw at the end should be within [rad]."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Worth:
         network_m: error of the network alone [m].
         fused_m: by back end [m].
         nis: the filter's mean; 3 is expected.
+        position_nees: the first back end's median; 2.4 is expected of three axes, nan without true
+            attitude.
         yaw_error: the filter's, at the end against the start [rad]; nan without true attitude.
         yaw_sigma: what it says of it [rad].
     """
@@ -49,6 +55,7 @@ class Worth:
     network_m: float
     fused_m: dict[str, float]
     nis: float
+    position_nees: float
     yaw_error: float
     yaw_sigma: float
 
@@ -85,6 +92,7 @@ def worth_of(
         network_m,
         {name: _error(track, known) for name, track in tracks.items()},
         math.nan if first.nis is None else first.nis,
+        _nees(first, sequence.truth),
         error,
         sigma,
     )
@@ -96,11 +104,15 @@ def worth_table(found: Sequence[Worth]) -> str:
     head = ["group", "n", "network"]
     for name in names:
         head += [f"{name} mean", "p95", "worst"]
-    rows = [[*head, "NIS", "yaw deg", "< 3 sigma"]]
+    rows = [[*head, "NIS", "NEES", "yaw deg", "< 10 deg", "< 3 sigma"]]
     for group, part in by_group(found):
         rows.append(_row(group, part, names))
     words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
-    return "\n".join([*aligned(rows), words])
+    more = (
+        "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
+        "against that at the start"
+    )
+    return "\n".join([*aligned(rows), words, more])
 
 
 def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
@@ -113,9 +125,11 @@ def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
     yaw = np.array([(one.yaw_error, one.yaw_sigma) for one in part])
     yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
     if len(yaw) == 0:
-        return [*row, "-", "-"]
-    covered = (yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]).mean()
-    return [*row, f"{np.degrees(np.median(yaw[:, 0])):.1f}", f"{covered:.0%}"]
+        return [*row, "-", "-", "-", "-"]
+    good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]
+    row += [f"{np.nanmedian([one.position_nees for one in part]):.1f}"]
+    row += [f"{np.degrees(np.median(yaw[:, 0])):.1f}"]
+    return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]
 
 
 def _error(track: Track, known: Trajectory | PositionTrack) -> float:
@@ -123,6 +137,10 @@ def _error(track: Track, known: Trajectory | PositionTrack) -> float:
     if isinstance(known, Trajectory):
         return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
     return position_error(track, known)[0]
+
+
+def _nees(track: Track, truth: Trajectory | None) -> float:
+    return math.nan if truth is None else position_nees(track.trajectory, truth).median
 
 
 def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:

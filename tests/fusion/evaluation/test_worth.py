@@ -16,12 +16,12 @@ Make = Callable[..., Any]
 
 
 def test_ratios_are_geometric_means_by_group() -> None:
-    rows = [Worth("a", "x", 1.0, {"ekf": 0.5}, 3.0, 0.01, 0.1)]
-    rows += [Worth("b", "x", 1.0, {"ekf": 2.0}, 3.0, 0.9, 0.1)]
-    rows += [Worth("c", "y", 2.0, {"ekf": 1.0}, 1.0, float("nan"), 0.1)]
-    _, x, y, pooled, _ = worth_table(rows).splitlines()
+    rows = [Worth("a", "x", 1.0, {"ekf": 0.5}, 3.0, 1.0, 0.01, 0.1)]
+    rows += [Worth("b", "x", 1.0, {"ekf": 2.0}, 3.0, 5.0, 0.9, 0.1)]
+    rows += [Worth("c", "y", 2.0, {"ekf": 1.0}, 1.0, float("nan"), float("nan"), 0.1)]
+    _, x, y, pooled, *_ = worth_table(rows).splitlines()
     assert x.split()[:4] == ["x", "2", "1.00", "1.00"]
-    assert x.split()[-1] == "50%"
+    assert x.split()[-5:] == ["3.0", "3.0", "26.1", "50%", "50%"]
     assert y.split()[3] == "0.50"
     assert pooled.split()[:2] == ["all", "3"]
 
