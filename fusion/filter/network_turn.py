@@ -10,12 +10,37 @@ tell turn and yaw apart, and a track in a frame of its own gains nothing from it
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from stario.fusion.filter.ekf_state import EkfState, gauss_markov
+from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.sequences.sequence import FloatArray
 
 SECONDS = 60.0
 """After which a turn is forgotten."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTurn:
+    """What a filter knows of the turn, for a graph that begins from its state.
+
+    Attributes:
+        turn: [rad].
+        covariance: (16,) with the plain errors of the state (order of `NavState.covariance`), and
+            its variance.
+    """
+
+    turn: float
+    covariance: FloatArray
+
+
+def known_turn(s: EkfState) -> KnownTurn | None:
+    """What a filter knows of it; None where no turn has begun."""
+    if not s.has_turn:
+        return None
+    rows = [*range(CORE), s.turn_row]
+    P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
+    return KnownTurn(s.network_turn, P[CORE])
 
 
 def begun(s: EkfState, sigma: float) -> EkfState:

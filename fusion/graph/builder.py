@@ -11,6 +11,7 @@ from scipy.linalg.lapack import dpotrf
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import Displacement as Measured
 from stario.fusion.filter.network_turn import SECONDS as TURN_SECONDS
+from stario.fusion.filter.network_turn import KnownTurn
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
@@ -43,8 +44,8 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: intervals since the start or the last gap, where a graph is begun anew.
-        turn_sigma: of the network's turn, where fixes tell it from the yaw [rad]; 0: none. Only for
-            whole tracks.
+        turn_sigma: of the network's turn, where fixes tell it from the yaw [rad]; 0: none.
+        turn: what is known of it at the first state, where it is not new.
         streaming: take fixes as the filter judged them; displacements too, where it gives them the
             same weight. A loss of the graph's own starts from what the IMU says: while the speed is
             not yet known it took right displacements for outliers, one after the other, in 2 of 100
@@ -63,10 +64,11 @@ class GraphBuilder:
         first: NavState,
         count: int = 0,
         turn_sigma: float = 0.0,
+        turn: KnownTurn | None = None,
         streaming: bool = False,
     ) -> None:
         self._config, self._turn_sigma = config, turn_sigma
-        self.graph = KeyframeGraph(first, config.filter.gate)
+        self.graph = KeyframeGraph(first, config.filter.gate, turn)
         self.starts = [0]
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
@@ -80,6 +82,11 @@ class GraphBuilder:
         self._pending: list[ImuInterval] = []
         # Keyframes where windows end and begin, by the count of intervals; a gap ends them all.
         self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
+
+    @property
+    def knows_turn(self) -> bool:
+        """Whether the network's turn is a state."""
+        return self._turn_sigma > 0.0
 
     @property
     def newest(self) -> Segment:
@@ -120,6 +127,8 @@ class GraphBuilder:
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
+            if self.knows_turn:
+                self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
             began = self._joints.get(self.count - self._window)
             if displacement is not None and began is not None:
                 self._add_displacement(began, interval, *displacement)
@@ -199,10 +208,8 @@ class GraphBuilder:
         if not _usable(d_N, covariance):
             return
         assert interval.R_NB_window is not None  # a window always comes with its first attitude
-        turned = self._turn_sigma > 0.0
-        if turned:
-            self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
-        term = Displacement(i, self.graph.last, d_N, interval.R_NB_window, covariance, turned)
+        j, R_NB = self.graph.last, interval.R_NB_window
+        term = Displacement(i, j, d_N, R_NB, covariance, self.knows_turn)
         self.graph.add(term, gated=not self._judged)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:

@@ -65,14 +65,16 @@ class Prior:
     Attributes:
         k: the first of the keyframes.
         about: n states, of keyframe k and those behind it, that the error is counted from.
-        root: (m, 15 n).
+        root: (m, 15 n + t), the columns of the turns behind those of the keyframes.
         offset: (m,).
+        turns: t keyframes with a network's turn, and the turn [rad] that its error is counted from.
     """
 
     k: int
     about: tuple[KeyframeState, ...]
     root: FloatArray
     offset: FloatArray
+    turns: tuple[tuple[int, float], ...] = ()
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -93,6 +95,9 @@ class Prior:
             residual = residual - root @ state.error_from(about)
             H = root @ state.invariant_from_local()
             blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
+        for n, (k, turn) in enumerate(self.turns, CORE * len(self.about)):
+            residual = residual - self.root[:, n] * (turn_at(values, k) - turn)
+            blocks.append((T(k), self.root[:, n : n + 1]))
         return Linearised(residual, blocks)
 
 

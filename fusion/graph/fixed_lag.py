@@ -20,6 +20,7 @@ from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.gyro_bias import told_of_bias
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.network_turn import known_turn
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
@@ -158,7 +159,8 @@ class FixedLagEstimator:
     def _stale(self) -> bool:
         """Whether the filter knows by now that the graph began from something else."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
-        return wider or self._filter.map_frame != self._map_frame
+        turned = self._filter.ekf.state.has_turn and not self._builder.knows_turn
+        return wider or turned or self._filter.map_frame != self._map_frame
 
     def _narrow_bias_prior(self) -> None:
         """As the filter did: what the narrower prior knows more, as a measurement of zero."""
@@ -182,7 +184,9 @@ class FixedLagEstimator:
         self._map_frame, self._origin_W = first.map_frame, first.p_W
         self._bias_prior = self._filter.bias_prior.variance
         first = first.shifted(-self._origin_W)
-        self._builder = GraphBuilder(self._config, first, count, streaming=True)
+        turn = known_turn(self._filter.ekf.state)
+        sigma = 0.0 if turn is None else self._config.filter.network_turn_sigma
+        self._builder = GraphBuilder(self._config, first, count, sigma, turn, streaming=True)
         self._restart_from(first)
 
     def _solve(self) -> None:

@@ -21,6 +21,7 @@ from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.network_turn import KnownTurn
 from stario.fusion.graph.factors import Prior, Term, TurnWander, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
@@ -62,9 +63,10 @@ class KeyframeGraph:
         first: the first keyframe; its covariance is the prior.
         gate: probability from which a residual counts as an outlier and is weighed down, where it
             is not added as judged already.
+        turn: what is known of the network's turn at it, where that is a state.
     """
 
-    def __init__(self, first: NavState, gate: float) -> None:
+    def __init__(self, first: NavState, gate: float, turn: KnownTurn | None = None) -> None:
         self._gate = gate
         self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
@@ -74,7 +76,9 @@ class KeyframeGraph:
         self._tree: Any = None  # of the last solution
         self.last = -1
         self._insert(first)
-        self.add(_prior(0, first), gated=False)
+        if turn is not None:
+            self._turns[0] = turn.turn
+        self.add(_prior(0, first, turn), gated=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the solution: `solve` comes before `state` then."""
@@ -108,19 +112,20 @@ class KeyframeGraph:
         self._tree = None
 
     def add_turn(self, sigma: float, memory: float) -> None:
-        """Make the network's turn at the last keyframe a state.
-
-        It is only for whole tracks: `marginalise` does not keep it.
+        """Make the network's turn at the last keyframe a state, where it is none yet.
 
         Args:
             sigma: of it in the long run [rad].
             memory: after which it is forgotten [s].
         """
-        j, kept = self.last, 0.0
+        j, kept, turn = self.last, 0.0, 0.0
+        if j in self._turns:
+            return
         i = max(self._turns, default=j)
         if i != j:
             kept = math.exp((self._time[i] - self._time[j]) / memory)
-        self._turns[j] = 0.0
+            turn = kept * self._turns[i]
+        self._turns[j] = turn
         covariance = np.array([[(1.0 - kept**2) * sigma**2]])
         self.add(TurnWander(i, j, kept, covariance), gated=False)
 
@@ -175,7 +180,7 @@ class KeyframeGraph:
             if term.first < before:
                 linear.push_back(term.factor(values))
                 reached += [k for k in term.term.keyframes if k > before]
-        keys = [key(k) for k in old for key in (X, V, B)]
+        keys = [key for k in old for key in self._keys(k)]
         try:
             _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
@@ -185,6 +190,7 @@ class KeyframeGraph:
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
+            self._turns.pop(k, None)
         self._tree = None
 
     def _values(self) -> Any:
@@ -206,13 +212,17 @@ class KeyframeGraph:
 
     def _marginal(self, reached: range, rest: Any) -> Prior:
         """What elimination left of the keyframes that it reached."""
+        turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
         for k in reached:  # a window may reach a pose alone: columns of the rest as well
-            rest.push_back(_says_nothing(k))
-        A, b = rest.jacobian(_ordering([key(k) for k in reached for key in (X, V, B)]))
+            rest.push_back(_says_nothing(k, k in self._turns))
+        keys = [key(k) for k in reached for key in (X, V, B)]
+        A, b = rest.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
         about = tuple(self.pose(k) for k in reached)
-        to_local = block_diag(*(np.linalg.inv(state.invariant_from_local()) for state in about))
-        return Prior(reached[0], about, table[:, :-1] @ to_local, table[:, -1])
+        to_local = block_diag(
+            *(np.linalg.inv(state.invariant_from_local()) for state in about), np.eye(len(turns))
+        )
+        return Prior(reached[0], about, table[:, :-1] @ to_local, table[:, -1], turns)
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
@@ -268,12 +278,18 @@ class KeyframeGraph:
         return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
 
 
-def _prior(k: int, state: NavState) -> Prior:
-    """A state's covariance as what is known of a keyframe."""
+def _prior(k: int, state: NavState, turn: KnownTurn | None = None) -> Prior:
+    """A state's covariance, and that of the network's turn, as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
-    root = _root_information(to_invariant @ state.covariance @ to_invariant.T)
-    return Prior(k, (about,), root, np.zeros(CORE))
+    covariance: FloatArray = state.covariance
+    turns: tuple[tuple[int, float], ...] = ()
+    if turn is not None:
+        across = turn.covariance[:CORE, None]
+        covariance = np.block([[covariance, across], [across.T, turn.covariance[CORE:, None]]])
+        to_invariant, turns = block_diag(to_invariant, 1.0), ((k, turn.turn),)
+    root = _root_information(to_invariant @ covariance @ to_invariant.T)
+    return Prior(k, (about,), root, np.zeros(len(root)), turns)
 
 
 def _root_information(covariance: FloatArray) -> FloatArray:
@@ -295,9 +311,11 @@ def _world_from_local(R_WB: FloatArray) -> FloatArray:
     return matrix
 
 
-def _says_nothing(k: int) -> Any:
-    """A factor without information on a keyframe."""
+def _says_nothing(k: int, turned: bool) -> Any:
+    """A factor without information on a keyframe, and on the network's turn there."""
     blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
+    if turned:
+        blocks.append((T(k), np.zeros((1, 1))))
     return linear_factor(blocks, np.zeros(1))
 
 

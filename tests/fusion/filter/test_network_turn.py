@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from support import GRAPH as CONFIG
 
-from stario.fusion import Navigator
+from stario.fusion import Navigator, NavState
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.fixed import fixed_track, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
 from stario.fusion.filter.seen_positions import SeenPositions
+from stario.fusion.lie import yaw_twist
 from stario.sequences.metrics import pose_errors
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.so3 import exp_so3
@@ -75,6 +76,39 @@ def test_a_turned_network_does_not_make_the_yaw_overconfident(
     assert told.yaw_covered > 0.95
     assert told.yaw_nees < 3.0
     assert ignored.yaw_nees > 2.0 * told.yaw_nees
+
+
+def end_of_stream(
+    backend: BackendName, config: NavigatorConfig, model: Any, walk: ImuSequence
+) -> NavState:
+    """Of a stream with fixes that is interrupted half way and goes on elsewhere."""
+    navigator = Navigator(model, config, backend=backend)
+    fixes, states = true_fixes(walk.truth, 3.0, 0.1, seed=0), []
+    for k, sample in enumerate(zip(walk.time, walk.gyro, walk.accel, strict=True)):
+        while fixes and fixes[0].time <= sample[0]:
+            fix = fixes.pop(0)
+            navigator.update_position(fix.time, fix.value, fix.covariance)
+        states.append(navigator.push(*sample))
+        if k == len(walk.time) // 2:
+            kept = navigator.snapshot()
+            navigator = Navigator(model, config, backend=backend)
+            navigator.restore(kept)
+    return [s for s in states if s is not None][-1]
+
+
+def test_a_streams_graph_is_as_sure_of_the_yaw_as_its_filter(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Though it forgets all keyframes but those of the last seconds, and the turn with them."""
+    walk = make_walk(11, 120.0)
+    model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
+    ekf, graph = (end_of_stream(each, with_turn(0.1), model, walk) for each in ("ekf", "graph"))
+    sigma = np.sqrt(graph.covariance[2, 2])
+    assert sigma == pytest.approx(np.sqrt(ekf.covariance[2, 2]), rel=0.1)
+    true = walk.truth.at(np.array([graph.time])).attitude_WB.as_matrix()[0]
+    assert abs(yaw_twist(graph.R_WB @ true.T)) < 3.0 * sigma
+    ignorant = end_of_stream("graph", with_turn(0.0), model, walk)
+    assert np.sqrt(ignorant.covariance[2, 2]) < 0.7 * sigma
 
 
 def test_positions_too_near_for_one_to_tell_the_direction_tell_it_together(

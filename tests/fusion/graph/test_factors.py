@@ -56,10 +56,11 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Displacement(0, 1, rng.normal(size=3), R_NB, EYE, turned=True),
         TurnWander(0, 1, 0.6, np.eye(1)),
         TurnWander(1, 1, 0.0, np.eye(1)),
+        Prior(0, (state,), rng.normal(size=(9, 16)), rng.normal(size=9), ((0, 0.2),)),
     ]
 
 
-@pytest.mark.parametrize("which", range(9))
+@pytest.mark.parametrize("which", range(10))
 def test_jacobians_are_those_of_the_prediction(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
