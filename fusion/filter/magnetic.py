@@ -8,8 +8,9 @@ The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. Yaw a
 together unseen, so that yaw stays as unobservable as it was; its rate, the gyroscope's vertical
 bias, does not. Steel that turns the field changes its size and dip as well: how much these vary
 along the way says how far the azimuth wanders there. A field whose size or dip is not the place's
-usual counts for less, and one that contradicts the rest is an outlier as any other. Only where a
-declination is given it says once where north is, as a fix of yaw.
+usual counts for less, so does one that the device has carried on by its own gyroscope instead of
+measuring it, and one that contradicts the rest is an outlier as any other. Only where a declination
+is given it says once where north is, as a fix of yaw.
 
 The field is slow and its errors alike for metres: two bearings a second are all there is to learn.
 """
@@ -76,6 +77,11 @@ _MEMORY = 120
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Spread before anything is known, and as how many bearings it counts: as in a building."""
 
+_HELD, _HELD_FACTOR = 2e-3, 10.0
+"""Share of its size by which a sensor's reading changes at least between two bearings, and the
+factor on the variance of one that does not: some phones give out a calibrated field that they carry
+on by their own gyroscope, of one size to 1e-4 for seconds, where a sensor's own changes by 1e-2."""
+
 _WALKING = 0.3
 """Speed below which the spread is not looked at [m/s]: in one spot the field is always quiet."""
 
@@ -91,6 +97,7 @@ class MagneticReference:
         dip: usual angle below the horizontal [rad].
         spread: mean distance of size (as a share) and dip [rad] from the usual, where one walked.
         walked: bearings that it is the mean of.
+        measured: size of the last field, hard iron and all [uT].
     """
 
     time: float = -math.inf
@@ -99,6 +106,7 @@ class MagneticReference:
     dip: float = 0.0
     spread: float = _FIRST_SPREAD
     walked: int = 0
+    measured: float = 0.0
 
     @property
     def wander_sigma(self) -> float:
@@ -110,18 +118,22 @@ class MagneticReference:
         """White noise of a bearing in a field of usual size and dip [rad]."""
         return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
 
+    def is_held(self, measured: float) -> bool:
+        """Whether a field of this size [uT] is the last one, carried on by the device itself."""
+        return abs(measured - self.measured) < _HELD * measured
+
     def due(self, time: float) -> bool:
         """Whether a bearing may be taken in."""
         return time - self.time > PERIOD - 1e-6
 
-    def seen(self, time: float, size: float, dip: float, speed: float) -> MagneticReference:
+    def seen(self, time: float, size: float, dip: float, news: bool) -> MagneticReference:
         """With one more bearing: means of what is clipped to near them, as robust as medians.
 
         Args:
             time: of the bearing [s].
             size: of the field [uT].
             dip: angle below the horizontal [rad].
-            speed: of the device [m/s].
+            news: whether it tells of another place than the last: measured anew, while walking.
         """
         count = self.count + 1
         if count == 1:
@@ -131,8 +143,8 @@ class MagneticReference:
         usual_size = self.size + share * min(max(size - self.size, -near), near)
         off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
         usual_dip = self.dip + share * off
-        found = MagneticReference(time, count, usual_size, usual_dip, self.spread, self.walked)
-        if speed < _WALKING:
+        found = replace(self, time=time, count=count, size=usual_size, dip=usual_dip)
+        if not news:
             return found
         distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
         walked = self.walked + 1
@@ -193,7 +205,7 @@ def update_bearing(
     Returns:
         what became of it, and what the field usually is with it.
     """
-    now = ekf.state.time
+    now, measured = ekf.state.time, float(np.linalg.norm(m_B))
     if ekf.state.field is None:
         ekf.state = first_field(ekf.state, m_B)
     elif math.isfinite(reference.time):
@@ -207,9 +219,11 @@ def update_bearing(
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), replace(
             reference, time=now
         )
-    reference = reference.seen(now, size, dip, math.hypot(s.v_W[0], s.v_W[1]))
+    held = reference.is_held(measured)
+    news = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
+    reference = replace(reference.seen(now, size, dip, news), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
     )
-    variance = reference.bearing_sigma**2 * (1.0 + unusual**2)
+    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * (_HELD_FACTOR if held else 1.0)
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

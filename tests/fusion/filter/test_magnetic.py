@@ -100,7 +100,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
 def test_a_field_of_another_size_counts_for_less() -> None:
     reference = MagneticReference()
     for k in range(20):
-        reference = reference.seen(0.5 * k, 45.0, 1.0, speed=1.0)
+        reference = reference.seen(0.5 * k, 45.0, 1.0, news=True)
     gains = []
     for scale in (1.0, 1.5):
         ekf = StateCloningEkf(2)
@@ -114,14 +114,34 @@ def test_a_field_of_another_size_counts_for_less() -> None:
 def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> None:
     rng = np.random.default_rng(1)
     wander = {}
-    for place, spread, speed in (("quiet", 0.01, 1.0), ("steel", 0.4, 1.0), ("table", 0.01, 0.0)):
+    for place, spread, news in (
+        ("quiet", 0.01, True),
+        ("steel", 0.4, True),
+        ("table", 0.01, False),
+    ):
         reference = MagneticReference()
         for k in range(120):
             size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
-            reference = reference.seen(0.5 * k, size, dip, speed)
+            reference = reference.seen(0.5 * k, size, dip, news)
         wander[place] = reference.wander_sigma
     assert wander["quiet"] < 0.15
     assert wander["steel"] == wander["table"] == 0.4  # one spot says nothing of the others
+
+
+def test_a_field_that_the_device_carries_on_itself_is_hardly_news() -> None:
+    """Its size is the same to a ten-thousandth, as no sensor's is."""
+    moved = []
+    for change in (1e-4, 1e-2):
+        ekf = StateCloningEkf(2)
+        ekf.state = state()
+        m_B, reference = ekf.state.R_WB.T @ FIELD_W, MagneticReference()
+        _, reference = update_bearing(ekf, reference, m_B)
+        before = ekf.state.field
+        turned = ekf.state.R_WB.T @ exp_so3(np.array([0.0, 0.0, 0.2])) @ FIELD_W
+        update_bearing(ekf, reference, turned * (1.0 + change))
+        after = ekf.state.field
+        moved.append(after.azimuth + after.wander - before.azimuth - before.wander)
+    assert moved[1] > 2.0 * moved[0] > 0.0
 
 
 def test_a_quiet_place_tells_more_and_neither_more_than_it_can(make_oracle: Make) -> None:
