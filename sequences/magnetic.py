@@ -42,6 +42,15 @@ _VERDICTS = (
 )
 """Largest unsteadiness [rad] and least correlation of each."""
 
+HELD_CHANGE = 2e-3
+"""Share of its size by which a measured field changes at least within half a second. Some phones
+give out a calibrated field that they carry on by their own gyroscope: of one size to 1e-4 for
+seconds, where a sensor's own changes by 1e-2."""
+
+_HALF_SECOND, _TURNED_RAD, _OFTEN = 0.5, 0.05, 0.5
+"""Half seconds in which the field turns by so much in the sensor's axes are looked at; share of
+them from which on that deserves a word."""
+
 _UP_RAD = math.radians(20.0)
 _IRON_UT = 10.0
 _SURE = 5.0
@@ -65,6 +74,8 @@ class MagneticFindings:
         hard_iron_sigma_uT: its deviation (3,) [uT].
         bearing_rms_rad: of the levelled bearing about its line within a minute, median [rad].
         drift_rad_s: that line's slope, median: the gyroscope's drift in yaw [rad/s].
+        held: share of the half seconds in which the device turned over which it has carried the
+            field on by itself.
         problems: what is wrong, one line each.
     """
 
@@ -79,6 +90,7 @@ class MagneticFindings:
     hard_iron_sigma_uT: FloatArray | None
     bearing_rms_rad: float
     drift_rad_s: float
+    held: float = 0.0
     problems: tuple[str, ...] = ()
 
     @property
@@ -105,6 +117,7 @@ class MagneticFindings:
             "hard_iron_sigma_uT": self.hard_iron_sigma_uT,
             "levelled_bearing_rms_rad": self.bearing_rms_rad,
             "gyroscope_drift_rad_s": self.drift_rad_s,
+            "held_share": self.held,
             "verdict": self.verdict,
         }
 
@@ -125,6 +138,11 @@ class MagneticFindings:
             f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
             f"gyroscope: {self.verdict}"
         )
+        if self.held > _OFTEN:
+            lines.append(
+                f"  by its size the device carries it on by its own gyroscope {self.held:.0%} of "
+                "the time: it counts for little there"
+            )
         return lines
 
     def _iron_words(self) -> str:
@@ -173,6 +191,7 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         hard_iron_uT=iron,
         hard_iron_sigma_uT=sigma,
         bearing_rms_rad=spread,
+        held=_held(stamps, values),
         drift_rad_s=drift,
     )
     return _with_problems(sequence.name, findings)
@@ -223,6 +242,17 @@ def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
     """Whether an offset is one that must be taken out before the field is judged."""
     sure = np.abs(iron) > _SURE * sigma
     return bool(np.linalg.norm(iron[sure]) > _IRON_UT)
+
+
+def _held(time: FloatArray, field: FloatArray) -> float:
+    """Share of half seconds over which a field (n, 3) turns and its size stays the same."""
+    later = np.searchsorted(time, time + _HALF_SECOND)
+    first = np.flatnonzero(later < len(time))
+    size = np.linalg.norm(field, axis=1)
+    before, after = (field[k] / size[k, None] for k in (first, later[first]))
+    turned = np.linalg.norm(after - before, axis=1) > _TURNED_RAD
+    same = np.abs(size[later[first]] / size[first] - 1.0) < HELD_CHANGE
+    return float(same[turned].mean()) if turned.any() else 0.0
 
 
 def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:

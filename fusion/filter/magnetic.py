@@ -28,6 +28,7 @@ from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.lie import yaw_twist
 from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 PERIOD = 0.5
@@ -77,10 +78,8 @@ _MEMORY = 120
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Spread before anything is known, and as how many bearings it counts: as in a building."""
 
-_HELD, _HELD_FACTOR = 2e-3, 10.0
-"""Share of its size by which a sensor's reading changes at least between two bearings, and the
-factor on the variance of one that does not: some phones give out a calibrated field that they carry
-on by their own gyroscope, of one size to 1e-4 for seconds, where a sensor's own changes by 1e-2."""
+_HELD_FACTOR = 10.0
+"""On the variance of a field that the device has carried on by its own gyroscope."""
 
 _WALKING = 0.3
 """Speed below which the spread is not looked at [m/s]: in one spot the field is always quiet."""
@@ -120,7 +119,7 @@ class MagneticReference:
 
     def is_held(self, measured: float) -> bool:
         """Whether a field of this size [uT] is the last one, carried on by the device itself."""
-        return abs(measured - self.measured) < _HELD * measured
+        return abs(measured - self.measured) < HELD_CHANGE * measured
 
     def due(self, time: float) -> bool:
         """Whether a bearing may be taken in."""

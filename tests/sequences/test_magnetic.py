@@ -72,6 +72,17 @@ def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
     assert "another unit" in " ".join(inspect_recording(replace(good, magnetometer=unit)).problems)
 
 
+def test_a_field_that_the_device_carries_on_itself_is_told_by_its_size() -> None:
+    measured = walk(MagneticField())
+    assert measured.magnetometer is not None
+    time, field = measured.magnetometer.time, measured.magnetometer.field
+    size = np.linalg.norm(field, axis=1, keepdims=True)
+    carried = replace(measured, magnetometer=Magnetometer(time, 44.0 * field / size))
+    told = [" ".join(inspect_recording(one).lines()) for one in (measured, carried)]
+    assert "carries it on by its own gyroscope" not in told[0]
+    assert "carries it on by its own gyroscope 100%" in told[1]
+
+
 def test_inspection_tells_of_a_good_magnetometer_and_of_none() -> None:
     good = inspect_recording(walk(MagneticField()))
     assert not good.problems
