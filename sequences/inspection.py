@@ -146,6 +146,12 @@ class Inspection:
                 "agreeing": fit.agreeing,
                 "jumps": fit.jumps,
                 "axes": fit.axes(),
+                "yaw": fit.yaw
+                and {
+                    "scale": fit.yaw.scale,
+                    "bias_rad_s": fit.yaw.bias,
+                    "left_rad": fit.yaw.left,
+                },
             },
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
@@ -215,6 +221,13 @@ class Inspection:
                 f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
                 f"correlation {fit.correlation:.3f}, "
                 f"world {math.degrees(fit.tilt):.2f} deg off level"
+            )
+        if fit is not None and fit.yaw is not None:
+            lines.append(
+                f"  yaw: the gyroscope turns {100 * abs(fit.yaw.scale):.1f} % too "
+                f"{'far' if fit.yaw.scale > 0.0 else 'little'} and drifts by "
+                f"{math.degrees(fit.yaw.bias):+.3f} deg/s; {math.degrees(fit.yaw.left):.1f} deg "
+                "are left"
             )
         return lines
 

@@ -17,6 +17,7 @@ from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples
 
 LONGEST_S = 600.0
@@ -47,6 +48,7 @@ class TruthFit:
         jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
+        yaw: what turns the gyroscope's yaw away from the truth's; None where that cannot be told.
     """
 
     time_offset: float
@@ -57,6 +59,7 @@ class TruthFit:
     jumps: int
     times: FloatArray
     speed: FloatArray
+    yaw: YawDrift | None
 
     @property
     def misalignment(self) -> float:
@@ -101,6 +104,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
         ),
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
+        yaw=yaw_drift(time, gyro, accel, replace(truth, time=truth.time + aligned.lag), mount),
     )
 
 

@@ -1,0 +1,80 @@
+"""What turns the gyroscope's yaw away from the true one: its scale, and its bias.
+
+A scale error s and a bias b about the vertical make the levelled yaw psi drift against the truth's:
+
+    psi_true - psi = -s / (1 + s) (psi - psi_0) - b (t - t_0) + const
+
+Phones whose system takes the bias off still turn by some percent too far or too little; on a walk
+in loops that adds up, and neither gravity nor the network tells it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.levelling import levelled_attitudes
+from stario.sequences.rotations import yaw_of
+from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.windows import unbroken
+
+_STEP_S = 0.1
+_LEAST_TURNED_RAD = 0.3
+"""Deviation of the yaw from an even turning below which scale and bias cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class YawDrift:
+    """The gyroscope's yaw against the truth's.
+
+    Attributes:
+        scale: share by which the gyroscope turns too far.
+        bias: of it about the vertical [rad/s].
+        left: root mean square of what both do not explain [rad].
+    """
+
+    scale: float
+    bias: float
+    left: float
+
+
+def yaw_drift(
+    time: FloatArray, gyro: FloatArray, accel: FloatArray, truth: Trajectory, R_TB: Rotation
+) -> YawDrift | None:
+    """Fit scale and bias over the longest unbroken stretch.
+
+    Args:
+        time: (n,) [s], increasing.
+        gyro: (n, 3) [rad/s] in B.
+        accel: (n, 3) [m/s^2] in B.
+        truth: attitudes of axes T, on the IMU's clock.
+        R_TB: from B to T.
+
+    Returns:
+        None where the device turned too little to tell.
+    """
+    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
+    part = slice(start, stop)
+    if stop - start < 2:
+        return None
+    R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
+    at = np.unique(np.searchsorted(time[part], np.arange(time[start], time[stop - 1], _STEP_S)))
+    pose = truth.at(time[part][at])
+    attitude_NB = Rotation.from_matrix(R_NB[at])
+    yaw = np.unwrap(yaw_of(attitude_NB))[pose.valid]
+    off = np.unwrap(yaw_of(pose.attitude_WB[pose.valid] * R_TB * attitude_NB[pose.valid].inv()))
+    seconds = time[part][at][pose.valid] - time[start]
+    if len(off) < 3:
+        return None
+    even = np.column_stack([np.ones(len(off)), seconds])
+    turned = yaw - even @ np.linalg.lstsq(even, yaw, rcond=None)[0]
+    if float(turned.std()) < _LEAST_TURNED_RAD:
+        return None
+    columns = np.column_stack([even, yaw])
+    fitted, *_ = np.linalg.lstsq(columns, off, rcond=None)
+    left = math.sqrt(float(np.square(off - columns @ fitted).mean()))
+    _, rate, share = fitted.tolist()
+    return YawDrift(-share / (1.0 + share), -rate, left)

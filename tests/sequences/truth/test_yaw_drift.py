@@ -1,0 +1,53 @@
+"""What turns the gyroscope's yaw is what was done to it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.sequences import ImuSequence, inspect_recording
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.truth.fit import fit_truth
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
+    return simulate_imu(generate_walk(5, 90.0, style=style), 100.0, PERFECT_IMU, 1)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.023, -0.015])
+@pytest.mark.parametrize("bias", [0.0, 0.004])
+def test_scale_and_bias_come_back(walk: ImuSequence, scale: float, bias: float) -> None:
+    truth = walk.truth
+    assert truth is not None
+    up_B = truth.at(walk.time).attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+    found = fit_truth(replace(walk, gyro=(1.0 + scale) * walk.gyro + bias * up_B)).yaw
+    assert found is not None
+    assert found.scale == pytest.approx(scale, abs=2e-3)
+    assert found.bias == pytest.approx(bias, abs=5e-4)
+    assert found.left < np.radians(1.0)
+
+
+def test_a_person_reads_how_far_it_turns(walk: ImuSequence) -> None:
+    far, little = (
+        "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).lines())
+        for scale in (1.03, 0.97)
+    )
+    assert re.search(r"the gyroscope turns (2\.9|3\.[01]) % too far", far)
+    assert re.search(r"the gyroscope turns (2\.9|3\.[01]) % too little", little)
+
+
+def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
+    truth = walk.truth
+    assert truth is not None
+    until = walk.time < walk.time[0] + 12.0
+    short = ImuSequence(
+        walk.name, walk.time[until], 1e-3 * walk.gyro[until], walk.accel[until], truth
+    )
+    still = replace(truth, attitude_WB=truth.attitude_WB[np.zeros(len(truth.time), dtype=int)])
+    assert fit_truth(replace(short, truth=still)).yaw is None
