@@ -19,13 +19,8 @@ from stario.sequences.sequence import (
     too_slow,
 )
 from stario.sequences.stillness import Rest, find_rest
+from stario.sequences.truth.findings import fit_as_dict, fit_lines, fit_problems
 from stario.sequences.truth.fit import TruthFit, fit_truth
-
-_LATE_S = 0.02
-_TURNED_RAD = math.radians(5.0)
-_LEANING_RAD = math.radians(3.0)
-_ALIKE = 0.8
-"""Offset, misalignment, tilt and correlation from which a truth deserves a word."""
 
 
 @dataclass(frozen=True)
@@ -136,23 +131,7 @@ class Inspection:
                 "longest_gap_s": coverage.longest_gap_s,
                 "path_m": coverage.path_m,
             },
-            "truth_against_gyroscope": fit
-            and {
-                "time_offset_s": fit.time_offset,
-                "correlation": fit.correlation,
-                "misalignment_rad": fit.misalignment,
-                "misalignment_rotvec_rad": fit.R_TB.as_rotvec(),
-                "world_tilt_rad": fit.tilt,
-                "agreeing": fit.agreeing,
-                "jumps": fit.jumps,
-                "axes": fit.axes(),
-                "yaw": fit.yaw
-                and {
-                    "scale": fit.yaw.scale,
-                    "bias_rad_s": fit.yaw.bias,
-                    "left_rad": fit.yaw.left,
-                },
-            },
+            "truth_against_gyroscope": fit and fit_as_dict(fit),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
@@ -216,19 +195,7 @@ class Inspection:
             f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
         ]
         if fit is not None:
-            lines.append(
-                f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
-                f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
-                f"correlation {fit.correlation:.3f}, "
-                f"world {math.degrees(fit.tilt):.2f} deg off level"
-            )
-        if fit is not None and fit.yaw is not None:
-            lines.append(
-                f"  yaw: the gyroscope turns {100 * abs(fit.yaw.scale):.1f} % too "
-                f"{'far' if fit.yaw.scale > 0.0 else 'little'} and drifts by "
-                f"{math.degrees(fit.yaw.bias):+.3f} deg/s; {math.degrees(fit.yaw.left):.1f} deg "
-                "are left"
-            )
+            lines += fit_lines(fit)
         return lines
 
 
@@ -258,7 +225,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
             if not problems:  # wrong units explain it
                 problems.append(f"{sequence.name}: truth against gyroscope: {error}")
     if fit is not None:
-        problems += _fit_problems(sequence.name, fit, " ".join(problems))
+        problems += fit_problems(sequence.name, fit, " ".join(problems))
     magnetic = _magnetic(sequence)
     problems += magnetic.problems if magnetic else ()
     return Inspection(
@@ -320,34 +287,3 @@ def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
         longest_gap_s=float(steps.max(initial=0.0)),
         path_m=truth.path_length(),
     )
-
-
-def _fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
-    """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
-    field = f"{name}: truth"
-    if fit.correlation < _ALIKE:
-        return [
-            f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f})"
-        ]
-    problems = []
-    if abs(fit.time_offset) > _LATE_S:
-        problems.append(
-            f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"
-        )
-    axes, degrees = fit.axes(), math.degrees(fit.misalignment)
-    if axes is not None and f"--axes={axes}" not in known:
-        problems.append(
-            f"{field}: its axes are not the IMU's ({degrees:.0f} degrees): pass `--axes={axes}`"
-        )
-    elif axes is None and fit.misalignment > _TURNED_RAD:
-        problems.append(
-            f"{field}: its axes are {degrees:.1f} degrees off the IMU's, which no option mends: "
-            "turn its attitude in the file"
-        )
-    if fit.tilt > _LEANING_RAD and not known:
-        problems.append(f"{field}: its world is {math.degrees(fit.tilt):.1f} degrees off level")
-    if fit.jumps:
-        problems.append(
-            f"{field}: its attitude jumps by what the gyroscope has not seen, {fit.jumps} times"
-        )
-    return problems

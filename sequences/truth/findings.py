@@ -1,0 +1,78 @@
+"""How a truth fits its IMU, for a person and as plain values, and what of it asks for mending."""
+
+from __future__ import annotations
+
+import math
+
+from stario.sequences.truth.fit import TruthFit
+
+_LATE_S = 0.02
+_TURNED_RAD = math.radians(5.0)
+_LEANING_RAD = math.radians(3.0)
+_ALIKE = 0.8
+"""Offset, misalignment, tilt and correlation from which a truth deserves a word."""
+
+
+def fit_as_dict(fit: TruthFit) -> dict[str, object]:
+    """As plain values, units in the names."""
+    yaw = fit.yaw
+    return {
+        "time_offset_s": fit.time_offset,
+        "correlation": fit.correlation,
+        "misalignment_rad": fit.misalignment,
+        "misalignment_rotvec_rad": fit.R_TB.as_rotvec(),
+        "world_tilt_rad": fit.tilt,
+        "agreeing": fit.agreeing,
+        "jumps": fit.jumps,
+        "axes": fit.axes(),
+        "yaw": yaw and {"scale": yaw.scale, "bias_rad_s": yaw.bias, "left_rad": yaw.left},
+    }
+
+
+def fit_lines(fit: TruthFit) -> list[str]:
+    """For a person."""
+    lines = [
+        f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
+        f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
+        f"correlation {fit.correlation:.3f}, "
+        f"world {math.degrees(fit.tilt):.2f} deg off level"
+    ]
+    if fit.yaw is not None:
+        lines.append(
+            f"  yaw: the gyroscope turns {100 * abs(fit.yaw.scale):.1f} % too "
+            f"{'far' if fit.yaw.scale > 0.0 else 'little'} and drifts by "
+            f"{math.degrees(fit.yaw.bias):+.3f} deg/s; {math.degrees(fit.yaw.left):.1f} deg "
+            "are left"
+        )
+    return lines
+
+
+def fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
+    """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
+    field = f"{name}: truth"
+    if fit.correlation < _ALIKE:
+        return [
+            f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f})"
+        ]
+    problems = []
+    if abs(fit.time_offset) > _LATE_S:
+        problems.append(
+            f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"
+        )
+    axes, degrees = fit.axes(), math.degrees(fit.misalignment)
+    if axes is not None and f"--axes={axes}" not in known:
+        problems.append(
+            f"{field}: its axes are not the IMU's ({degrees:.0f} degrees): pass `--axes={axes}`"
+        )
+    elif axes is None and fit.misalignment > _TURNED_RAD:
+        problems.append(
+            f"{field}: its axes are {degrees:.1f} degrees off the IMU's, which no option mends: "
+            "turn its attitude in the file"
+        )
+    if fit.tilt > _LEANING_RAD and not known:
+        problems.append(f"{field}: its world is {math.degrees(fit.tilt):.1f} degrees off level")
+    if fit.jumps:
+        problems.append(
+            f"{field}: its attitude jumps by what the gyroscope has not seen, {fit.jumps} times"
+        )
+    return problems
