@@ -21,6 +21,7 @@ from stario.sequences.sequence import (
 from stario.sequences.stillness import Rest, find_rest
 from stario.sequences.truth.findings import fit_as_dict, fit_lines, fit_problems
 from stario.sequences.truth.fit import TruthFit, fit_truth
+from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class Inspection:
         truth: what is known of the true track, in words.
         device_attitude: how many attitudes the device's own fusion has logged.
         magnetic: the magnetometer's, None without one or where there is too little of it.
+        yaw: what turns the gyroscope's yaw away from the truth's, None where that cannot be told.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Inspection:
     truth: str = "none"
     magnetic: MagneticFindings | None = None
     device_attitude: int = 0
+    yaw: YawDrift | None = None
 
     def as_dict(self) -> dict[str, object]:
         """The findings as plain values, units in the names."""
@@ -131,7 +134,7 @@ class Inspection:
                 "longest_gap_s": coverage.longest_gap_s,
                 "path_m": coverage.path_m,
             },
-            "truth_against_gyroscope": fit and fit_as_dict(fit),
+            "truth_against_gyroscope": fit and fit_as_dict(fit, self.yaw),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
@@ -195,7 +198,7 @@ class Inspection:
             f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
         ]
         if fit is not None:
-            lines += fit_lines(fit)
+            lines += fit_lines(fit, self.yaw)
         return lines
 
 
@@ -240,6 +243,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         truth=sequence.truth_words(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
+        yaw=None if fit is None else yaw_drift(sequence, fit),
     )
 
 

@@ -47,6 +47,9 @@ HELD_CHANGE = 2e-3
 give out a calibrated field that they carry on by their own gyroscope: of one size to 1e-4 for
 seconds, where a sensor's own changes by 1e-2."""
 
+_NO_FIELD_UT = 1e-9
+"""For a sensor that gives zeros [uT]: not divided by."""
+
 _HALF_SECOND, _TURNED_RAD, _OFTEN = 0.5, 0.05, 0.5
 """Half seconds in which the field turns by so much in the sensor's axes are looked at; share of
 them from which on that deserves a word."""
@@ -248,7 +251,7 @@ def _held(time: FloatArray, field: FloatArray) -> float:
     """Share of half seconds over which a field (n, 3) turns and its size stays the same."""
     later = np.searchsorted(time, time + _HALF_SECOND)
     first = np.flatnonzero(later < len(time))
-    size = np.linalg.norm(field, axis=1)
+    size = np.maximum(np.linalg.norm(field, axis=1), _NO_FIELD_UT)
     before, after = (field[k] / size[k, None] for k in (first, later[first]))
     turned = np.linalg.norm(after - before, axis=1) > _TURNED_RAD
     same = np.abs(size[later[first]] / size[first] - 1.0) < HELD_CHANGE

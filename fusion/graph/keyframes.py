@@ -118,14 +118,12 @@ class KeyframeGraph:
             sigma: of it in the long run [rad].
             memory: after which it is forgotten [s].
         """
-        j, kept, turn = self.last, 0.0, 0.0
+        j = self.last
         if j in self._turns:
             return
         i = max(self._turns, default=j)
-        if i != j:
-            kept = math.exp((self._time[i] - self._time[j]) / memory)
-            turn = kept * self._turns[i]
-        self._turns[j] = turn
+        kept = math.exp((self._time[i] - self._time[j]) / memory) if i != j else 0.0
+        self._turns[j] = kept * self._turns.get(i, 0.0)
         covariance = np.array([[(1.0 - kept**2) * sigma**2]])
         self.add(TurnWander(i, j, kept, covariance), gated=False)
 

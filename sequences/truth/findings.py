@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.yaw_drift import YawDrift
 
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)
@@ -13,9 +14,8 @@ _ALIKE = 0.8
 """Offset, misalignment, tilt and correlation from which a truth deserves a word."""
 
 
-def fit_as_dict(fit: TruthFit) -> dict[str, object]:
+def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
     """As plain values, units in the names."""
-    yaw = fit.yaw
     return {
         "time_offset_s": fit.time_offset,
         "correlation": fit.correlation,
@@ -29,7 +29,7 @@ def fit_as_dict(fit: TruthFit) -> dict[str, object]:
     }
 
 
-def fit_lines(fit: TruthFit) -> list[str]:
+def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
     """For a person."""
     lines = [
         f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
@@ -37,12 +37,11 @@ def fit_lines(fit: TruthFit) -> list[str]:
         f"correlation {fit.correlation:.3f}, "
         f"world {math.degrees(fit.tilt):.2f} deg off level"
     ]
-    if fit.yaw is not None:
+    if yaw is not None:
         lines.append(
-            f"  yaw: the gyroscope turns {100 * abs(fit.yaw.scale):.1f} % too "
-            f"{'far' if fit.yaw.scale > 0.0 else 'little'} and drifts by "
-            f"{math.degrees(fit.yaw.bias):+.3f} deg/s; {math.degrees(fit.yaw.left):.1f} deg "
-            "are left"
+            f"  yaw: the gyroscope turns {100 * abs(yaw.scale):.1f} % too "
+            f"{'far' if yaw.scale > 0.0 else 'little'} and drifts by "
+            f"{math.degrees(yaw.bias):+.3f} deg/s; {math.degrees(yaw.left):.1f} deg are left"
         )
     return lines
 

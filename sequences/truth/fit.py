@@ -17,7 +17,6 @@ from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
-from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples
 
 LONGEST_S = 600.0
@@ -48,7 +47,6 @@ class TruthFit:
         jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
-        yaw: what turns the gyroscope's yaw away from the truth's; None where that cannot be told.
     """
 
     time_offset: float
@@ -59,7 +57,6 @@ class TruthFit:
     jumps: int
     times: FloatArray
     speed: FloatArray
-    yaw: YawDrift | None
 
     @property
     def misalignment(self) -> float:
@@ -82,7 +79,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     """
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
-    time, gyro, accel = clean_samples(_middle(sequence))
+    time, gyro, accel = clean_samples(middle(sequence))
     truth = sequence.truth
     coarse = _coarse_offset(time, gyro, truth)
     truth = replace(truth, time=truth.time + coarse)
@@ -104,15 +101,15 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
         ),
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
-        yaw=yaw_drift(time, gyro, accel, replace(truth, time=truth.time + aligned.lag), mount),
     )
 
 
-def _middle(sequence: ImuSequence) -> ImuSequence:
+def middle(sequence: ImuSequence) -> ImuSequence:
+    """The samples of a recording that are looked at, `LONGEST_S` at most."""
     if sequence.duration <= LONGEST_S:
         return sequence
-    middle = float(np.nanmedian(sequence.time))
-    keep = np.abs(sequence.time - middle) <= LONGEST_S / 2
+    centre = float(np.nanmedian(sequence.time))
+    keep = np.abs(sequence.time - centre) <= LONGEST_S / 2
     return ImuSequence(
         sequence.name, sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
     )

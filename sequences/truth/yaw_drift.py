@@ -11,15 +11,16 @@ in loops that adds up, and neither gravity nor the network tells it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.levelling import levelled_attitudes
 from stario.sequences.rotations import yaw_of
-from stario.sequences.sequence import FloatArray, Trajectory
-from stario.sequences.windows import unbroken
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.truth.fit import TruthFit, middle
+from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
 _LEAST_TURNED_RAD = 0.3
@@ -41,21 +42,22 @@ class YawDrift:
     left: float
 
 
-def yaw_drift(
-    time: FloatArray, gyro: FloatArray, accel: FloatArray, truth: Trajectory, R_TB: Rotation
-) -> YawDrift | None:
-    """Fit scale and bias over the longest unbroken stretch.
+def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
+    """Fit scale and bias over the longest unbroken stretch of what `fit_truth` looks at.
 
     Args:
-        time: (n,) [s], increasing.
-        gyro: (n, 3) [rad/s] in B.
-        accel: (n, 3) [m/s^2] in B.
-        truth: attitudes of axes T, on the IMU's clock.
-        R_TB: from B to T.
+        sequence: with a truth.
+        fit: of that truth.
 
     Returns:
         None where the device turned too little to tell.
+
+    Raises:
+        InputError: as for `clean_samples`.
     """
+    assert sequence.truth is not None  # there is a fit of it
+    time, gyro, accel = clean_samples(middle(sequence))
+    truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
     part = slice(start, stop)
     if stop - start < 2:
@@ -65,7 +67,7 @@ def yaw_drift(
     pose = truth.at(time[part][at])
     attitude_NB = Rotation.from_matrix(R_NB[at])
     yaw = np.unwrap(yaw_of(attitude_NB))[pose.valid]
-    off = np.unwrap(yaw_of(pose.attitude_WB[pose.valid] * R_TB * attitude_NB[pose.valid].inv()))
+    off = np.unwrap(yaw_of(pose.attitude_WB[pose.valid] * fit.R_TB * attitude_NB[pose.valid].inv()))
     seconds = time[part][at][pose.valid] - time[start]
     if len(off) < 3:
         return None

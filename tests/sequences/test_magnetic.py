@@ -83,6 +83,19 @@ def test_a_field_that_the_device_carries_on_itself_is_told_by_its_size() -> None
     assert "carries it on by its own gyroscope 100%" in told[1]
 
 
+def test_a_sensor_that_gives_zeros_at_first_is_looked_over_all_the_same() -> None:
+    late = walk(MagneticField())
+    assert late.magnetometer is not None
+    field = late.magnetometer.field.copy()
+    field[:100] = 0.0
+    with np.errstate(all="raise"):
+        found = judge_magnetometer(
+            replace(late, magnetometer=Magnetometer(late.magnetometer.time, field))
+        )
+    assert found is not None
+    assert found.held < 0.5
+
+
 def test_inspection_tells_of_a_good_magnetometer_and_of_none() -> None:
     good = inspect_recording(walk(MagneticField()))
     assert not good.problems
