@@ -25,6 +25,7 @@ _COLUMNS = {
     "rms_1s_m": ("1 s [m]", ".3f"),
     "rms_10s_m": ("10 s [m]", ".2f"),
     "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("turned [deg]", ".0f"),
     "nis": ("NIS", ".2f"),
     "nis_ekf": ("EKF NIS", ".2f"),
 }
