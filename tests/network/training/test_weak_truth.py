@@ -18,9 +18,11 @@ from stario.network.training.train import train
 from stario.network.training.weak_truth import (
     LegBatch,
     LegSampler,
+    direction_loss,
     ends_covariance,
     leg_loss,
     leg_residuals,
+    velocity_change,
 )
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
@@ -133,6 +135,40 @@ def test_the_gradient_points_to_longer_displacements_and_not_to_a_turn() -> None
     assert float(plain) > 0.0
     assert factor.grad is not None
     assert float(factor.grad) < 0.0
+
+
+def turned(told_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    c, s = angle.cos(), angle.sin()
+    x, y, z = told_N.unbind(-1)
+    return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
+
+
+def test_velocity_changes_as_the_accelerometer_says() -> None:
+    [world] = world_streams(WALK, attitude="true")
+    accel_W = torch.from_numpy(world.imu_W[: SECONDS * 200, 3:5]).view(1, SECONDS, 200, 2)
+    position = torch.from_numpy(world.position_W[: SECONDS * 200 + 1 : 200, :2])
+    changes = position.diff(dim=0).diff(dim=0)
+    changes = changes - changes.mean(dim=0)
+    assert float(changes.norm(dim=-1).max()) > 0.5
+    assert float((velocity_change(accel_W)[0] - changes).norm(dim=-1).max()) < 0.02
+
+
+def test_the_accelerometer_turns_back_who_walks_another_way_and_leaves_lengths_alone() -> None:
+    recording = known("positions", 0.1)
+    batch = batch_of(recording)
+    told_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+    right = float(direction_loss(told_N, batch))
+    assert float(direction_loss(0.5 * told_N, batch)) == pytest.approx(0.5 * right, abs=1e-6)
+    losses = []
+    for degrees in (-30.0, 30.0, -90.0, 90.0, -170.0, 170.0):
+        angle = torch.tensor(np.radians(degrees), dtype=torch.float32, requires_grad=True)
+        loss = direction_loss(turned(told_N, angle), batch)
+        loss.backward()
+        assert angle.grad is not None
+        assert float(angle.grad) * degrees > 0.0
+        losses.append(float(loss.detach()))
+    assert losses == sorted(losses)
+    assert right < 0.5 * losses[0]
 
 
 def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
