@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ _SECOND = round(WINDOW_SECONDS / TICK_SECONDS)
 
 _RISING = (np.arange(WINDOW_SAMPLES) + 0.5) / (WINDOW_SAMPLES * WINDOW_RATE)
 
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
+Complex = np.ndarray[Any, np.dtype[np.complex128]]
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,11 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
     told = accel_N[:-_SECOND] @ _RISING + accel_N[_SECOND:] @ _RISING[::-1]
     moved = displacement_N[_SECOND:, :2] - displacement_N[:-_SECOND, :2]
     a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
-    return Direction(
-        complex(np.vdot(d, a)), _square(d), _square(a), len(d) / (2.0 * _SECOND)
-    )  # a change takes two seconds
+    apart = len(d) / (2.0 * _SECOND)  # a change takes two seconds
+    return Direction(complex(np.vdot(d, a)), _square(d), _square(a), apart)
 
 
-def _without_slow(changes: Complex) -> Complex:
+def _without_slow(changes: Any) -> Complex:
     """Less their mean over each 20 s."""
     parts = np.array_split(changes, max(1, len(changes) // _STRETCH))
     return np.concatenate([part - part.mean() for part in parts])

@@ -134,8 +134,8 @@ class LegSampler:
         shown = show(imu_N, heading, self.augmentation, self._generator, self._seconds)
         R_NH = shown.R_HW.mT * shown.mirror[:, None, 3:]
         windows = shown.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        told = _padded(drawn, self._seconds)
-        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *told, change)
+        told = [*_padded(drawn, self._seconds), change]
+        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *told)
 
     def _draw(self) -> tuple[LegStream, int]:
         for _ in range(20):
