@@ -15,8 +15,8 @@ import math
 
 import numpy as np
 
+from stario.sequences.attitude.so3 import exp_and_left_jacobian, log_so3, series_coefficients, skew
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_and_left_jacobian, log_so3, series_coefficients, skew
 
 _EYE = np.eye(3)
 

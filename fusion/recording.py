@@ -15,8 +15,8 @@ from stario.fusion.imu.stateful import (
     StatefulInference,
     displacements_of,
 )
-from stario.sequences.checks import check_units
 from stario.sequences.errors import InputError
+from stario.sequences.inspection.checks import check_units
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 

@@ -65,7 +65,8 @@ def _classes() -> dict[str, type]:
         whitening,
     )
     from stario.fusion.imu import front_end, gyro_unit, intervals, outliers, preintegration
-    from stario.sequences import levelling, noise
+    from stario.sequences import noise
+    from stario.sequences.attitude import levelling
 
     classes: tuple[type, ...] = (
         *(config.FilterConfig, config.GraphConfig, config.NavigatorConfig, noise.ImuNoise),

@@ -5,9 +5,13 @@ from typing import TYPE_CHECKING
 from stario.sequences.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from stario.sequences.batch import Skipped as Skipped
-    from stario.sequences.checks import check_units as check_units
+    from stario.sequences.accuracy.metrics import align as align
+    from stario.sequences.accuracy.metrics import evaluate_track as evaluate_track
+    from stario.sequences.accuracy.nees import position_nees as position_nees
+    from stario.sequences.attitude.rotations import about_z as about_z
+    from stario.sequences.attitude.rotations import yaw_of as yaw_of
     from stario.sequences.conventions import with_conventions as with_conventions
+    from stario.sequences.datasets.batch import Skipped as Skipped
     from stario.sequences.errors import ConfigError as ConfigError
     from stario.sequences.errors import InputError as InputError
     from stario.sequences.errors import ReadError as ReadError
@@ -15,18 +19,14 @@ if TYPE_CHECKING:
     from stario.sequences.errors import WeightsError as WeightsError
     from stario.sequences.files import read_tum as read_tum
     from stario.sequences.files import write_tum as write_tum
-    from stario.sequences.inspection import inspect_recording as inspect_recording
+    from stario.sequences.inspection.checks import check_units as check_units
+    from stario.sequences.inspection.report import inspect_recording as inspect_recording
     from stario.sequences.legs import LegStream as LegStream
     from stario.sequences.legs import leg_streams as leg_streams
-    from stario.sequences.metrics import align as align
-    from stario.sequences.metrics import evaluate_track as evaluate_track
-    from stario.sequences.nees import position_nees as position_nees
     from stario.sequences.noise import ImuNoise as ImuNoise
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.readers.csv_writer import write_csv as write_csv
-    from stario.sequences.rotations import about_z as about_z
-    from stario.sequences.rotations import yaw_of as yaw_of
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
@@ -62,20 +62,20 @@ _MODULES = {
     "PositionTrack": "sequence",
     "ReadError": "errors",
     "STANDARD_GRAVITY": "sequence",
-    "Skipped": "batch",
+    "Skipped": "datasets.batch",
     "StarioError": "errors",
     "Trajectory": "sequence",
     "WalkStyle": "simulation.walks",
     "WeightsError": "errors",
-    "about_z": "rotations",
-    "align": "metrics",
-    "check_units": "checks",
-    "evaluate_track": "metrics",
+    "about_z": "attitude.rotations",
+    "align": "accuracy.metrics",
+    "check_units": "inspection.checks",
+    "evaluate_track": "accuracy.metrics",
     "find_recordings": "readers",
     "generate_walk": "simulation.walks",
-    "inspect_recording": "inspection",
+    "inspect_recording": "inspection.report",
     "leg_streams": "legs",
-    "position_nees": "nees",
+    "position_nees": "accuracy.nees",
     "read_recording": "readers",
     "read_tum": "files",
     "simulate_imu": "simulation.imu",
@@ -84,7 +84,7 @@ _MODULES = {
     "world_streams": "windows",
     "write_csv": "readers.csv_writer",
     "write_tum": "files",
-    "yaw_of": "rotations",
+    "yaw_of": "attitude.rotations",
 }
 
 __all__ = [*_MODULES]

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import FloatArray, Trajectory
 
 _TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -1,8 +1,8 @@
 """A recording as a network sees it in use: 200 Hz in the frame N that the IMU levels by itself.
 
 N is gravity-aligned, its yaw zero at the start and drifting with the gyroscope
-(`stario.sequences.levelling`). No truth is needed, so this serves recordings with poses, positions
-or waypoints alike.
+(`stario.sequences.attitude.levelling`). No truth is needed, so this serves recordings with poses,
+positions or waypoints alike.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.sequences.levelling import levelled_attitudes
+from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     WINDOW_RATE,

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.levelling import levelled_attitudes
-from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import MAX_IMU_GAP as MAX_IMU_GAP
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import advancing

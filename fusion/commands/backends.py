@@ -17,8 +17,8 @@ from stario.fusion.commands.common import (
 from stario.fusion.commands.options import Estimating, JsonOption, PathsArgument, Reading, grouped
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.backends import Score
-    from stario.sequences.batch import Skipped
+    from stario.fusion.evaluation.checks.backends import Score
+    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 
@@ -39,7 +39,12 @@ def backends(
 
     Without PATH or --data: on simulated walks, measured under white noise of a known size.
     """
-    from stario.fusion.evaluation.backends import score_recording, score_table, score_walk, summary
+    from stario.fusion.evaluation.checks.backends import (
+        score_recording,
+        score_table,
+        score_walk,
+        summary,
+    )
     from stario.network.training.splits import split_paths
 
     scores: list[Score] = []

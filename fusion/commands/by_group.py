@@ -42,7 +42,7 @@ def fusion(
     as_json: JsonOption = False,
 ) -> None:
     """Hold the filter's error against its network's, with NIS and honesty of the yaw, by group."""
-    from stario.fusion.evaluation.worth import worth_of, worth_table
+    from stario.fusion.evaluation.checks.worth import worth_of, worth_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
     _judge_each(
@@ -67,7 +67,7 @@ def fixes(
     as_json: JsonOption = False,
 ) -> None:
     """Give true positions now and then, and see whether position and yaw are as sure as said."""
-    from stario.fusion.evaluation.fixed import fixed_table, fixed_track
+    from stario.fusion.evaluation.checks.fixed import fixed_table, fixed_track
 
     _judge_each(
         "check fixes",
@@ -88,7 +88,7 @@ def gaps(
     as_json: JsonOption = False,
 ) -> None:
     """Take 0.1 s out at six instants, then 5 % of the samples, and see how far the end moves."""
-    from stario.fusion.evaluation.missing import moved_ends, moved_table
+    from stario.fusion.evaluation.checks.missing import moved_ends, moved_table
 
     _judge_each("check gaps", (reading, paths, estimating, by, as_json), moved_ends, moved_table)
 
@@ -100,7 +100,7 @@ def _judge_each(
     table: Callable[[Sequence[Any]], str],
 ) -> None:
     """Judge each recording, print the table or JSON, and leave with what could not be used."""
-    from stario.fusion.evaluation.judging import check_by, labels
+    from stario.fusion.evaluation.judging.judge import check_by, labels
 
     reading, paths, estimating, by, as_json = given
     grouping = check_by(by)

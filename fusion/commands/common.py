@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, TypeVar
 import typer
 
 from stario.fusion.commands.options import Reading
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
-from stario.sequences.text_table import aligned, figure
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 Result = TypeVar("Result")
@@ -30,11 +30,11 @@ def collected(
     """What came of recordings, in order; those that could not be used join `skipped`.
 
     Args:
-        outcomes: as `stario.sequences.batch.each` yields them.
+        outcomes: as `stario.sequences.datasets.batch.each` yields them.
         skipped: takes them up.
         progress: called with the number of recordings that are done.
     """
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
 
     results: list[Result] = []
     for done, outcome in enumerate(outcomes, 1):
@@ -60,7 +60,7 @@ def result_of_each(
         paths: of recordings, folders or lists.
         work: given a recording's path and the recording.
     """
-    from stario.sequences.batch import each
+    from stario.sequences.datasets.batch import each
 
     files, skipped = reading.recordings(paths)
 
@@ -92,7 +92,7 @@ def one_by_one(
         single: an option that was given and goes with one recording alone.
     """
     from stario.fusion.evaluation.many import distinct_name
-    from stario.sequences.batch import each
+    from stario.sequences.datasets.batch import each
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:

@@ -26,7 +26,7 @@ def consistency(
 ) -> None:
     """Monte Carlo on simulated walks: NEES, NIS and yaw against what an honest filter shows."""
     from stario.fusion.config import NavigatorConfig, read_config
-    from stario.fusion.evaluation.consistency import consistency as monte_carlo
+    from stario.fusion.evaluation.checks.consistency import consistency as monte_carlo
 
     checked = read_config(config) if config else NavigatorConfig()
     with progress_bar("consistency") as progress:

@@ -13,7 +13,7 @@ from stario.fusion.commands.options import Reading, grouped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 
@@ -34,8 +34,8 @@ def convert(
     ] = None,
 ) -> None:
     """Convert recordings to a CSV, to the EuRoC layout or to an archive, without loss."""
-    from stario.sequences.convert import convert as convert_sequence
-    from stario.sequences.convert import convert_all, layout_of
+    from stario.sequences.datasets.convert import convert as convert_sequence
+    from stario.sequences.datasets.convert import convert_all, layout_of
 
     if len(paths) < 2:
         raise InputError("convert", str(paths[0]), "IN... OUT", "name what to write as well")
@@ -66,8 +66,8 @@ def _only(reading: Reading, sources: list[Path]) -> Path:
 
 def _read(reading: Reading, files: list[Path], skipped: list[Skipped]) -> Iterator[ImuSequence]:
     """One recording after the other; what cannot be read or judged is told at the end."""
-    from stario.sequences.batch import Skipped
-    from stario.sequences.convert import check_content
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.convert import check_content
 
     for file in files:
         try:

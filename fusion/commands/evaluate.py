@@ -22,8 +22,8 @@ from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
-    from stario.sequences.batch import Skipped
-    from stario.sequences.splits import Listed
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.splits import Listed
 
 
 @grouped
@@ -85,7 +85,7 @@ def evaluate(
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import scores_of, summary, summary_table
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
 
     if by is not None:
         listed, skipped = _listed(reading, paths or [], data, split)
@@ -134,7 +134,7 @@ def _listed(
 ) -> tuple[list[Listed], list[Skipped]]:
     """Recordings that are named, or else those of a split, and what leads to none."""
     from stario.network.training.splits import listed
-    from stario.sequences.splits import Listed
+    from stario.sequences.datasets.splits import Listed
 
     if paths:
         files, skipped = reading.recordings(paths)
@@ -168,7 +168,7 @@ def _networks(
         table_text,
     )
     from stario.network.model import load_model, weights_named
-    from stario.sequences.metrics import check_convention
+    from stario.sequences.accuracy.metrics import check_convention
 
     networks = {name: load_model(weights_named(name, runs)) for name in names}
     if out is not None:

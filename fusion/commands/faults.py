@@ -32,7 +32,7 @@ def faults(
     as_json: JsonOption = False,
 ) -> None:
     """Put faults into a recording, one by one, and print what each costs and what is reported."""
-    from stario.fusion.evaluation.faults import fault_table, matched_walk, run_faults
+    from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
 
     settings = estimating.settings()
     if path is not None:

@@ -38,10 +38,10 @@ def _inspect(
     sequence: ImuSequence, folder: Path, network: DisplacementModel, told: bool
 ) -> dict[str, object]:
     from stario.fusion.evaluation.results import make_folder
-    from stario.sequences.drawing import save_figure
+    from stario.sequences.drawing.figures import save_figure
+    from stario.sequences.drawing.plots import imu_overview
     from stario.sequences.files import write_json
-    from stario.sequences.inspection import inspect_recording
-    from stario.sequences.plots import imu_overview
+    from stario.sequences.inspection.report import inspect_recording
 
     found = inspect_recording(sequence)
     make_folder(folder)

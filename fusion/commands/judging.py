@@ -14,8 +14,8 @@ from stario.fusion.commands.options import Reading
 if TYPE_CHECKING:
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
     from stario.network.model import DisplacementModel
-    from stario.sequences.batch import Skipped
-    from stario.sequences.splits import Listed
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.splits import Listed
 
 
 def judge_by_groups(
@@ -31,16 +31,16 @@ def judge_by_groups(
     as_json: bool,
 ) -> list[Skipped]:
     """The table of groups; returns the recordings that could not be used."""
-    from stario.fusion.evaluation.judging import check_by, judge, rows_of
-    from stario.fusion.evaluation.judging_table import (
+    from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
+    from stario.fusion.evaluation.judging.prepared import prepared_recordings
+    from stario.fusion.evaluation.judging.table import (
         Judgement,
         judgement_dict,
         judgement_text,
         write_judgement,
     )
-    from stario.fusion.evaluation.prepared import prepared_recordings
     from stario.fusion.evaluation.results import make_folder
-    from stario.sequences.stream_cache import cache_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
 
     grouping = check_by(by)
     chosen = _thinned(recordings, every)

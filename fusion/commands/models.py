@@ -19,7 +19,7 @@ def models(
     """Parameters, FLOPs, time and memory of each network, beside the paper's figures."""
     from stario.network.architectures import ARCHITECTURES
     from stario.network.runtime.survey import survey, survey_table
-    from stario.sequences.stream_cache import cache_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
 
     with progress_bar("models") as progress:
         rows = survey(names or list(ARCHITECTURES), cache_folder(), progress)

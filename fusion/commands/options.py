@@ -19,7 +19,7 @@ from stario.sequences.errors import ConfigError, InputError, StarioError
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.network.model import DisplacementModel
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 PathsArgument = Annotated[
@@ -105,7 +105,7 @@ class Reading:
 
     def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
         """Recordings at the paths, in folders or in lists, and what leads to none."""
-        from stario.sequences.batch import Skipped
+        from stario.sequences.datasets.batch import Skipped
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a format that is named is that of the path itself

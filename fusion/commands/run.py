@@ -82,7 +82,7 @@ def _run(
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import told
-    from stario.sequences.metrics import align
+    from stario.sequences.accuracy.metrics import align
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:

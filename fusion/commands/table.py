@@ -75,8 +75,8 @@ def table(
     from stario.fusion.table.filling import fill, table_cells
     from stario.fusion.table.sets import learned_from
     from stario.fusion.table.training import Reading
-    from stario.sequences.batch import Skipped
-    from stario.sequences.stream_cache import cache_folder
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.stream_cache import cache_folder
 
     known = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else [name.strip() for name in networks.split(",")]

@@ -22,7 +22,7 @@ from stario.sequences.errors import InputError
 if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
     from stario.network.training.data import Recorded
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.windows import Attitude, WorldStream
 
 
@@ -104,7 +104,7 @@ def train(
     from stario.network.training.data import cached_walks, gather
     from stario.network.training.parallel import leads
     from stario.network.training.train import train as train_network
-    from stario.sequences.stream_cache import cache_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
 
     recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
     folder = cache or cache_folder()
@@ -172,7 +172,7 @@ def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
 def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
     """Recordings to learn from and to be kept, of the lists in the package."""
     from stario.network.training.splits import listed
-    from stario.sequences.splits import leave_out
+    from stario.sequences.datasets.splits import leave_out
 
     if data is None:
         for option, given in (("--leave-out", group is not None), ("--learn-from", name != "all")):
@@ -222,9 +222,9 @@ def _streams_of(
     reading: Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
 ) -> tuple[list[Recorded], list[Skipped]]:
     from stario.network.training.data import Recorded
-    from stario.sequences.batch import Skipped
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.stream_cache import recorded
     from stario.sequences.readers.archive import archive_attributes
-    from stario.sequences.stream_cache import recorded
 
     recordings: list[Recorded] = []
     skipped: list[Skipped] = []

@@ -19,9 +19,9 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import Progress
 from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
+from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import CONVENTIONS, Alignment, align, evaluate_track
-from stario.sequences.nees import position_nees
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

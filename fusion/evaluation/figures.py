@@ -1,6 +1,6 @@
 """Figures of networks side by side: cost against error, distributions, sample tracks.
 
-Drawn as those of `stario.sequences.plots`, without pyplot.
+Drawn as those of `stario.sequences.drawing.plots`, without pyplot.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _AGAINST = "R-ResNet"
 
 def write_table(folder: Path, table: NetworkTable) -> list[Path]:
     """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
-    from stario.sequences.drawing import save_figure
+    from stario.sequences.drawing.figures import save_figure
 
     text = io.StringIO()
     names = list(Entry.__dataclass_fields__)

@@ -14,7 +14,7 @@ from stario.fusion.fixes import Fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import Progress
 from stario.network.model import DisplacementModel, load_model
-from stario.sequences.batch import Skipped, each
+from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence
@@ -41,7 +41,7 @@ def compare_recordings(
             handing over the network with every recording.
         config: the navigator's settings.
         read: how a path is read; can be pickled.
-        jobs: processes, as for `stario.sequences.batch.each`.
+        jobs: processes, as for `stario.sequences.datasets.batch.each`.
         fixes: known to the EKF of every recording.
         truth_needed: skip recordings without truth.
         progress: called with the share of the work that is done; within a recording too where

@@ -21,8 +21,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.network_alone import UPDATES, Answers
-from stario.fusion.evaluation.prepared import Prepared
+from stario.fusion.evaluation.judging.network_alone import UPDATES, Answers
+from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream, levelled_streams

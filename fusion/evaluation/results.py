@@ -12,10 +12,10 @@ from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, Metrics
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.fusion.state import Innovations, Track
-from stario.sequences.drawing import save_figure
+from stario.sequences.drawing.figures import save_figure
+from stario.sequences.drawing.plots import error_over_time, innovations, plan_view
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
-from stario.sequences.plots import error_over_time, innovations, plan_view
 from stario.sequences.sequence import PositionTrack, Trajectory
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.evaluation.compare import METRIC_WORDS, TRACKS, Comparison, Metrics, metric_words
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray
-from stario.sequences.text_table import aligned, figure
 
 _COLUMNS = (
     ("pdr", "ate_m", "steps (PDR)"),

@@ -20,12 +20,12 @@ from stario.fusion.evaluation.tracks import network_track, network_track_true_at
 from stario.fusion.navigator import Navigator
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
-from stario.sequences.batch import Skipped, each
+from stario.sequences.accuracy.metrics import CONVENTIONS, Convention, align, evaluate_track
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.text_table import aligned
 
 PROTOCOLS = {
     "network_true_attitude": "network, true attitude",
@@ -39,7 +39,7 @@ METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}
 
 @dataclass(frozen=True)
 class Entry:
-    """Errors of one track; see `stario.sequences.metrics.CONVENTIONS`.
+    """Errors of one track; see `stario.sequences.accuracy.metrics.CONVENTIONS`.
 
     Attributes:
         recording: its name.
@@ -143,7 +143,7 @@ def compare_networks(
         config: of the filter.
         read: how a path is read; can be pickled.
         convention: how position errors are averaged.
-        jobs: processes, as for `stario.sequences.batch.each`.
+        jobs: processes, as for `stario.sequences.datasets.batch.each`.
         samples: recordings whose tracks are kept for a figure.
         progress: called with the share of the work done.
 

@@ -17,9 +17,9 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.so3 import exp_so3
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,

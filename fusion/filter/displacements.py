@@ -15,7 +15,7 @@ from stario.fusion.filter.network_turn import wandered
 from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
 from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
 from stario.fusion.lie import yaw_rotation
-from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
 _RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0

@@ -35,9 +35,9 @@ from stario.fusion.filter.jacobians import (
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import exp_times, yaw_twist
 from stario.fusion.state import NavState
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
-from stario.sequences.so3 import exp_so3
 
 _NO_GAIN = np.zeros(3)
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.state import NavState, SmoothedPose
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import skew
 
 _CLONE_COLUMNS = [0, 1, 2, 4]
 """Columns R, p of a pose: a clone has no velocity."""

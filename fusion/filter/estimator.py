@@ -39,7 +39,7 @@ from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
-from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.state import NavState, SmoothedPose
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray, Trajectory
-from stario.sequences.so3 import skew
 
 _UP = np.array([0.0, 0.0, 1.0])
 

@@ -18,7 +18,7 @@ from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.filter.sceptic import SecondOpinion
 from stario.fusion.imu.intervals import ImuInterval
-from stario.sequences.levelling import BIAS_SIGMA
+from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
 
 _CORRECTED = 0.01

@@ -13,8 +13,8 @@ from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3
 
 STILL_TILT_SIGMA = 0.01
 """Of the first attitude when the device was at rest [rad]."""

@@ -16,8 +16,8 @@ import numpy as np
 
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import twist
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import skew
 
 CORE = 15
 """Size of the error state of one navigation state."""

@@ -27,8 +27,8 @@ from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.lie import yaw_twist
-from stario.sequences.chi_square import chi2_quantile
-from stario.sequences.magnetic import HELD_CHANGE
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 PERIOD = 0.5

@@ -31,9 +31,9 @@ from stario.fusion.filter.seen_positions import SeenPositions
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
-from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 """Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""

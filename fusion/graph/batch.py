@@ -17,8 +17,8 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
+from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3, log_so3
 
 _UNKNOWN_POSITION = 1e4
 """Standard deviation of a position that only fixes tell [m]."""

@@ -20,8 +20,8 @@ from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
+from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3, log_so3
 from stario.sequences.windows import WINDOW_SECONDS
 
 _SAME_TIME = 1e-6

@@ -22,8 +22,8 @@ from gtsam.symbol_shorthand import B, T, V, X
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.lie import twist, yaw_rotation
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import exp_so3
 
 _EYE = np.eye(3)
 

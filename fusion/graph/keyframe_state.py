@@ -10,8 +10,8 @@ from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.lie import log_se23
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import skew
 
 _EYE = np.eye(3)
 

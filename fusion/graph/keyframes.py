@@ -27,7 +27,7 @@ from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
-from stario.sequences.chi_square import chi2_quantile
+from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
 _MOVED = 1e-3

@@ -27,8 +27,8 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.outliers import Flags, OutlierDetector
+from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
-from stario.sequences.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import (

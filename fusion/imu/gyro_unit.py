@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.imu.intervals import ImuInterval
-from stario.sequences.checks import average_force, check_gyro
 from stario.sequences.errors import InputError
+from stario.sequences.inspection.checks import average_force, check_gyro
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import GYRO_UNITS
 

@@ -26,10 +26,10 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.outliers import Flags
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
-from stario.sequences.so3 import skew
 
 # gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
 # the graph and is far below any sensor's.

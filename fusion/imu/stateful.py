@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import turned_windows
 

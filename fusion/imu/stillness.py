@@ -1,4 +1,4 @@
-"""A still second, found interval by interval by the test of `stario.sequences.stillness`.
+"""A still second, found interval by interval (`stario.sequences.inspection.stillness`).
 
 A hand's tremor or a trolley's wheels exceed it. That an even glide looks still as well is left to
 the zero-velocity update's own chi-square test (README.md, "Zero velocity").
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.imu.intervals import ImuInterval
+from stario.sequences.inspection.stillness import looks_still, scatter_bound
 from stario.sequences.sequence import FloatArray
-from stario.sequences.stillness import looks_still, scatter_bound
 
 
 class StillnessDetector:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.map_frame import KNOWN_YAW
 from stario.fusion.state import NavState
-from stario.sequences.rotations import yaw_of
+from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray
 
 Point = list[float]

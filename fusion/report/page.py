@@ -13,15 +13,15 @@ import numpy as np
 
 from stario.fusion.report.health import Finding, findings
 from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import align
 from stario.sequences.files import atomic_write
-from stario.sequences.metrics import align
 from stario.sequences.readers.checked import optional_package
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.compare import Comparison, Metrics
     from stario.fusion.report.series import Series
-    from stario.sequences.metrics import Alignment
+    from stario.sequences.accuracy.metrics import Alignment
     from stario.sequences.sequence import ImuSequence
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}

@@ -11,8 +11,8 @@ import plotly.graph_objects as go
 
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
-from stario.sequences.chi_square import chi2_quantile
-from stario.sequences.drawing import TRACK_STYLES
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"

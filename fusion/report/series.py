@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.state import Track
-from stario.sequences.rotations import yaw_of
+from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray, Trajectory
 
 MOST_POINTS = 1500

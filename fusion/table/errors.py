@@ -1,7 +1,7 @@
 """Errors of a network on the recordings that test it, whatever kind of truth they have.
 
 With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
-own attitude, by `stario.fusion.evaluation.displacement_error`.
+own attitude, by `stario.fusion.evaluation.judging.displacement_error`.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, recording_errors
-from stario.fusion.evaluation.network_alone import answers
+from stario.fusion.evaluation.judging.displacement_error import BLOCK_SECONDS, recording_errors
+from stario.fusion.evaluation.judging.network_alone import answers
+from stario.fusion.evaluation.judging.prepared import Prepared, prepared_recordings
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
-from stario.fusion.evaluation.prepared import Prepared, prepared_recordings
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
 from stario.fusion.navigator import Navigator
 from stario.fusion.table.training import Reading
 from stario.network.model import DisplacementModel
-from stario.sequences.batch import Skipped
+from stario.sequences.accuracy.metrics import Convention, align, evaluate_track, pose_errors
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.splits import Listed
 from stario.sequences.errors import StarioError
-from stario.sequences.metrics import Convention, align, evaluate_track, pose_errors
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.splits import Listed
 
 TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
 """Tracks of a recording with poses, as everywhere."""

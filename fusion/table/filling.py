@@ -13,7 +13,7 @@ from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
 from stario.fusion.table.sets import FIRST, DataSet
 from stario.fusion.table.training import Reading, cell_recipe
 from stario.network.architectures import ARCHITECTURES, architecture
-from stario.sequences.batch import Skipped, each
+from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.readers.checked import optional_package
 
@@ -68,7 +68,7 @@ def fill(
         cells: in the order in which they are begun.
         out: folder of all results, which every process that takes part can write to.
         reading: how recordings are read.
-        jobs: processes, as for `stario.sequences.batch.each`.
+        jobs: processes, as for `stario.sequences.datasets.batch.each`.
     """
     yield from each(partial(fill_cell, out=out, reading=reading), cells, jobs)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.evaluation.bootstrap import CONFIDENCE, REPLICATES, Interval
+from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.sequences.sequence import FloatArray
 
 Recordings = Sequence[tuple[str, str, FloatArray]]

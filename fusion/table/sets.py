@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from stario.network.training.splits import listed
+from stario.sequences.datasets.splits import Listed, random_split
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings
-from stario.sequences.splits import Listed, random_split
 
 _MEMBERS = {
     "oxiod": ("oxiod",),

@@ -12,7 +12,7 @@ from stario.fusion.table.summary import AGAINST, COLUMNS, Mean, Row, SetTable
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow
 from stario.network.training.config import TrainingConfig
-from stario.sequences.metrics import CONVENTIONS
+from stario.sequences.accuracy.metrics import CONVENTIONS
 
 Work = Mapping[str, tuple[float, float, float]]
 """As `stario.fusion.table.summary.seconds_by_network` gives it."""

@@ -16,10 +16,10 @@ from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import Recorded, cached_walks, gather
 from stario.network.training.run import EpochReport
 from stario.network.training.train import train
-from stario.sequences.batch import Skipped
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.stream_cache import recorded
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
 
 _EPOCH_STEPS = 250

@@ -22,8 +22,8 @@ from stario.network.runtime.engines import Engine, TorchEngine
 from stario.network.runtime.inference import inference_form
 from stario.network.runtime.memory import peak_bytes
 from stario.network.runtime.timing import seconds_in_turn
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.text_table import aligned, figure
 from stario.sequences.windows import WINDOW_SAMPLES
 
 BATCHES = (1, 64)

@@ -11,13 +11,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
 from stario.sequences.legs import LegStream
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.stream_cache import Stream, cached
 from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)

@@ -12,9 +12,9 @@ from torch import Tensor
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.config import TrainingConfig
 from stario.network.training.weak_truth import LegBatch, LegSampler, by_kind, leg_loss
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
-from stario.sequences.rotations import about_z
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,

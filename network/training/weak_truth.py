@@ -21,8 +21,8 @@ velocities of two seconds in a row differ by
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
 the error of levelling hardly change within a stretch and are taken out by the mean. With
 c = sum_k conj(d_k+1 - d_k) a_k a turn of the displacements takes 2 (|c| - Re c) from the sum of
-|d_k+1 - d_k - a_k|^2. That alone is the loss: the whole sum would have a network that cannot tell
-every second shorten them all (Indoor Location left out: errors 10 % larger).
+|d_k+1 - d_k - a_k|^2, and that over s_a^2, times q, is the loss. The whole sum would have a network
+that cannot tell every second shorten them all (Indoor Location left out: errors 10 % larger).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES
 VARIANCE_RATE = 0.05
 """Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
 
-VELOCITY_SIGMA = 0.15
+VELOCITY_SIGMA = 0.1
 """Deviation per axis of a change of velocity that the accelerometer tells, s_a [m/s]."""
 
 _HUBER = 3.0
@@ -287,13 +287,13 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
 
 
 def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
-    """What a turn of the displacements (S, K, 3) would take off their error [m^2], whitened."""
+    """What a turn of each stretch's displacements (S, K, 3) would take off its error [m^2]."""
     d, a = displacement_N[..., :2].diff(dim=1), legs.velocity_change
     real = (d * a).sum((1, 2))
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves
     by_turn = 2.0 * (size - real) / a.shape[1]
-    return VARIANCE_RATE * by_turn.mean() / (2.0 * VARIANCE_RATE + VELOCITY_SIGMA**2)
+    return VARIANCE_RATE * by_turn.mean() / VELOCITY_SIGMA**2
 
 
 def _robust(white: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.advio import is_advio, read_advio
 from stario.sequences.readers.archive import (
     Where,
     archive_members,
@@ -20,21 +19,22 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.readers.euroc import is_euroc, read_euroc
-from stario.sequences.readers.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.imunet import is_imunet, read_imunet
-from stario.sequences.readers.json_export import is_json_export, laid_out
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.own_csv import is_own_csv, read_own_csv
-from stario.sequences.readers.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.phone import is_phone, is_wide, read_phone, read_wide
-from stario.sequences.readers.phone_files import lone_sensors
+from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
+from stario.sequences.readers.phones.files import lone_sensors
+from stario.sequences.readers.phones.json_export import is_json_export, laid_out
+from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.poses import pose_files
-from stario.sequences.readers.ridi import is_ridi, read_ridi
-from stario.sequences.readers.rnin import is_rnin, read_rnin
-from stario.sequences.readers.ronin import is_ronin, read_ronin
+from stario.sequences.readers.published.advio import is_advio, read_advio
+from stario.sequences.readers.published.euroc import is_euroc, read_euroc
+from stario.sequences.readers.published.imunet import is_imunet, read_imunet
+from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
+from stario.sequences.readers.published.ridi import is_ridi, read_ridi
+from stario.sequences.readers.published.rnin import is_rnin, read_rnin
+from stario.sequences.readers.published.ronin import is_ronin, read_ronin
+from stario.sequences.readers.published.tlio import is_tlio, read_tlio
 from stario.sequences.readers.text import first_line, magic
-from stario.sequences.readers.tlio import is_tlio, read_tlio
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 

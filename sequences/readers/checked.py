@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import advancing
 

@@ -31,6 +31,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import time_unit
@@ -46,7 +47,6 @@ from stario.sequences.readers.columns import (
     unit_factor,
 )
 from stario.sequences.readers.text import first_lines, read_lines, read_quickly
-from stario.sequences.rotations import NORM_TOLERANCE
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,

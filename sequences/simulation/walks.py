@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
 from stario.sequences.simulation.carrying import CARRIES, CarryMotion, Gait

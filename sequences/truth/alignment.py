@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation
+from stario.sequences.attitude.rotations import cumulative_rotations, tilt_aligning
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import cumulative_rotations, tilt_aligning
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.truth.mount_heading import heading_turn
 

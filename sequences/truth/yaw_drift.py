@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.levelling import levelled_attitudes
-from stario.sequences.rotations import yaw_of
+from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import TruthFit, middle
 from stario.sequences.windows import clean_samples, unbroken

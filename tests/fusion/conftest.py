@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.front_end import cut_recording
-from stario.sequences.rotations import about_z, yaw_of
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.fusion import Navigator, NavState, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.sequences.metrics import Alignment, align, evaluate_track, pose_errors
+from stario.sequences.accuracy.metrics import Alignment, align, evaluate_track, pose_errors
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 

@@ -11,8 +11,8 @@ from support import CONFIG, FILTER, NOISE, Broken, ate, stream, streamed_off
 
 from stario.fusion import Navigator, Track
 from stario.fusion.config import NavigatorConfig
+from stario.sequences.accuracy.metrics import align
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import align
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.walks import CARRYING_MODES
 

@@ -22,12 +22,12 @@ from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.cutting import cut
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.lie import exp_se23, yaw_twist
+from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.noise import ImuNoise
-from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
-from stario.sequences.so3 import exp_so3
 
 NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)

@@ -12,10 +12,10 @@ from support import CONFIG, ate, stream, streamed_off
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import inertial_track
-from stario.sequences.metrics import align, pose_errors
-from stario.sequences.nees import position_nees
+from stario.sequences.accuracy.metrics import align, pose_errors
+from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.noise import ImuNoise
-from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
 

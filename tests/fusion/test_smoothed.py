@@ -9,7 +9,7 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig, Track
 from stario.fusion.config import FilterConfig
 from stario.fusion.fixes import position_fix
-from stario.sequences.metrics import align, pose_errors
+from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors

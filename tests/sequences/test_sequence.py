@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import about_z, tilt_aligning, wrap_angle, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import about_z, tilt_aligning, wrap_angle, yaw_of
 from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,

@@ -10,8 +10,8 @@ from __future__ import annotations
 import importlib.resources
 from pathlib import Path
 
+from stario.sequences.datasets.splits import Listed, read_list
 from stario.sequences.errors import InputError
-from stario.sequences.splits import Listed, read_list
 
 NAMES = ("test", "validation", "training", "holdout", "all", "open")
 

@@ -21,8 +21,8 @@ from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import save_model
-from stario.sequences.archive_writer import write_archive
 from stario.sequences.conventions import with_axes
+from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.files import read_tum
 from stario.sequences.readers import find_recordings
 from stario.sequences.readers.csv_writer import write_csv

@@ -20,9 +20,9 @@ from stario.fusion.evaluation.compare import (
 )
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
-from stario.sequences.metrics import align, evaluate_track
 from stario.sequences.sequence import ImuSequence
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))

@@ -15,10 +15,10 @@ from stario.fusion.evaluation.pedestrian import (
     pedestrian_track,
     steps_of,
 )
+from stario.sequences.accuracy.metrics import evaluate_track
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream
-from stario.sequences.metrics import evaluate_track
 from stario.sequences.readers import read_recording
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.windows import WINDOW_RATE
 

@@ -19,8 +19,8 @@ from stario.fusion.evaluation.tables import (
     table_text,
 )
 from stario.network.model import weights_named
+from stario.sequences.accuracy.metrics import check_convention
 from stario.sequences.errors import InputError, WeightsError
-from stario.sequences.metrics import check_convention
 
 
 class Scaled:

@@ -15,9 +15,9 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
 )
 from stario.fusion.navigator import Navigator
+from stario.sequences.accuracy.metrics import align, pose_errors
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.metrics import align, pose_errors
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

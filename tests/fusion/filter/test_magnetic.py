@@ -17,13 +17,13 @@ from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
 from stario.fusion.navigator import Navigator as Stream
+from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import ConfigError
-from stario.sequences.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.so3 import exp_so3
 
 FIELD_W = np.array([15.0, 12.0, -40.0])
 Make = Callable[..., Any]

@@ -12,7 +12,7 @@ from support import stream
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.fixes import Fix, position_fix, yaw_fix
-from stario.sequences.rotations import about_z
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]

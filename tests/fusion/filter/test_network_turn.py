@@ -13,13 +13,13 @@ from support import GRAPH as CONFIG
 from stario.fusion import Navigator, NavState
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.fixed import fixed_track, true_fixes
+from stario.fusion.evaluation.checks.fixed import fixed_track, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
 from stario.fusion.filter.seen_positions import SeenPositions
 from stario.fusion.lie import yaw_twist
-from stario.sequences.metrics import pose_errors
+from stario.sequences.accuracy.metrics import pose_errors
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.so3 import exp_so3
 
 Make = Callable[..., Any]
 TURN = 0.12

@@ -20,7 +20,7 @@ from stario.fusion.graph.factors import (
     Yaw,
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.sequences.so3 import exp_so3
+from stario.sequences.attitude.so3 import exp_so3
 
 EYE = np.eye(3)
 

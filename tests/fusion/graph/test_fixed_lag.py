@@ -22,9 +22,9 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.lie import yaw_twist
 from stario.fusion.recording import PreprocessedRecording
-from stario.sequences.rotations import about_z
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.so3 import exp_so3
 
 Make = Callable[..., Any]
 

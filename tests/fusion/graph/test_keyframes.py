@@ -14,7 +14,7 @@ from support import Broken, ate
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.backends import score_walk, summary
+from stario.fusion.evaluation.checks.backends import score_walk, summary
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph.keyframes import KeyframeGraph
@@ -22,10 +22,10 @@ from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.report.health import told
 from stario.fusion.state import NavState
+from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.nees import position_nees
 from stario.sequences.noise import ImuNoise
-from stario.sequences.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.settings import with_settings
 

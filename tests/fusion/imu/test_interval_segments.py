@@ -7,7 +7,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import segment_of
-from stario.sequences.so3 import exp_so3
+from stario.sequences.attitude.so3 import exp_so3
 
 CONFIG = NavigatorConfig()
 

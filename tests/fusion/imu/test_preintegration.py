@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.preintegration import corrected_increments, preintegrate
 from stario.fusion.lie import exp_se23, log_se23
+from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
-from stario.sequences.so3 import exp_so3, log_so3, skew
 
 GRAVITY = 9.80665
 NOISE = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3)

@@ -18,9 +18,9 @@ from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.network import load_model
 from stario.sequences import read_recording
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU
-from stario.sequences.so3 import exp_so3
 
 DATA = Path(
     os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"

@@ -21,7 +21,7 @@ from stario.fusion.table.sets import DataSet, folder_set
 from stario.fusion.table.summary import filled_cells, set_table
 from stario.fusion.table.training import Reading, cell_recipe
 from stario.network.architectures import ARCHITECTURES
-from stario.sequences.batch import Skipped
+from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv

@@ -9,8 +9,8 @@ import pytest
 
 from stario.fusion.table import sets
 from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
+from stario.sequences.datasets.splits import Listed
 from stario.sequences.errors import InputError
-from stario.sequences.splits import Listed
 
 DATA = Path(os.environ.get("STARIO_DATA", "../shared/data"))
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.readers.checked import trajectory
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

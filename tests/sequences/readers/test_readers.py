@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
-from stario.sequences.readers.euroc import read_euroc
 from stario.sequences.readers.lists import is_list
-from stario.sequences.readers.oxiod import read_oxiod
+from stario.sequences.readers.published.euroc import read_euroc
+from stario.sequences.readers.published.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

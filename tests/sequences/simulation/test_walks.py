@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import welch
 
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.rotations import about_z
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.routes import band_noise, drift, random_route

@@ -1,0 +1,1 @@
+"""What `stario check` runs."""

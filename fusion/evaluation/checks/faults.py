@@ -1,0 +1,236 @@
+"""What faults in a recording cost: the same recording run with and without each.
+
+What a fault costs the fusion shows best
+where the displacements are the true ones under white noise of a known size; a network's own errors,
+which differ from window to window, hide it. So that is what measures unless a network is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.checks.spoiling import Corrupt, Fault, faults
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.recording import PreprocessedRecording
+from stario.fusion.state import Health, Track
+from stario.sequences.accuracy.metrics import align, evaluate_track
+from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.windows import WINDOW_SECONDS
+
+WHITE_NOISE = 0.05
+"""Of the true displacements where no network measures, per axis [m]."""
+
+
+@dataclass(frozen=True)
+class FaultResult:
+    """What a fault cost.
+
+    Attributes:
+        fault: its name.
+        backend: "ekf" or "graph".
+        error_without: absolute trajectory error of the untouched recording [m].
+        error_with: of the spoilt one [m].
+        end_error: distance from the truth at the end [m].
+        end_sigma: what the track says of it, root of the covariance's trace [m].
+        finite: whether every state, covariance included, is finite.
+        reported: what the health report says of it.
+    """
+
+    fault: str
+    backend: str
+    error_without: float
+    error_with: float
+    end_error: float
+    end_sigma: float
+    finite: bool
+    reported: str
+
+
+def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
+    """A simulated walk and a configuration that knows its sensor's errors as they are."""
+    noise = ImuNoise()
+    errors = ImuErrors(noise=noise, gyro_turn_on=5e-4, accel_turn_on=0.02)
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
+    walk = generate_walk(seed, seconds, style=style)
+    known = FilterConfig(
+        covariance_scale=1.0,
+        gyro_bias_sigma=errors.gyro_turn_on,
+        accel_bias_sigma=errors.accel_turn_on,
+        adaptive=False,
+    )
+    sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
+    return sequence, NavigatorConfig(noise=noise, filter=known)
+
+
+def run_faults(
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    model: Predictor | None = None,
+    seed: int = 0,
+    backends: Sequence[BackendName] = get_args(BackendName),
+    only: Sequence[Fault] | None = None,
+) -> list[FaultResult]:
+    """Run a recording with each fault through each back end.
+
+    Args:
+        sequence: a recording with truth.
+        config: of the navigator.
+        model: the network; None for the true displacements under white noise.
+        seed: of the faults' draws.
+        backends: which to run.
+        only: the faults; None for all of them.
+
+    Raises:
+        InputError: the recording has no truth, or is too short.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+    results: list[FaultResult] = []
+    for backend in backends:
+        without = _error(_run(Fault(""), sequence, config, model, seed, backend), sequence)
+        for fault in faults(sequence.duration) if only is None else only:
+            track = _run(fault, sequence, config, model, seed, backend)
+            results.append(_result(fault, backend, track, sequence, without))
+    return results
+
+
+def fault_table(results: Sequence[FaultResult]) -> str:
+    """The results for a person."""
+    rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
+    for r in results:
+        figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
+        rows.append([r.fault, r.backend, *(f"{value:.3f}" for value in figures)])
+    told = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
+    lines = zip(aligned(rows), ["reported", *told], strict=True)
+    return "\n".join(f"{line}   {words}" for line, words in lines)
+
+
+def reported(health: Health) -> str:
+    """What a health report says of faults, in a few words."""
+    words = [f"{name} {n}" for name, n in health.samples.items() if n and name != "used"]
+    words += [f"{name} {n}" for name, n in health.flagged.items() if n]
+    words += [f"refused {reason} {n}" for reason, n in health.refused.items()]
+    words += [f"gap {length:.1f} s" for _, length in health.gaps]
+    words += [f"gated {health.gated} of {health.updates}", *health.notes]
+    return ", ".join(words)
+
+
+def _run(
+    fault: Fault,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    model: Predictor | None,
+    seed: int,
+    backend: BackendName,
+) -> Track:
+    rng = np.random.default_rng(seed)
+    spoilt = sequence if fault.spoil is None else fault.spoil(sequence, rng)
+    navigator = Navigator(model or _Silent(), config, backend=backend)
+    preprocessed = navigator.observe(spoilt)
+    if model is None and sequence.truth is not None:
+        preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
+    if fault.corrupt is not None:
+        preprocessed = _corrupted(preprocessed, fault.corrupt, rng)
+    return navigator.track(preprocessed)
+
+
+class _Silent:
+    """Stands where a network would."""
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        n = len(np.asarray(windows))
+        return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+
+
+def with_true_displacements(
+    preprocessed: PreprocessedRecording,
+    truth: Trajectory,
+    config: NavigatorConfig,
+    seed: int,
+    noise: float = WHITE_NOISE,
+) -> PreprocessedRecording:
+    """A prepared recording measured by its true displacements under white noise.
+
+    Like a network's they are given in each window's frame, off by the yaw of the attitude the
+    window was prepared with, and with the covariance that the filter then takes at its word.
+
+    Args:
+        preprocessed: the prepared recording.
+        truth: of its poses.
+        config: of the navigator.
+        seed: of the noise; a window draws the same one whatever happened before it.
+        noise: per axis [m].
+    """
+    covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
+    known = [k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None]
+    intervals = [preprocessed.intervals[k] for k in known]
+    stop = np.array([interval.stop for interval in intervals])
+    ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
+    first, last = truth.at(ends[0]), truth.at(ends[1])
+    seen = [interval.R_NB_window for interval in intervals if interval.R_NB_window is not None]
+    R_NB = Rotation.from_matrix(np.stack(seen))
+    turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
+    displacement_N = turn.apply(last.position_W - first.position_W)
+    measurements = list(preprocessed.measurements)
+    for k, d_N, time in zip(known, displacement_N, stop - truth.time[0], strict=True):
+        rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
+        measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
+    return replace(preprocessed, measurements=measurements)
+
+
+def _corrupted(
+    preprocessed: PreprocessedRecording, corrupt: Corrupt, rng: np.random.Generator
+) -> PreprocessedRecording:
+    """What the fault makes of the measurements, all of them at once."""
+    known = [
+        k for k, measurement in enumerate(preprocessed.measurements) if measurement is not None
+    ]
+    pairs = [measurement for measurement in preprocessed.measurements if measurement is not None]
+    mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
+    corrupt((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
+    measurements = list(preprocessed.measurements)
+    for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
+        measurements[k] = (d_N, cov_N)
+    return replace(preprocessed, measurements=measurements)
+
+
+def _result(
+    fault: Fault, backend: str, track: Track, sequence: ImuSequence, without: float
+) -> FaultResult:
+    assert sequence.truth is not None and track.covariance is not None  # noqa: PT018
+    aligned = align(track.trajectory, sequence.truth, "first")
+    last = sequence.truth.at(np.clip(track.time[-1:], *sequence.truth.time[[0, -1]]))
+    arrays = [values for values in track.arrays().values() if values.dtype.kind == "f"]
+    return FaultResult(
+        fault=fault.name,
+        backend=backend,
+        error_without=without,
+        error_with=_error(track, sequence),
+        end_error=float(np.linalg.norm(aligned.position_W[-1] - last.position_W[0])),
+        end_sigma=float(np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9]))),
+        finite=all(bool(np.isfinite(values).all()) for values in arrays),
+        reported="" if track.health is None else reported(track.health),
+    )
+
+
+def _error(track: Track, sequence: ImuSequence) -> float:
+    assert sequence.truth is not None  # checked at the edge
+    return evaluate_track(track.trajectory, sequence.truth).ate_m
+
+
+# --- what the faults do ------------------------------------------------------------------------

@@ -1,0 +1,124 @@
+"""How honest a track is that fixes tell where it is: its error, and what it says of it.
+
+Fixes are the true positions at equal intervals with white errors. Counted is the second half of
+each track: by then several fixes have told the direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.worth import LEAST_SIGMA
+from stario.fusion.fixes import Fix, position_fix
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.sequences.accuracy.metrics import pose_errors
+from stario.sequences.accuracy.nees import nees
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence, Trajectory
+
+_FEWEST = 4
+"""Fixes that a track is judged with, at least."""
+
+
+@dataclass(frozen=True)
+class FixedTrack:
+    """One recording with fixes.
+
+    Attributes:
+        recording: its name.
+        group: that it is counted in.
+        applied: share of the fixes that were taken in.
+        position_rms: horizontal [m].
+        position_nees: median; 2.4 is expected of three axes.
+        yaw_rms: [rad].
+        yaw_nees: mean; 1 is expected.
+        yaw_covered: share of the poses whose yaw is within three deviations.
+    """
+
+    recording: str
+    group: str
+    applied: float
+    position_rms: float
+    position_nees: float
+    yaw_rms: float
+    yaw_nees: float
+    yaw_covered: float
+
+
+def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
+    """Positions of the truth, `every` seconds one, with errors of `sigma` [m] per axis."""
+    at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
+    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(at.time), 3))
+    covariance = sigma**2 * np.eye(3)
+    return [
+        position_fix(float(time), position, covariance)
+        for time, position, known in zip(at.time, at.position_W + noise, at.valid, strict=True)
+        if known
+    ]
+
+
+def fixed_track(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    every: float = 5.0,
+    sigma: float = 0.3,
+    backend: BackendName = "ekf",
+    seed: int = 0,
+) -> FixedTrack:
+    """Run a recording with fixes.
+
+    Raises:
+        InputError: it has no poses as truth, too few fixes fit in, or it cannot be run.
+    """
+    if sequence.truth is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses")
+    fixes = true_fixes(sequence.truth, every, sigma, seed)
+    if len(fixes) < _FEWEST:
+        raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_FEWEST} or more")
+    track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
+    assert track.covariance is not None  # both back ends give it
+    assert track.health is not None
+    errors = pose_errors(track.trajectory, sequence.truth)
+    middle = 0.5 * (sequence.truth.time[0] + sequence.truth.time[-1])
+    late = errors.estimate.time > middle
+    known = np.searchsorted(track.time, errors.estimate.time[late])
+    P, off, yaw = track.covariance[known], errors.position_W[late], errors.yaw[late]
+    return FixedTrack(
+        sequence.name,
+        group,
+        track.health.fixes.get("applied", 0) / len(fixes),
+        float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())),
+        float(np.median(nees(off, P[:, 6:9, 6:9]))),
+        float(np.sqrt((yaw**2).mean())),
+        float((yaw**2 / P[:, 2, 2]).mean()),
+        float((np.abs(yaw) < LEAST_SIGMA * np.sqrt(P[:, 2, 2])).mean()),
+    )
+
+
+def fixed_table(found: Sequence[FixedTrack]) -> str:
+    """A row for each group: medians of its recordings, and how often the yaw is covered."""
+    head = ["group", "n", "fixes taken", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
+    rows = [head]
+    for group, part in by_group(found):
+        rows.append(
+            [
+                *(group, str(len(part)), f"{np.mean([one.applied for one in part]):.0%}"),
+                f"{np.median([one.position_rms for one in part]):.2f}",
+                f"{np.median([one.position_nees for one in part]):.1f}",
+                f"{np.degrees(np.median([one.yaw_rms for one in part])):.1f}",
+                f"{np.median([one.yaw_nees for one in part]):.1f}",
+                f"{np.mean([one.yaw_covered for one in part]):.1%}",
+            ]
+        )
+    words = "second half of each track; NEES of position: median, 2.4 expected; of yaw: mean, 1"
+    return "\n".join([*aligned(rows), words])

@@ -1,0 +1,112 @@
+"""How far a track's end moves where samples are missing: what is given out must not hang on a hair.
+
+A recording is run as it is, with a short gap at each of several instants, and with samples dropped
+at random; both tracks begin in the same pose, so their ends are compared as they stand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.spoiling import drops, gap
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.lie import yaw_twist
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence
+
+GAP_SECONDS, DROPPED = 0.1, 0.05
+"""Length of a gap [s], and the share of samples that is dropped."""
+
+INSTANTS = 6
+"""At which a gap is put, one after the other."""
+
+MOST_METRES, MOST_DEGREES = 0.01, 3.0
+"""By which the end should move at most: of a metre per metre of the path, and in yaw."""
+
+_SHORTEST_PATH = 1.0
+"""A track that goes nowhere has no path to count by [m]."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The end of a track with samples missing against that without.
+
+    Attributes:
+        recording: its name.
+        group: that it is counted in.
+        fault: what was missing.
+        metres: horizontal distance of the ends over the length of the track.
+        degrees: difference of their yaws.
+    """
+
+    recording: str
+    group: str
+    fault: str
+    metres: float
+    degrees: float
+
+
+def moved_ends(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    backend: BackendName = "ekf",
+    seed: int = 0,
+) -> list[Moved]:
+    """Of a recording with each of the faults.
+
+    Raises:
+        InputError: the recording cannot be run, or its track is shorter than a metre.
+    """
+
+    def run(spoilt: ImuSequence) -> Track:
+        return Navigator(model, config, backend=backend).run(spoilt)
+
+    whole = run(sequence)
+    steps = np.diff(whole.trajectory.position_W[:, :2], axis=0)
+    path = float(np.linalg.norm(steps, axis=1).sum())
+    if path < _SHORTEST_PATH:
+        raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "one of a metre and more")
+    instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
+    faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
+    faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
+    return [
+        Moved(sequence.name, group, name, *_between(whole, run(spoilt), path))
+        for name, spoil in faults
+        for spoilt in (spoil(sequence, np.random.default_rng(seed)),)
+    ]
+
+
+def _between(whole: Track, other: Track, path: float) -> tuple[float, float]:
+    a, b = whole.trajectory, other.trajectory
+    metres = float(np.linalg.norm(a.position_W[-1, :2] - b.position_W[-1, :2])) / path
+    turn = (b.attitude_WB[-1] * a.attitude_WB[-1].inv()).as_matrix()
+    return metres, abs(math.degrees(yaw_twist(turn)))
+
+
+def moved_table(found: Sequence[Moved]) -> str:
+    """A row for each group: how many ends stay, and how far the others go."""
+    head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
+    rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
+    for group, part in by_group(found):
+        metres = np.array([one.metres for one in part])
+        degrees = np.array([one.degrees for one in part])
+        stay = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
+        figures = [
+            f"{value:.2f}"
+            for values in (100.0 * metres, degrees)
+            for value in np.quantile(values, (0.5, 0.95, 1.0))
+        ]
+        rows.append([group, str(len(part)), f"{stay:.0%}", *figures])
+    return "\n".join(aligned(rows))

@@ -1,0 +1,128 @@
+"""Speed of the whole: filter, network and run, medians and ratios from one run of the benchmark."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.checks.benchmark import filter_speed
+from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, demonstration
+from stario.fusion.navigator import Navigator
+from stario.network.model import DisplacementModel
+from stario.network.runtime.benchmark import network_speed
+from stario.sequences.datasets.stream_cache import recorded
+from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+_RUNS = 5
+
+
+def speed_report(model: DisplacementModel) -> dict[str, Any]:
+    """Seconds per minute of data and milliseconds per window; medians of interleaved runs."""
+    engine = filter_speed()
+    sequence = demonstration()
+    minutes = sequence.duration / 60.0
+    runs: dict[str, list[float]] = {"run": [], "run_network": [], "filter_20_hz": []}
+    default = Navigator(model, NavigatorConfig())
+    fast = Navigator(model, NavigatorConfig(filter=FilterConfig(update_rate=20)))
+    preprocessed = fast.observe(sequence)
+    for _ in range(_RUNS):
+        seconds, track = _timed(lambda: default.run(sequence))
+        runs["run"].append(seconds / minutes)
+        runs["run_network"].append(track.seconds_network / minutes)
+        seconds, _track = _timed(lambda: fast.track(preprocessed))
+        runs["filter_20_hz"].append(seconds / minutes)
+    medians = {name: float(np.median(values)) for name, values in runs.items()}
+    return {
+        "filter_s_per_min_20_hz": medians["filter_20_hz"],
+        "filter_engine_s_per_min_20_hz": engine.structured,
+        "filter_engine_dense_s_per_min_20_hz": engine.dense,
+        "filter_engine_ratio": engine.ratio,
+        "run_s_per_min": medians["run"],
+        "run_network_s_per_min": medians["run_network"],
+        **push_speed(model),
+        "update_rate_hz": default.config.filter.update_rate,
+        **windows_speed(),
+        "network": [asdict(speed) for speed in network_speed(model.training_form)],
+    }
+
+
+def windows_speed(seconds: float = 600.0) -> dict[str, float]:
+    """Seconds per hour of data to read windows for training from a CSV, and from the cache."""
+    sequence = simulate_imu(generate_walk(DEMONSTRATION_SEED, seconds), 200.0, PHONE_IMU)
+    hours = sequence.duration / 3600.0
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "walk.csv"
+        write_csv(path, sequence)
+        runs = [
+            _timed(lambda: list(recorded([path], read_recording, {}, Path(name) / "cache")))[0]
+            for _ in range(1 + _RUNS)
+        ]
+    return {
+        "windows_built_s_per_hour": runs[0] / hours,
+        "windows_cached_s_per_hour": float(np.median(runs[1:])) / hours,
+    }
+
+
+def push_speed(model: DisplacementModel) -> dict[str, float]:
+    """Microseconds of one `push` in a stream: without a state (median), with a network update."""
+    sequence = demonstration()
+    navigator = Navigator(model, NavigatorConfig())
+    plain, with_update = [], []
+    rows = zip(sequence.time.tolist(), sequence.gyro.tolist(), sequence.accel.tolist(), strict=True)
+    updates = 0
+    for row in rows:
+        began = perf_counter()
+        state = navigator.push(*row)
+        seconds = perf_counter() - began
+        if state is None:
+            plain.append(seconds)
+        elif navigator.health.updates > updates:
+            updates = navigator.health.updates
+            with_update.append(seconds)
+    return {
+        "push_us_median": 1e6 * float(np.median(plain)),
+        "push_us_with_update_p99": 1e6 * float(np.percentile(with_update, 99)),
+    }
+
+
+def speed_table(report: dict[str, Any]) -> str:
+    """The report for a person."""
+    lines = [
+        f"filter, 20 updates/s, preintegration included: "
+        f"{report['filter_s_per_min_20_hz']:.3f} s/min",
+        f"its engine alone: {report['filter_engine_s_per_min_20_hz']:.3f} s/min",
+        f"the same through filterpy's dense algebra: "
+        f"{report['filter_engine_dense_s_per_min_20_hz']:.3f} s/min "
+        f"({report['filter_engine_ratio']:.1f} times slower)",
+        f"whole run at {report['update_rate_hz']} updates/s: {report['run_s_per_min']:.3f} s/min, "
+        f"of which network {report['run_network_s_per_min']:.3f} s/min",
+    ]
+    lines.append(
+        f"training windows: {report['windows_built_s_per_hour']:.2f} s per hour of data from CSV, "
+        f"{report['windows_cached_s_per_hour']:.3f} s from the cache, one process"
+    )
+    lines.append(
+        f"push: {report['push_us_median']:.1f} us in the median, "
+        f"{report['push_us_with_update_p99'] / 1e3:.1f} ms with a network update (99th percentile)"
+    )
+    lines += [
+        f"network, batch {n['batch']}: {n['inference_form']:.3f} ms/window "
+        f"(as trained: {n['training_form']:.3f}), {n['threads']} threads"
+        for n in report["network"]
+    ]
+    return "\n".join(lines)
+
+
+def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    began = perf_counter()
+    result = work()
+    return perf_counter() - began, result

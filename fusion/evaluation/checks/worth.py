@@ -1,0 +1,150 @@
+"""What the fusion is worth: the filter's and the graph's error against the network's, by group.
+
+The network alone is chained along the attitude levelled from the IMU. Errors are horizontal,
+root mean square after a fit of yaw and position: over all poses, or at the waypoints.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.known_positions import LEAST, position_error
+from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import evaluate_track, pose_errors
+from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+
+LEAST_SIGMA = 3.0
+"""Deviations that an honest yaw error stays within."""
+
+GOOD_YAW = math.radians(10.0)
+"""What the yaw at the end should be within [rad]."""
+
+
+@dataclass(frozen=True)
+class Worth:
+    """One recording.
+
+    Attributes:
+        recording: its name.
+        group: that it is counted in.
+        network_m: error of the network alone [m].
+        fused_m: by back end [m].
+        nis: the filter's mean; 3 is expected.
+        position_nees: the first back end's median; 2.4 is expected of three axes, nan without true
+            attitude.
+        yaw_error: the filter's, at the end against the start [rad]; nan without true attitude.
+        yaw_sigma: what it says of it [rad].
+    """
+
+    recording: str
+    group: str
+    network_m: float
+    fused_m: dict[str, float]
+    nis: float
+    position_nees: float
+    yaw_error: float
+    yaw_sigma: float
+
+
+def worth_of(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    backends: Sequence[BackendName] = get_args(BackendName),
+) -> Worth:
+    """Run a recording through the network alone and the back ends.
+
+    Raises:
+        InputError: nothing or too little is known of where it led, or it cannot be run.
+    """
+    known: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
+    if known is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    preprocessed = Navigator(model, config).observe(sequence)
+    tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
+    first = tracks[backends[0]]
+    network_m = _error(network_track(preprocessed), known)
+    if math.isnan(network_m):
+        raise InputError(
+            f"{sequence.name}: positions",
+            f"fewer than {LEAST} within the track",
+            f"{LEAST} or more",
+        )
+    error, sigma = _yaw(first, sequence.truth)
+    return Worth(
+        sequence.name,
+        group,
+        network_m,
+        {name: _error(track, known) for name, track in tracks.items()},
+        math.nan if first.nis is None else first.nis,
+        _nees(first, sequence.truth),
+        error,
+        sigma,
+    )
+
+
+def worth_table(found: Sequence[Worth]) -> str:
+    """A row for each group: ratios to the network, NIS, and the yaw at the end."""
+    names = list(found[0].fused_m) if found else []
+    head = ["group", "n", "network"]
+    for name in names:
+        head += [f"{name} mean", "p95", "worst"]
+    rows = [[*head, "NIS", "NEES", "yaw deg", "< 10 deg", "< 3 sigma"]]
+    for group, part in by_group(found):
+        rows.append(_row(group, part, names))
+    words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
+    more = (
+        "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
+        "against that at the start"
+    )
+    return "\n".join([*aligned(rows), words, more])
+
+
+def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
+    row = [group, str(len(part)), f"{np.median([one.network_m for one in part]):.2f}"]
+    for name in names:
+        ratio = np.log([one.fused_m[name] / one.network_m for one in part])
+        figures = np.exp([ratio.mean(), np.quantile(ratio, 0.95), ratio.max()])
+        row += [f"{value:.2f}" for value in figures]
+    row.append(f"{np.nanmean([one.nis for one in part]):.1f}")
+    yaw = np.array([(one.yaw_error, one.yaw_sigma) for one in part])
+    yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
+    if len(yaw) == 0:
+        return [*row, "-", "-", "-", "-"]
+    good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]
+    row += [f"{np.nanmedian([one.position_nees for one in part]):.1f}"]
+    row += [f"{np.degrees(np.median(yaw[:, 0])):.1f}"]
+    return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]
+
+
+def _error(track: Track, known: Trajectory | PositionTrack) -> float:
+    """Horizontal, after a fit of yaw and position [m]."""
+    if isinstance(known, Trajectory):
+        return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
+    return position_error(track, known)[0]
+
+
+def _nees(track: Track, truth: Trajectory | None) -> float:
+    return math.nan if truth is None else position_nees(track.trajectory, truth).median
+
+
+def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:
+    if truth is None or track.covariance is None:
+        return math.nan, math.nan
+    yaw: FloatArray = np.unwrap(pose_errors(track.trajectory, truth).yaw)
+    return float(yaw[-1] - yaw[0]), math.sqrt(float(track.covariance[-1, 2, 2]))

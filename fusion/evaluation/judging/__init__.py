@@ -1,0 +1,1 @@
+"""Networks alone judged by groups of recordings."""

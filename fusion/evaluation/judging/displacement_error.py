@@ -1,0 +1,286 @@
+"""Errors of a network alone on one recording, whatever kind of truth it has.
+
+All positions are horizontal and written x + iy. The track lives in N, whose yaw against the world
+is unknown; what is done about it depends on the truth:
+
+- poses: displacements over a horizon are turned by the true yaw at the horizon's start; the track
+  as a whole is fitted in yaw and position, or set on the first pose.
+- positions: the yaw is fitted over the stretch of 20 s (or the horizon, if longer) from the start.
+- waypoints: the track is fitted to all waypoints in yaw and position.
+
+A displacement is compared where the truth has neither gap nor jump between its ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stario.fusion.evaluation.judging.direction import Direction, direction
+from stario.fusion.evaluation.judging.network_alone import Answers
+from stario.fusion.evaluation.judging.prepared import Kind, Prepared, PreparedPiece
+from stario.sequences.levelled_stream import TICK_SECONDS
+from stario.sequences.sequence import BoolArray, FloatArray
+
+HORIZONS = (1, 10, 30)
+"""Spans [s] over which displacements are compared."""
+
+BLOCK_SECONDS = 30.0
+"""Errors are summed by blocks of this length, for the bootstrap."""
+
+STRETCH_SECONDS = 20
+"""Length of the stretches of which `stretch_percent` is the error."""
+
+_LEAST_PAIRS = 20
+"""Displacements of which a recording's error over a horizon is told."""
+
+_LEG = round(2.0 / TICK_SECONDS)
+
+Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
+
+FIGURES = {
+    "ate_fit_m": "root mean square of the horizontal position error after a fit in yaw and position"
+    " [m]; of waypoints, at the waypoints",
+    "ate_fit_percent": "the same in % of the true path",
+    "ate_first_m": "the same with yaw and position of the first pose [m]",
+    "length_ratio": "length of the track over that of the truth, along legs of 2 s or between "
+    "waypoints",
+    "rms_1s_m": "root mean square of the displacement's error over 1 s [m]",
+    "rms_10s_m": "over 10 s [m]",
+    "rms_30s_m": "over 30 s [m]",
+    "stretch_percent": "position error within stretches of 20 s, each fitted in yaw and position, "
+    "root mean square, in % of the path",
+    "direction_deg": "yaw between the displacements and what the accelerometer says of them, its "
+    "size [deg]: no other figure shows whether waypoints are walked backwards; on a walk of a "
+    "minute of constant speed it is only known to some 30 degrees",
+    "nis": "mean of error^T covariance^-1 error of single windows, scaled to three axes "
+    "(expected: 3)",
+    "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), where it was asked for",
+}
+"""Figures of a recording; nan where its kind of truth does not give one."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingErrors:
+    """Errors of one network on one recording.
+
+    Attributes:
+        name: the recording's.
+        kind: of its truth.
+        path_m: length of the true path that was compared [m].
+        figures: as `FIGURES`.
+        blocks: by horizon ("1", "10", "30" s), (B, 2): sum of squared errors [m^2] and how many
+            they are, for each block of 30 s. Of waypoints the residuals stand in for 10 s.
+    """
+
+    name: str
+    kind: Kind
+    path_m: float
+    figures: dict[str, float]
+    blocks: dict[str, FloatArray]
+
+
+@dataclass(eq=False)
+class _Sums:
+    """What the pieces of a recording add up to."""
+
+    squares: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    path: float = 0.0
+    length: float = 0.0
+    blocks: dict[str, list[FloatArray]] = field(default_factory=dict)
+
+    def add(self, measure: str, errors: FloatArray) -> None:
+        known = errors[np.isfinite(errors)]
+        self.squares.setdefault(measure, []).append((float(np.sum(known**2)), len(known)))
+
+    def rms(self, measure: str) -> float:
+        total, count = np.sum(self.squares.get(measure, [(0.0, 0.0)]), axis=0)
+        return float(np.sqrt(total / count)) if count else float("nan")
+
+    def add_blocks(self, measure: str, errors: FloatArray) -> None:
+        """Errors (K,) by start tick, nan where not known."""
+        if np.isfinite(errors).sum() < _LEAST_PAIRS:
+            return
+        self.add(measure, errors)
+        per_block = round(BLOCK_SECONDS / TICK_SECONDS)
+        squares = np.nan_to_num(errors**2)
+        starts = np.arange(0, max(len(errors), 1), per_block)
+        counted = np.isfinite(errors).astype(np.float64)
+        sums = np.stack([np.add.reduceat(part, starts) for part in (squares, counted)], axis=1)
+        self.blocks.setdefault(measure, []).append(sums[sums[:, 1] > 0])
+
+
+def recording_errors(prepared: Prepared, found: Sequence[Answers]) -> RecordingErrors:
+    """Errors of a network's answers on a recording.
+
+    Args:
+        prepared: the recording.
+        found: answers on each of its pieces.
+    """
+    sums = _Sums()
+    judge = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
+    towards = Direction()
+    for piece, answer in zip(prepared.pieces, found, strict=True):
+        judge(piece, answer, sums)
+        towards += direction(piece.stream, answer.displacement_N)
+    fitted = sums.rms("fit")
+    figures = {
+        "ate_fit_m": fitted,
+        "ate_fit_percent": 100.0 * _ratio(fitted, sums.path),
+        "ate_first_m": sums.rms("first"),
+        "length_ratio": _ratio(sums.length, sums.path),
+        **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
+        "stretch_percent": 100.0 * sums.rms("stretch"),
+        "direction_deg": abs(np.degrees(towards.turn)),
+        "nis": sums.rms("nis") ** 2,
+        "nis_ekf": float("nan"),
+    }
+    blocks = {name: np.concatenate(parts) for name, parts in sums.blocks.items()}
+    return RecordingErrors(prepared.name, prepared.kind, sums.path, figures, blocks)
+
+
+def _poses(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+    track, truth, breaks = _at_ticks(piece, answer)
+    turn = np.exp(1j * piece.yaw_WN[: len(track)])
+    known = np.isfinite(truth)
+    if known.sum() < 2:
+        return
+    fitted = fit_yaw_and_position(track[known], truth[known])
+    sums.add("fit", np.abs(fitted - truth[known]))
+    first = np.flatnonzero(known)[0]
+    on_first = truth[first] + turn[first] * (track - track[first])
+    sums.add("first", np.abs(on_first - truth)[known])
+    _lengths(track, truth, breaks, sums)
+    for horizon in HORIZONS:
+        moved, true, start = _displacements(track, truth, breaks, horizon)
+        if horizon == 1:  # the windows themselves
+            moved = _windows_xy(answer)[start]
+        errors = np.full(len(track), np.nan)
+        errors[start] = np.abs(turn[start] * moved - true)
+        sums.add_blocks(str(horizon), errors)
+    _stretches(track, truth, breaks, sums)
+    _, true, start = _displacements(track, truth, breaks, 1)
+    _nis(answer, start, np.conj(turn[start]) * true, sums)
+
+
+def _positions(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+    track, truth, breaks = _at_ticks(piece, answer)
+    _lengths(track, truth, breaks, sums)
+    for horizon in HORIZONS:
+        errors = np.full(len(track), np.nan)
+        turn = _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
+        moved, true, start = _displacements(track, truth, breaks, horizon)
+        if horizon == 1:
+            moved = _windows_xy(answer)[start]
+        errors[start] = np.abs(turn[start] * moved - true)
+        sums.add_blocks(str(horizon), errors)
+        if horizon == 1:
+            fitted = np.isfinite(turn[start])
+            _nis(answer, start[fitted], np.conj(turn[start])[fitted] * true[fitted], sums)
+    _stretches(track, truth, breaks, sums)
+
+
+def _waypoints(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+    track = answer.track()[: len(piece.position_W)]
+    ticks = piece.stream.ticks[: len(track)]
+    inside = piece.waypoint_time <= ticks[-1]
+    time, truth = piece.waypoint_time[inside], piece.waypoint_W[inside]
+    if len(time) < 3:
+        return
+    at = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
+    errors = np.abs(fit_yaw_and_position(at, truth) - truth)
+    sums.add("fit", errors)
+    sums.path += float(np.abs(np.diff(truth)).sum())
+    sums.length += float(np.abs(np.diff(at)).sum())
+    block = np.floor((time - ticks[0]) / BLOCK_SECONDS).astype(int)
+    counted = [np.bincount(block, weights) for weights in (errors**2, np.ones(len(errors)))]
+    rows: FloatArray = np.stack(counted, axis=1).astype(np.float64)
+    sums.blocks.setdefault("10", []).append(rows[rows[:, 1] > 0])
+
+
+def _at_ticks(piece: PreparedPiece, answer: Answers) -> tuple[Complex, Complex, np.ndarray]:
+    """Track, truth and its breaks at the ticks that all of them have."""
+    track = answer.track()
+    count = min(len(track), len(piece.position_W))
+    return track[:count], piece.position_W[:count], piece.breaks[:count]
+
+
+def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
+    """A track (n,) moved onto the truth (n,) by the yaw and position of least squared error."""
+    centre, target = track.mean(), truth.mean()
+    turn = np.vdot(track - centre, truth - target)
+    return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
+
+
+def _displacements(
+    track: Complex, truth: Complex, breaks: np.ndarray, seconds: int
+) -> tuple[Complex, Complex, np.ndarray]:
+    """Displacements of track and truth over a span, and the ticks (n,) that they start at."""
+    span = round(seconds / TICK_SECONDS)
+    if span >= len(track):
+        none = np.empty(0, dtype=complex)
+        return none, none, np.empty(0, dtype=np.int64)
+    start = np.flatnonzero(_unbroken(truth, breaks, span))
+    return track[start + span] - track[start], truth[start + span] - truth[start], start
+
+
+def _unbroken(truth: Complex, breaks: np.ndarray, span: int) -> BoolArray:
+    """Which ticks (n - span,) see neither gap nor jump over the next `span` ticks."""
+    ends = np.isfinite(truth[:-span]) & np.isfinite(truth[span:])
+    return np.asarray(ends & (breaks[:-span] == breaks[span:]))
+
+
+def _lengths(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
+    moved, true, start = _displacements(track, truth, breaks, 2)
+    legs = start % _LEG == 0
+    sums.path += float(np.abs(true[legs]).sum())
+    sums.length += float(np.abs(moved[legs]).sum())
+
+
+def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, seconds: int) -> Complex:
+    """exp(i yaw) that fits the legs of the stretch from each tick best (n,); nan where broken."""
+    span = round(seconds / TICK_SECONDS)
+    turn = np.full(len(track), complex(np.nan, np.nan))
+    if span >= len(track):
+        return turn
+    whole = np.flatnonzero(_unbroken(truth, breaks, span))
+    product = np.conj(track[_LEG:] - track[:-_LEG]) * np.nan_to_num(truth[_LEG:] - truth[:-_LEG])
+    total = np.concatenate([[0.0], np.cumsum(product)])
+    turn[whole] = np.exp(1j * np.angle(total[whole + span - _LEG + 1] - total[whole]))
+    return turn
+
+
+def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
+    """Share of the path [1] that stretches are off after a fit of each; half overlapping."""
+    span = round(STRETCH_SECONDS / TICK_SECONDS)
+    if span >= len(track):
+        return
+    whole = _unbroken(truth, breaks, span)
+    for start in range(0, len(whole), span // 2):
+        if not whole[start]:
+            continue
+        part = slice(start, start + span + 1)
+        path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
+        if path < 5.0:  # stands: there is no path to be a share of
+            continue
+        errors = np.abs(fit_yaw_and_position(track[part], truth[part]) - truth[part])
+        sums.add("stretch", errors / path)
+
+
+def _nis(answer: Answers, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
+    """Horizontal error against the covariance, scaled from two axes to three."""
+    error = _windows_xy(answer)[start] - true_N
+    vector = np.stack([error.real, error.imag], axis=1)
+    covariance = answer.covariance_N[start, :2, :2]
+    nis = np.einsum("ni,ni->n", vector, np.linalg.solve(covariance, vector[..., None])[..., 0])
+    sums.add("nis", np.sqrt(1.5 * nis))
+
+
+def _windows_xy(answer: Answers) -> Complex:
+    return np.asarray(answer.displacement_N[:, 0] + 1j * answer.displacement_N[:, 1])
+
+
+def _ratio(value: float, by: float) -> float:
+    return value / by if by > 0 else float("nan")

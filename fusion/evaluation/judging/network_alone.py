@@ -1,0 +1,82 @@
+"""The network alone: displacements along the IMU's own levelled attitude, and their track.
+
+Windows overlap by half: each contributes the mean velocity over its second, and the velocity
+between two ticks is the mean of the windows that cover it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from stario.fusion.evaluation.judging.prepared import Prepared
+from stario.fusion.imu.stateful import Predictor, StatefulInference
+from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
+from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import WINDOW_SECONDS
+
+UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
+"""Windows that begin within the length of one."""
+
+_BATCH = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What a network says on the M windows of a piece.
+
+    Attributes:
+        displacement_N: (M, 3) [m] over the second from tick m.
+        covariance_N: (M, 3, 3) [m^2].
+    """
+
+    displacement_N: FloatArray
+    covariance_N: FloatArray
+
+    def track(self) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+        """Horizontal position x + iy (M + 2,) [m] at the ticks from 0 at the first."""
+        steps = (self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1]) / UPDATES
+        cells = len(steps) + UPDATES - 1
+        total, count = np.zeros(cells, dtype=complex), np.zeros(cells)
+        for shift in range(UPDATES):
+            total[shift : shift + len(steps)] += steps
+            count[shift : shift + len(steps)] += 1.0
+        return np.concatenate([[0.0], np.cumsum(total / count)])
+
+
+@runtime_checkable
+class Answering(Protocol):
+    """What answers on a whole recording by itself, without a network."""
+
+    def answers(self, prepared: Prepared) -> list[Answers]:
+        """Answers on every piece, in the frame N."""
+        ...
+
+
+def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
+    """A network's answers on every piece of a recording, in the frame N.
+
+    Args:
+        model: may remember; its memory begins anew at every piece.
+        prepared: the recording.
+    """
+    if isinstance(model, Answering):
+        return model.answers(prepared)
+    network = StatefulInference(model, UPDATES)
+    found = []
+    for piece in prepared.pieces:
+        network.restart()
+        found.append(_along(network, piece.stream))
+    return found
+
+
+def _along(network: StatefulInference, stream: LevelledStream) -> Answers:
+    windows, heading = stream.windows(), stream.headings
+    parts = [
+        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
+        for first in range(0, len(windows), _BATCH)
+    ]
+    displacement, covariance = zip(*parts, strict=True)
+    return Answers(np.concatenate(displacement), np.concatenate(covariance))

@@ -1,0 +1,271 @@
+"""Recordings prepared for judging networks: windows and truth at ticks, made once and kept on disk.
+
+Everything here depends on the recording alone, so several sets of weights share it, and a second
+call finds it in the cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.datasets.stream_cache import recording_key
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_write
+from stario.sequences.inspection.checks import check_units
+from stario.sequences.legs import broken_steps
+from stario.sequences.levelled_stream import LevelledStream, levelled_streams
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+    Trajectory,
+    is_gap,
+)
+
+log = logging.getLogger(__name__)
+
+Kind = Literal["poses", "positions", "waypoints"]
+
+_ARRAYS = (
+    "imu_N",
+    "facing_N",
+    "R_NB",
+    "position_W",
+    "breaks",
+    "yaw_WN",
+    "waypoint_time",
+    "waypoint_W",
+    "start",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPiece:
+    """An unbroken stretch of a recording with what is known of its truth at the stream's K ticks.
+
+    Attributes:
+        stream: the IMU, levelled by itself.
+        position_W: (K,) horizontal position x + iy [m]; nan where unknown, and for waypoints.
+        breaks: (K,) gaps and jumps of the truth before each tick: a displacement between two
+            ticks is known where they have seen as many.
+        yaw_WN: (K,) yaw [rad] that turns N to the true world; nan where no attitude is known.
+        waypoint_time: (W,) [s].
+        waypoint_W: (W,) position x + iy [m] at those times.
+    """
+
+    stream: LevelledStream
+    position_W: np.ndarray[tuple[int], np.dtype[np.complex128]]
+    breaks: np.ndarray[tuple[int], np.dtype[np.int64]]
+    yaw_WN: FloatArray
+    waypoint_time: FloatArray
+    waypoint_W: np.ndarray[tuple[int], np.dtype[np.complex128]]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A recording ready to judge networks by.
+
+    Attributes:
+        path: as it was named.
+        name: the recording's.
+        kind: of its truth.
+        attributes: person, device, place and the like, where known.
+        pieces: its unbroken stretches.
+    """
+
+    path: Path
+    name: str
+    kind: Kind
+    attributes: dict[str, str]
+    pieces: list[PreparedPiece]
+
+
+def prepare(sequence: ImuSequence, path: Path) -> Prepared:
+    """Level a recording and bring its truth to the ticks.
+
+    Raises:
+        InputError: there is no truth of any kind, no stretch of 2 s, or the units are wrong.
+    """
+    check_units(sequence)
+    streams = levelled_streams(sequence)
+    if not streams:
+        raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
+    if sequence.truth is not None:
+        kind: Kind = "poses"
+        pieces = [_with_poses(stream, sequence.truth) for stream in streams]
+    elif sequence.positions is not None:
+        kind = sequence.positions.kind
+        build = _with_waypoints if kind == "waypoints" else _with_positions
+        pieces = [build(stream, sequence.positions) for stream in streams]
+    else:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _KEPT}
+    return Prepared(path, sequence.name, kind, attributes, pieces)
+
+
+_KEPT = ("person", "device", "place", "carry", "grade", "magnets_near")
+
+
+def prepared_recordings(
+    paths: Sequence[Path],
+    read: Callable[[Path], ImuSequence],
+    options: dict[str, object],
+    folder: Path,
+    jobs: int | None = 1,
+) -> Iterator[Prepared | Skipped]:
+    """Each recording prepared, from the cache or read, in the order of the paths.
+
+    Args:
+        paths: recordings.
+        read: how a path is read; can be pickled.
+        options: what `read` depends on besides the path, as plain values.
+        folder: the cache's.
+        jobs: processes, as for `stario.sequences.datasets.batch.each`.
+    """
+    work = partial(_kept, read=read, options=options, folder=folder)
+    yield from each(work, paths, jobs)
+
+
+def _kept(
+    path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
+) -> Prepared:
+    key = recording_key(path, {**options, "preparation": _code()})
+    file = folder / f"{key}.judged"
+    found = _load(file, path)
+    if found is None:
+        found = prepare(read(path), path)
+        _store(file, found)
+    return found
+
+
+def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
+    time, position_W = truth.time[truth.valid], truth.position_W[truth.valid]
+    base = _with_known(stream, time, position_W, is_gap(np.diff(time)))
+    at_tick = truth.at(stream.ticks)
+    yaw_WN = yaw_of(at_tick.attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
+    yaw_WN[np.isnan(base.position_W)] = np.nan
+    return PreparedPiece(
+        stream, base.position_W, base.breaks, yaw_WN, base.waypoint_time, base.waypoint_W
+    )
+
+
+def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
+    time, position_W = track.time[track.valid], track.position_W[track.valid]
+    return _with_known(stream, time, position_W, broken_steps(time, position_W))
+
+
+def _with_known(
+    stream: LevelledStream, time: FloatArray, position_W: FloatArray, bad: BoolArray
+) -> PreparedPiece:
+    """Positions (n, 2 or 3) interpolated to the ticks but for the steps (n - 1,) that are bad."""
+    ticks = stream.ticks
+    before = np.searchsorted(time, ticks, side="right") - 1
+    inside = (before >= 0) & (before < len(bad))
+    inside[inside] = ~bad[before[inside]]
+    xy = np.interp(ticks, time, position_W[:, 0]) + 1j * np.interp(ticks, time, position_W[:, 1])
+    breaks = np.searchsorted(time[1:][bad], ticks, side="right")
+    none = np.empty(0)
+    unknown = np.full(len(ticks), np.nan)
+    position = np.where(inside, xy, complex(np.nan, np.nan))
+    return PreparedPiece(stream, position, breaks, unknown, none, none.astype(complex))
+
+
+def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
+    inside = track.valid & (track.time >= stream.ticks[0]) & (track.time <= stream.ticks[-1])
+    count = len(stream.R_NB)
+    return PreparedPiece(
+        stream,
+        np.full(count, complex(np.nan, np.nan)),
+        np.zeros(count, dtype=np.int64),
+        np.full(count, np.nan),
+        track.time[inside],
+        track.position_W[inside, 0] + 1j * track.position_W[inside, 1],
+    )
+
+
+@cache
+def _code() -> str:
+    """Digest of this module: what other code has prepared is not found again."""
+    return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
+
+
+def _store(file: Path, prepared: Prepared) -> None:
+    arrays = {}
+    for k, piece in enumerate(prepared.pieces):
+        for name, value in _arrays(piece).items():
+            arrays[f"{k}.{name}"] = value
+    told = {
+        "name": prepared.name,
+        "kind": prepared.kind,
+        "attributes": prepared.attributes,
+        "pieces": len(prepared.pieces),
+    }
+    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(told)})
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(file, "wb") as target:
+            target.write(content)
+    except (OSError, InputError) as error:
+        log.warning("%s: prepared recordings are not kept: %s", file.parent, error)
+
+
+def _load(file: Path, path: Path) -> Prepared | None:
+    if not file.exists():
+        return None
+    try:
+        with safetensors.safe_open(file, "numpy") as source:
+            told = json.loads(source.metadata()["recording"])
+            pieces = [
+                _piece({name: source.get_tensor(f"{k}.{name}") for name in _ARRAYS})
+                for k in range(told["pieces"])
+            ]
+    except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
+        log.warning("%s: not whole, made anew: %s", file, error)
+        return None
+    return Prepared(path, told["name"], told["kind"], told["attributes"], pieces)
+
+
+def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:
+    return {
+        "imu_N": piece.stream.imu_N,
+        "facing_N": piece.stream.facing_N,
+        "R_NB": piece.stream.R_NB,
+        "position_W": _split(piece.position_W),
+        "breaks": piece.breaks.astype(np.int64),
+        "yaw_WN": piece.yaw_WN,
+        "waypoint_time": piece.waypoint_time,
+        "waypoint_W": _split(piece.waypoint_W),
+        "start": np.array([piece.stream.start]),
+    }
+
+
+def _piece(arrays: dict[str, np.ndarray]) -> PreparedPiece:
+    imu_N, facing_N, R_NB = (arrays[name] for name in ("imu_N", "facing_N", "R_NB"))
+    stream = LevelledStream(float(arrays["start"][0]), imu_N, facing_N, R_NB)
+    position_W, waypoint_W = (_joined(arrays[name]) for name in ("position_W", "waypoint_W"))
+    return PreparedPiece(
+        stream, position_W, arrays["breaks"], arrays["yaw_WN"], arrays["waypoint_time"], waypoint_W
+    )
+
+
+def _split(values: np.ndarray) -> np.ndarray:
+    return np.stack([values.real, values.imag], axis=1)
+
+
+def _joined(values: np.ndarray) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+    return np.asarray(values[:, 0] + 1j * values[:, 1])

@@ -1,0 +1,162 @@
+"""The judged groups as text, CSV, JSON and one figure."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
+from stario.fusion.evaluation.judging.displacement_error import FIGURES
+from stario.fusion.evaluation.judging.figure import groups_figure
+from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row
+from stario.sequences.drawing.figures import save_figure
+from stario.sequences.drawing.text_table import aligned, figure
+from stario.sequences.files import atomic_write, write_json
+
+_COLUMNS = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("turned [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_ekf": ("EKF NIS", ".2f"),
+}
+
+_DECIDES = "rms_10s_m"
+_WORST = 1.1
+
+WORDS = {
+    **FIGURES,
+    "medians": "over the recordings of a group",
+    "ratio": "root mean square errors, ours over theirs: geometric mean over groups, of all sets "
+    f"that of the sets; [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
+    "groups, recordings and blocks of 30 s; of waypoints the residuals stand in for 10 s",
+}
+"""What each figure means."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What was judged.
+
+    Attributes:
+        ours: name of the weights.
+        theirs: of those compared with, or None.
+        rows: the groups.
+        judged: the recordings.
+    """
+
+    ours: str
+    theirs: str | None
+    rows: list[Row]
+    judged: list[Judged]
+
+
+def judgement_text(found: Judgement) -> str:
+    """The table for a person: theirs, ours and the ratio below each other for every group."""
+    known = {"theirs": found.theirs, "ours": found.ours}
+    labels = {label: name for label, name in known.items() if name is not None}
+    table = [["", "", "n", "km", *(title for title, _ in _COLUMNS.values())]]
+    for row in found.rows:
+        for label, name in labels.items():
+            cells = [figure(row.medians[name][key], form) for key, (_, form) in _COLUMNS.items()]
+            table.append([row.name, label, str(row.recordings), f"{row.path_km:.2f}", *cells])
+    head, *body = aligned(table)
+    lines = [head]
+    for k, row in enumerate(found.rows):
+        lines += body[k * len(labels) : (k + 1) * len(labels)]
+        for key, interval in row.ratios.items():
+            title = _COLUMNS[key][0].split(" [")[0]
+            lines.append(f"{row.name}: ratio over {title}: {_interval(interval)}")
+    if told := verdict(found.rows):
+        lines.append(told)
+    names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
+    return "\n".join([*lines, *names, *(f"{key}: {text}." for key, text in WORDS.items())])
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """Whether ours should replace theirs; empty without a comparison over several groups.
+
+    Taken is what is surely better over all and nowhere worse by more than a tenth.
+    """
+    ratios = {row.name: row.ratios[_DECIDES] for row in rows if _DECIDES in row.ratios}
+    pooled = ratios.pop(POOLED, None)
+    if pooled is None:
+        return ""
+    worst = max(ratios, key=lambda name: ratios[name].ratio)
+    taken = pooled.high < 1.0 and ratios[worst].ratio <= _WORST
+    told = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
+    return f"{'taken' if taken else 'not taken'}: {told}"
+
+
+def judgement_dict(found: Judgement) -> dict[str, object]:
+    """The same as plain values, recordings included."""
+    return {
+        "ours": found.ours,
+        "theirs": found.theirs,
+        "verdict": verdict(found.rows),
+        "groups": [asdict(row) for row in found.rows],
+        "recordings": [_recording(one) for one in found.judged],
+        "words": WORDS,
+    }
+
+
+def write_judgement(folder: Path, found: Judgement) -> list[Path]:
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
+    rows = [
+        {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
+        | figures
+        | (_ratios(row) if name == found.ours else {})
+        for row in found.rows
+        for name, figures in row.medians.items()
+    ]
+    single = [
+        {"recording": one.path.name, **one.labels, "weights": name, "path_m": errors.path_m}
+        | errors.figures
+        for one in found.judged
+        for name, errors in one.errors.items()
+    ]
+    written = [folder / name for name in ("groups.csv", "recordings.csv", "groups.json")]
+    for path, content in zip(written, (rows, single), strict=False):
+        _write_csv(path, content)
+    write_json(written[2], judgement_dict(found))
+    save_figure(groups_figure(found.rows, found.ours, found.theirs), folder / "groups.png")
+    return [*written, folder / "groups.png"]
+
+
+def _recording(one: Judged) -> dict[str, object]:
+    figures = {name: errors.figures for name, errors in one.errors.items()}
+    kind, path_m = next((e.kind, e.path_m) for e in one.errors.values())
+    return {"recording": str(one.path), **one.labels, "truth": kind, "path_m": path_m} | {
+        "figures": figures
+    }
+
+
+def _ratios(row: Row) -> dict[str, float]:
+    return {
+        f"{key}_{part}": getattr(interval, part)
+        for key, interval in row.ratios.items()
+        for part in ("ratio", "low", "high")
+    }
+
+
+def _write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
+    names = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue())
+
+
+def _interval(found: Interval) -> str:
+    return f"{found.ratio:.3f} [{found.low:.3f}, {found.high:.3f}]"

@@ -1,0 +1,1 @@
+"""How far a track is from the truth, and how honest its covariance."""

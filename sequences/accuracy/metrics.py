@@ -1,0 +1,271 @@
+"""How far a track is from the truth: ATE, RTE, PDE, AYE and NEES, each with one meaning.
+
+Every error is that of a pose of the estimate against the truth interpolated to its time, never
+across a gap of the truth. `CONVENTIONS` says in words what each number means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, cast, get_args
+
+import numpy as np
+
+from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, Trajectory, too_slow
+
+Alignment = Literal["none", "first", "yaw"]
+Convention = Literal["rms", "ronin", "mean"]
+
+CONVENTIONS: dict[str, str] = {
+    "ate_m": "absolute trajectory error [m]: root mean square of the position error's norm",
+    "rte_m": "relative trajectory error [m]: root mean square of the norm of the displacement "
+    "error over 60 s, in world axes; for tracks shorter than that the end-to-end displacement "
+    "error scaled by 60 s / length",
+    "pde": "position drift error [1]: final position error / length of the true path",
+    "aye_rad": "absolute yaw error [rad]: root mean square of the wrapped yaw error, which is the "
+    "twist about the vertical of R_estimate R_truth^T",
+    "nees": "normalised estimation error squared of the position [1]: error^T covariance^-1 error, "
+    "3-D; its expectation is 3",
+    "nis": "normalised innovation squared [1]: innovation^T S^-1 innovation; its expectation is "
+    "the number of components",
+    "coverage": "share [1] of the estimate's poses at whose time the truth is known; the truth is "
+    "interpolated linearly, never across its gaps",
+    "path_m": "length of the true path [m] along 1 s chords, within the times compared",
+    "duration_s": "time [s] between the first and the last pose compared",
+    "alignment": "what is done to the estimate before: none; first (yaw and position of the first "
+    "common pose); yaw (least squares in yaw and position); tilt is never changed",
+    "horizontal": "true: position errors and path in x and y alone; false: in x, y and z",
+    "convention": "rms as said above; ronin averages the squares over coordinates too, as RoNIN's "
+    "code does, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
+    "norms, not squares, as TLIO's code does; PDE and AYE are the same in all",
+}
+
+
+@dataclass(frozen=True)
+class TrackMetrics:
+    """Errors of one track, see `CONVENTIONS`; lengths in m, angles in rad, times in s.
+
+    `rte_m` is nan where gaps leave no pair of poses `rte_interval_s` apart, `pde` where the true
+    path has no length. `rte_scaled` tells that the track was shorter than the interval.
+    """
+
+    ate_m: float
+    rte_m: float
+    pde: float
+    aye_rad: float
+    coverage: float
+    path_m: float
+    duration_s: float
+    alignment: Alignment
+    horizontal: bool
+    convention: Convention
+    rte_interval_s: float
+    rte_scaled: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Estimate minus truth at the M poses of the estimate where both are known.
+
+    Attributes:
+        estimate: the M poses of the estimate.
+        truth: the truth at their times.
+        position_W: (M, 3) [m].
+        yaw: (M,) wrapped [rad].
+        coverage: M / number of valid poses of the estimate.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    position_W: FloatArray
+    yaw: FloatArray
+    coverage: float
+
+
+def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
+    """Compare two tracks as they are, at the estimate's times.
+
+    Raises:
+        InputError: there is no time at which both are known.
+    """
+    at_estimate = truth.at(estimate.time)
+    common = estimate.valid & at_estimate.valid
+    if not common.any():
+        raise InputError(
+            "estimate",
+            f"no overlap: {_span(estimate)} against truth {_span(truth)}",
+            "a pose at a time when the truth is known",
+            too_slow(truth),
+        )
+    ours, theirs = _select(estimate, common), _select(at_estimate, common)
+    return PoseErrors(
+        estimate=ours,
+        truth=theirs,
+        position_W=ours.position_W - theirs.position_W,
+        yaw=yaw_of(ours.attitude_WB * theirs.attitude_WB.inv()),
+        coverage=float(common.sum() / estimate.valid.sum()),
+    )
+
+
+def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajectory:
+    """Turn an estimate about the vertical and shift it onto the truth; tilt stays as it is.
+
+    Position, attitude, velocity and covariance are turned alike.
+
+    Args:
+        estimate: the track to move.
+        truth: where to.
+        mode: "none"; "first", by yaw and position of the first common pose; "yaw", by the yaw and
+            position of least squared position error (Horn 1987, restricted to the vertical axis).
+
+    Raises:
+        InputError: unknown mode, or no overlap.
+    """
+    _check_choice("alignment", mode, get_args(Alignment))
+    if mode == "none":
+        return estimate
+    errors = pose_errors(estimate, truth)
+    ours, theirs = errors.estimate.position_W, errors.truth.position_W
+    if mode == "first":
+        return _moved(estimate, -float(errors.yaw[0]), ours[0], theirs[0])
+    center, target = ours.mean(axis=0), theirs.mean(axis=0)
+    x, y = (ours - center)[:, :2].T
+    u, v = (theirs - target)[:, :2].T
+    yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
+    return _moved(estimate, float(yaw), center, target)
+
+
+def evaluate_track(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    alignment: Alignment = "first",
+    horizontal: bool = True,
+    convention: Convention = "rms",
+    rte_interval: float = 60.0,
+) -> TrackMetrics:
+    """Errors of a track against the truth, as `CONVENTIONS` defines them.
+
+    Args:
+        estimate: the track.
+        truth: the true track; it may be sampled more coarsely and have gaps.
+        alignment: see `align`.
+        horizontal: positions in x and y alone.
+        convention: how position errors are averaged.
+        rte_interval: span of the relative error [s].
+
+    Raises:
+        InputError: no overlap, an unknown choice, or an interval that is not positive.
+    """
+    _check_choice("convention", convention, get_args(Convention))
+    if not (np.isfinite(rte_interval) and rte_interval > 0):
+        raise InputError("rte_interval", repr(rte_interval), "seconds > 0")
+    errors = pose_errors(align(estimate, truth, alignment), truth)
+    time = errors.estimate.time
+    error = errors.position_W[:, : 2 if horizontal else 3]
+    path = _path_length(errors.truth, horizontal)
+    rte, scaled = _relative_error(time, error, rte_interval, convention)
+    return TrackMetrics(
+        ate_m=_average(error, convention),
+        rte_m=rte,
+        pde=float(np.linalg.norm(error[-1]) / path) if path > 0 else float("nan"),
+        aye_rad=float(np.sqrt(np.mean(errors.yaw**2))),
+        coverage=errors.coverage,
+        path_m=path,
+        duration_s=float(time[-1] - time[0]),
+        alignment=alignment,
+        horizontal=horizontal,
+        convention=convention,
+        rte_interval_s=rte_interval,
+        rte_scaled=scaled,
+    )
+
+
+def _relative_error(
+    time: FloatArray, error: FloatArray, interval: float, convention: Convention
+) -> tuple[float, bool]:
+    """Average error of the displacement over `interval` [m], and whether it had to be scaled.
+
+    The displacement's error between two poses is the difference of their position errors.
+    """
+    duration = time[-1] - time[0]
+    # A partner may lie half a step of the estimate off, but no more than a hundredth of the span.
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    tolerance = min(0.5 * step + 1e-6, 0.01 * interval)
+    if duration < interval - tolerance:
+        drift = (error[-1:] - error[:1]) * (interval / duration if duration > 0 else np.nan)
+        return _average(drift, convention), True
+    end = _nearest(time, time + interval)
+    paired = np.abs(time[end] - time - interval) <= tolerance
+    if not paired.any():
+        return float("nan"), False
+    return _average(error[end[paired]] - error[paired], convention), False
+
+
+def _average(error: FloatArray, convention: Convention) -> float:
+    square = np.sum(error**2, axis=1)
+    if convention == "mean":
+        return float(np.mean(np.sqrt(square)))
+    coordinates = error.shape[1] if convention == "ronin" else 1
+    return float(np.sqrt(np.mean(square) / coordinates))
+
+
+def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    return right - (wanted - time[right - 1] < time[right] - wanted)
+
+
+def _path_length(truth: Trajectory, horizontal: bool) -> float:
+    if not horizontal:
+        return truth.path_length()
+    return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()
+
+
+def _moved(
+    trajectory: Trajectory, yaw: float, pivot_W: FloatArray, target_W: FloatArray
+) -> Trajectory:
+    """Turn by `yaw` [rad] about the vertical through `pivot_W`, then take that to `target_W`."""
+    turn = about_z(yaw)
+    R = turn.as_matrix()
+    velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
+    return replace(
+        trajectory,
+        position_W=(trajectory.position_W - pivot_W) @ R.T + target_W,
+        attitude_WB=turn * trajectory.attitude_WB,
+        velocity_W=None if velocity is None else velocity @ R.T,
+        position_covariance_W=None if covariance is None else R @ covariance @ R.T,
+    )
+
+
+def _select(trajectory: Trajectory, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Trajectory:
+    velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
+    return Trajectory(
+        time=trajectory.time[keep],
+        position_W=trajectory.position_W[keep],
+        attitude_WB=trajectory.attitude_WB[keep],
+        velocity_W=None if velocity is None else velocity[keep],
+        position_covariance_W=None if covariance is None else covariance[keep],
+        valid=trajectory.valid[keep],
+    )
+
+
+def _span(trajectory: Trajectory) -> str:
+    time = trajectory.time[trajectory.valid]
+    return f"{time[0]:.3f} to {time[-1]:.3f} s" if len(time) else "no valid pose"
+
+
+def check_convention(name: str) -> Convention:
+    """A word as a convention of averaging.
+
+    Raises:
+        InputError: there is no such convention.
+    """
+    _check_choice("convention", name, get_args(Convention))
+    return cast(Convention, name)
+
+
+def _check_choice(field: str, found: str, choices: tuple[str, ...]) -> None:
+    if found not in choices:
+        raise InputError(field, repr(found), "one of " + ", ".join(choices))

@@ -1,0 +1,101 @@
+"""Whether errors are as large as their covariance says: NEES, its bounds, and that of positions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.accuracy.metrics import Alignment, align, pose_errors
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class PositionNees:
+    """3-D position NEES of a track: time (M,) [s], nees (M,), and its mean and median."""
+
+    time: FloatArray
+    nees: FloatArray
+    mean: float
+    median: float
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared, e^T P^-1 e; chi-square with k degrees if P is true.
+
+    Args:
+        error: (N, k).
+        covariance: (N, k, k), in the squared units of `error`.
+
+    Returns:
+        (N,), without unit.
+
+    Raises:
+        InputError: shapes do not agree or a covariance is not positive definite.
+    """
+    error = np.asarray(error, dtype=np.float64)
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if error.ndim != 2:
+        raise InputError("error", f"shape {error.shape}", "(N, k)")
+    n, k = error.shape
+    if covariance.shape != (n, k, k):
+        raise InputError("covariance", f"shape {covariance.shape}", f"({n}, {k}, {k}) as error")
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        row = int(np.argmax([np.linalg.eigvalsh(P).min() <= 0 for P in covariance]))
+        raise InputError(
+            "covariance", f"row {row} not positive definite", "positive definite matrices"
+        ) from None
+    whitened = np.linalg.solve(factor, error[..., None])[..., 0]
+    return np.asarray(np.sum(whitened**2, axis=1), dtype=np.float64)
+
+
+def nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Bounds of the mean NEES (or NIS) of a consistent estimator over independent samples.
+
+    Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 5.4.
+
+    Args:
+        dof: length of the error vector; the expectation of the mean.
+        runs: number of independent samples averaged; poses of one track are not independent.
+        confidence: probability between the bounds.
+
+    Raises:
+        InputError: `dof` or `runs` below 1, or a confidence outside (0, 1).
+    """
+    for name, count in (("dof", dof), ("runs", runs)):
+        if count < 1:
+            raise InputError(name, repr(count), "at least 1")
+    if not 0 < confidence < 1:
+        raise InputError("confidence", repr(confidence), "a probability between 0 and 1")
+    tail = (1 - confidence) / 2
+    low, high = (chi2_quantile(p, dof * runs) / runs for p in (tail, 1 - tail))
+    return low, high
+
+
+def position_nees(
+    estimate: Trajectory, truth: Trajectory, alignment: Alignment = "first"
+) -> PositionNees:
+    """NEES of a track's 3-D position under its own covariance.
+
+    Poses with a covariance of exactly zero, such as a start that is the origin by definition,
+    carry no statement and are left out. Aligning takes away the share of the initial yaw in the
+    error but not in the covariance: for a check of that share give the truth's frame and "none".
+
+    Raises:
+        InputError: no overlap, no covariance, or one that is not positive definite.
+    """
+    if estimate.position_covariance_W is None:
+        raise InputError("estimate.position_covariance_W", "None", "(N, 3, 3) [m^2]")
+    errors = pose_errors(align(estimate, truth, alignment), truth)
+    covariance = errors.estimate.position_covariance_W
+    assert covariance is not None  # align and selection keep it
+    stated = covariance.any(axis=(1, 2))
+    if not stated.any():
+        raise InputError("estimate.position_covariance_W", "only zeros", "covariances [m^2]")
+    values = nees(errors.position_W[stated], covariance[stated])
+    time = errors.estimate.time[stated]
+    return PositionNees(time, values, float(values.mean()), float(np.median(values)))

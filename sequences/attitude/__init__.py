@@ -1,0 +1,1 @@
+"""Attitude from the IMU: rotations, levelling."""

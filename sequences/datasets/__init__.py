@@ -1,0 +1,1 @@
+"""Many recordings: lists, splits, caches, conversion."""

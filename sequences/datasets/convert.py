@@ -1,0 +1,178 @@
+"""Recordings from any format into a CSV of one's own, the EuRoC layout or an archive."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_folder, atomic_write
+from stario.sequences.inspection.checks import MIN_SECONDS, check_units
+from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+log = logging.getLogger(__name__)
+
+LAYOUTS = ("csv", "euroc", "archive")
+
+_IMU_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+_POSE_HEADER = (
+    "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)
+_VELOCITY_HEADER = ",v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1]"
+
+
+def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> list[Path]:
+    """Write a recording, whole or not at all.
+
+    Numbers are written with the digits that bring them back bit for bit; the EuRoC layout holds
+    times in integer nanoseconds. An archive keeps everything, the others not: truth's poses that
+    are not valid, its covariance, positions without attitude, attributes; CSV no velocity, EuRoC
+    no magnetometer. What is lost is logged.
+
+    Args:
+        sequence: the recording.
+        path: a file to write or replace, or the EuRoC recording's new folder.
+        layout: one of `LAYOUTS`; None for what the path's end says, see `layout_of`.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: the layout is unknown, the path cannot be written, or the recording's numbers
+            are not in s, rad/s and m/s^2, which the files would claim.
+    """
+    layout = layout_of(path, layout)
+    check_content(sequence)
+    _warn_of_loss(sequence, layout)
+    if layout == "euroc":
+        return write_euroc(path, sequence)
+    if layout == "archive":
+        write_archive(path, [sequence])
+    else:
+        write_csv(path, sequence)
+    return [path]
+
+
+def convert_all(sequences: Iterable[ImuSequence], path: Path) -> list[str]:
+    """Write recordings into one archive, whole or not at all; returns their names in it.
+
+    Raises:
+        InputError: as for `convert` and `write_archive`.
+    """
+    return write_archive(path, map(check_content, sequences))
+
+
+def layout_of(path: Path, layout: str | None = None) -> str:
+    """The layout that is named, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
+
+    Raises:
+        InputError: the layout is unknown.
+    """
+    if layout is None:
+        by_suffix = {".csv": "csv", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
+        return by_suffix.get(path.suffix.lower(), "euroc")
+    if layout not in LAYOUTS:
+        raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
+    return layout
+
+
+def check_content(sequence: ImuSequence) -> ImuSequence:
+    """The recording, if its numbers can be in the units that a file would claim.
+
+    Raises:
+        InputError: as for `check_units`.
+    """
+    if sequence.duration >= MIN_SECONDS:  # a shorter one shows too little to be judged
+        check_units(sequence)
+    return sequence
+
+
+def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
+    """Write `mav0/imu0/data.csv` and, with truth, `mav0/state_groundtruth_estimate0/data.csv`.
+
+    Times are those of the sequence in whole nanoseconds, counted from its earliest. Truth has
+    EuRoC's first eight columns, w first, and its velocity's three where that is known.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: a time is not finite, or the folder is there already.
+    """
+    if not np.isfinite(sequence.time).all():
+        row = int(np.argmin(np.isfinite(sequence.time)))
+        raise InputError(
+            f"{sequence.name}: time of sample {row}",
+            str(sequence.time[row]),
+            "finite seconds: the EuRoC layout holds integer nanoseconds",
+            "convert to csv",
+        )
+    truth = sequence.truth
+    valid = None if truth is None else truth.valid
+    times = [sequence.time] if truth is None else [sequence.time, truth.time[valid]]
+    first = min(float(part.min()) for part in times if len(part))
+    tables = {
+        "imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel])),
+    }
+    if truth is not None and truth.valid.any():
+        header = _POSE_HEADER + (_VELOCITY_HEADER if truth.velocity_W is not None else "")
+        poses = _poses(truth)[truth.valid]
+        tables["state_groundtruth_estimate0"] = (header, truth.time[truth.valid], poses)
+    with atomic_folder(path) as folder:
+        for name, (header, time, values) in tables.items():
+            inner = folder / "mav0" / name
+            inner.mkdir(parents=True)
+            _write_table(inner / "data.csv", header, _nanoseconds(time, first), values)
+    return [path / "mav0" / name / "data.csv" for name in tables]
+
+
+def _poses(truth: Trajectory) -> FloatArray:
+    columns = [truth.position_W, truth.quat_xyzw[:, [3, 0, 1, 2]]]
+    if truth.velocity_W is not None:
+        columns.append(truth.velocity_W)
+    return np.hstack(columns)
+
+
+def _nanoseconds(time: FloatArray, first: float) -> NDArray[np.int64]:
+    """Whole nanoseconds; those of `first` are 0 where it is negative, for stamps have no sign."""
+    origin = round(min(first, 0.0) * 1e9)
+    return np.asarray(np.round(time * 1e9), dtype=np.int64) - origin
+
+
+def _write_table(path: Path, header: str, stamps: NDArray[np.int64], values: FloatArray) -> None:
+    rows = (
+        ",".join([str(stamp), *map(repr, row)])
+        for stamp, row in zip(stamps.tolist(), values.tolist(), strict=True)
+    )
+    with atomic_write(path) as file:
+        file.write("\n".join([header, *rows]) + "\n")
+
+
+def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
+    if layout == "archive":
+        return
+    truth, lost = sequence.truth, []
+    if truth is not None and truth.velocity_W is not None and layout == "csv":
+        lost.append("the truth's velocity has no column in CSV")
+    if truth is not None and truth.position_covariance_W is not None:
+        lost.append("the truth's covariance has no column")
+    if sequence.positions is not None and layout == "euroc":
+        lost.append(
+            f"{sequence.positions.kind} have no file in the EuRoC layout: write .csv or .h5"
+        )
+    if sequence.magnetometer is not None and layout == "euroc":
+        lost.append("the magnetometer has no file in the EuRoC layout: write a .csv or .h5")
+    if sequence.device_attitude is not None:
+        lost.append("the device's own attitude has no column: write an .h5")
+    for words in lost:
+        log.warning("%s: %s", sequence.name, words)

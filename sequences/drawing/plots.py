@@ -1,0 +1,308 @@
+"""Every figure: plan view, errors over time, innovations, and the IMU's samples.
+
+Functions return a `matplotlib.figure.Figure` drawn by Agg, without pyplot and its global state,
+so that they work headless and in threads. matplotlib is imported where it is used, because it is
+slow to import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.accuracy.metrics import PoseErrors, pose_errors
+from stario.sequences.drawing.boxes import box_of, excess, frame_around, rounds, size_of
+from stario.sequences.drawing.figures import (
+    ABOVE_LEFT,
+    ABOVE_RIGHT,
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LEGEND,
+    ORANGE,
+    RED,
+    SKY,
+    broken,
+    distance,
+    draw_dots,
+    draw_path,
+    draw_samples,
+    new_figure,
+    panels_of,
+    reach_of,
+    style_of,
+)
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+    Trajectory,
+    second_ticks,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_AXIS_COLOURS = (BLUE, ORANGE, GREEN)
+_CLIP_FACTOR = 3.0
+_CROWDED = 12.0  # rounds from which lines are drawn finer
+
+
+def plan_view(
+    tracks: Mapping[str, Trajectory],
+    truth: Trajectory | None,
+    title: str,
+    known: PositionTrack | None = None,
+) -> Figure:
+    """All tracks from above, on equal axes that fit the truth and the tracks near it.
+
+    A track that drifts far beyond these is cut at the frame and the legend says how far it goes.
+    Invalid poses and gaps show as breaks. Tracks are drawn as given: align them before.
+
+    Args:
+        tracks: by name; "inertial", "network", "network_true_attitude", "ekf" and "graph" have
+            fixed colours.
+        truth: the true track in the same frame, or None.
+        title: of the figure.
+        known: positions or waypoints in the same frame, (n, 2), where there is no true track.
+
+    Raises:
+        InputError: there is nothing to draw.
+    """
+    paths = {name: broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
+    path_truth = None if truth is None else broken(truth.time, truth.position_W[:, :2], truth.valid)
+    boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
+    if path_truth is not None and np.isfinite(path_truth[1]).any():
+        typical = path_truth[1]
+    elif boxes:
+        # Drift only makes a track larger, so the lower median is a track that did not run away.
+        by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
+        typical = paths[by_size[(len(boxes) - 1) // 2]]
+    else:
+        raise InputError("tracks", "no valid pose", "at least one track to draw")
+    home = box_of(typical)
+    near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
+    if known is not None:
+        near.append(box_of(known.position_W))
+    frame = frame_around(np.array([home, *near]))
+    width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
+    fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
+    (axes,) = panels_of(fig)
+    fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
+    if path_truth is not None:
+        draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
+    for k, (name, box) in enumerate(boxes.items()):
+        label, colour = style_of(name, k)
+        far = excess(box, home)
+        if far > 0.5 * size_of(home):
+            label += f" (leaves the figure, by {distance(far)})"
+        draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+    if known is not None:
+        size = 7.0 if known.kind == "waypoints" else 3.0
+        label = f"{known.kind}, fitted"
+        x, y = known.position_W.T
+        axes.plot(x, y, "x", color="black", ms=size, mew=1.6, label=label, zorder=4)
+    axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.plot([], [], "o", mfc="white", mec=INK, label="start")
+    axes.plot([], [], "s", mfc=INK, mec="white", label="end")
+    fig.legend(loc="outside lower center", ncols=3, **LEGEND)
+    return fig
+
+
+def error_over_time(
+    tracks: Mapping[str, Trajectory], truth: Trajectory, title: str = "Position error"
+) -> Figure:
+    """Horizontal error of all tracks, and the error per axis within 3 sigma where one is stated.
+
+    The axes fit the better tracks; one with more than thrice the error of the others is cut. Per
+    axis only tracks with `position_covariance_W` are drawn, or all where none has one. Tracks are
+    compared as given: align them before.
+
+    Raises:
+        InputError: no track, or one that has no time in common with the truth.
+    """
+    if not tracks:
+        raise InputError("tracks", "none", "at least one track")
+    errors = {name: pose_errors(track, truth) for name, track in tracks.items()}
+    norms = {name: np.linalg.norm(e.position_W[:, :2], axis=1) for name, e in errors.items()}
+    largest = {name: float(norm.max()) for name, norm in norms.items()}
+    typical = sorted(largest.values())[(len(largest) - 1) // 2]
+    good = [name for name in tracks if largest[name] <= _CLIP_FACTOR * max(typical, 0.1)]
+    fig = new_figure(9.0, 9.0, title)
+    panels = panels_of(fig, 1.7, 1, 1, 1)
+    for k, name in enumerate(tracks):
+        label, colour = style_of(name, k)
+        if name not in good:
+            label += f" (leaves the figure, up to {distance(largest[name])})"
+        time, norm = broken(errors[name].estimate.time, norms[name][:, None])
+        panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
+    panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
+    panels[0].set_ylabel("horizontal error [m]")
+    stated = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
+    for k, name in enumerate(tracks):
+        if name in (stated or good):
+            _draw_axis_errors(panels[1:], errors[name], *style_of(name, k))
+    panels[-1].set_xlabel("time [s]")
+    fig.align_ylabels()
+    panels[0].legend(**ABOVE_LEFT)
+    if stated:
+        panels[1].legend(**ABOVE_LEFT)
+    return fig
+
+
+def innovations(
+    time: FloatArray,
+    residual: FloatArray,
+    sigma: FloatArray,
+    nis: FloatArray,
+    dof: int,
+    gated: BoolArray,
+    title: str = "Innovations of the filter",
+    unit: str = "m",
+) -> Figure:
+    """What the filter's measurements said beyond its prediction, against what it expected.
+
+    Args:
+        time: (M,) of the updates [s].
+        residual: (M, 3) innovation, x y z [unit].
+        sigma: (M, 3) its standard deviation as the filter states it [unit].
+        nis: (M,) normalised innovation squared.
+        dof: expectation of the NIS.
+        gated: (M,) True where the gate refused or weakened the update.
+        title: of the figure.
+        unit: of what was measured.
+
+    Raises:
+        InputError: shapes do not agree or there is no update.
+    """
+    m = len(time)
+    arrays = {"residual": (residual, (m, 3)), "sigma": (sigma, (m, 3)), "nis": (nis, (m,))}
+    for name, (value, shape) in {**arrays, "gated": (gated, (m,))}.items():
+        if np.shape(value) != shape or m == 0:
+            raise InputError(name, f"shape {np.shape(value)}", f"{shape}, with at least one update")
+    gated = np.asarray(gated, dtype=np.bool_)
+    fig = new_figure(9.0, 9.0, title)
+    panels = panels_of(fig, 1, 1, 1, 1.3)
+    for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
+        band_time, band = broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
+        axes.fill_between(band_time, -band[:, 0], band[:, 0], color=BLUE, alpha=0.15, lw=0)
+        reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
+        # A gated residual can be huge: marked at the edge, it leaves the others their room.
+        draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
+        axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
+    panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
+    _draw_nis(panels[3], time, nis, dof, gated)
+    panels[3].set_xlabel("time [s]")
+    fig.align_ylabels()
+    return fig
+
+
+def imu_overview(
+    sequence: ImuSequence,
+    rotation: tuple[FloatArray, FloatArray] | None = None,
+    rest: Iterable[tuple[float, float]] = (),
+    gaps: Iterable[tuple[float, float]] = (),
+) -> Figure:
+    """Angular rate, specific force and its norm, and the true speed where there is a truth.
+
+    Long recordings are drawn as mean and envelope, so that no peak is lost.
+
+    Args:
+        sequence: the recording.
+        rotation: times [s] and the truth's angular rate there [rad/s], to be drawn over the
+            gyroscope's.
+        rest: first and last time of stretches to be shaded as rest [s].
+        gaps: first and last time of stretches to be shaded as gaps [s].
+
+    Raises:
+        InputError: no sample has finite values.
+    """
+    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    if not finite.any():
+        raise InputError("sequence", "no finite sample", "finite time, gyro and accel")
+    order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
+    time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
+    count = 2 + (rotation is not None) + (sequence.truth is not None)
+    fig = new_figure(9.0, 2.0 + 2.0 * count, f"IMU of {sequence.name}")
+    panels = panels_of(fig, *([1] * count))
+    draw_samples(panels[1], time, np.linalg.norm(accel, axis=1), "norm", GREY)
+    for axes, values in ((panels[0], gyro), (panels[1], accel)):
+        for k, axis in enumerate("xyz"):
+            draw_samples(axes, time, values[:, k], axis, _AXIS_COLOURS[k])
+    panels[1].axhline(STANDARD_GRAVITY, color=INK, lw=0.9, ls="--", label="gravity")
+    panels[0].set_ylabel("angular rate [rad/s]")
+    panels[1].set_ylabel("specific force [m/s$^2$]")
+    if rotation is not None:
+        panels[2].plot(*rotation, color=GREY, lw=0.8, label="truth")
+        draw_samples(panels[2], time, np.linalg.norm(gyro, axis=1), "gyroscope", BLUE)
+        panels[2].set(ylabel="rotation [rad/s]", ylim=(0, reach_of(np.linalg.norm(gyro, axis=1))))
+    for k, (start, stop) in enumerate(rest):
+        panels[1].axvspan(start, stop, color=SKY, alpha=0.3, lw=0, label="" if k else "at rest")
+    for k, (start, stop) in enumerate(gaps):
+        for axes in panels[:2]:
+            axes.axvspan(start, stop, color=RED, alpha=0.5, lw=1, label="" if k else "gap")
+    for axes in panels[: 2 + (rotation is not None)]:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **LEGEND)
+    if sequence.truth is not None:
+        ticks, speed = _speed(sequence.truth)
+        panels[-1].plot(ticks, speed, color="black", lw=1.0)
+        panels[-1].set(ylabel="true speed [m/s]", ylim=(0, reach_of(speed)))
+    panels[-1].set_xlabel("time [s]")
+    fig.align_ylabels()
+    panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)
+    return fig
+
+
+def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Speed [m/s] along 1 s chords, as the length of the path is measured."""
+    step = 1.0
+    ticks = second_ticks(truth.time)
+    if len(ticks) < 2 or truth.valid.sum() < 2:
+        return np.empty(0), np.empty(0)
+    at = truth.at(ticks)
+    speed = np.linalg.norm(np.diff(at.position_W, axis=0), axis=1) / step
+    known = at.valid[1:] & at.valid[:-1]
+    return ticks[:-1] + step / 2, np.where(known, speed, np.nan)
+
+
+def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
+    time = errors.estimate.time
+    for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
+        axes.plot(*broken(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label)
+        if errors.estimate.position_covariance_W is not None:
+            sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
+            band_time, band = broken(time, 3 * sigma[:, None])
+            axes.fill_between(
+                band_time,
+                -band[:, 0],
+                band[:, 0],
+                color=colour,
+                alpha=0.15,
+                lw=0,
+                label=f"{label}, 3 sigma",
+            )
+        axes.set_ylabel(f"error in {axis} [m]")
+
+
+def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
+    low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
+    draw_dots(axes, time, np.maximum(nis, low), gated)
+    axes.axhline(dof, color=INK, lw=1.0, label=f"expected {dof}")
+    axes.axhline(bound, color=INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
+    axes.set_yscale("log")
+    axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
+    axes.set_ylabel("NIS [1]")
+    axes.set_title(
+        f"NIS: mean {np.nanmean(nis):.2f}, {100 * np.mean(gated):.1f} % gated",
+        loc="left",
+        fontsize=10,
+    )
+    axes.legend(**ABOVE_RIGHT)

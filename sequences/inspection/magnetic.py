@@ -1,0 +1,310 @@
+"""What a recording's magnetometer is worth: size, dip, clock, the device's own field, its bearing.
+
+Turning through a constant field, a magnetometer sees it turn the other way:
+
+    dm/dt = -w x (m - b)
+
+with the rate w and a constant offset b that the device adds (its hard iron). That needs no
+attitude: how well it holds says whether axes and units are right, the shift in time at which it
+holds best how late the samples are stamped, and b follows by least squares.
+
+The bearing of the field, levelled by the IMU alone, stands still against the gyroscope's yaw but
+for the gyroscope's drift. How still it stands within a minute is what a filter can gain from it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stario.sequences.arrays import correlation
+from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import clean_samples, unbroken
+
+_LONGEST_S = 600.0
+_SHORTEST_S = 10.0
+_STEP_S = 0.05
+_SPAN_S = 0.1
+_LAGS_S = np.arange(-0.05, 0.151, 0.01)
+_WINDOW_S = 60.0
+
+_TURNING_RAD_S = 0.1
+"""A device that turns less than this (root mean square) shows neither iron nor lag."""
+
+_SIZES_UT = (15.0, 90.0)
+_LEVEL_UT = 6.0
+_VERDICTS = (
+    ("good", math.radians(12.0), 0.75),
+    ("coarse", math.radians(25.0), 0.5),
+)
+"""Largest unsteadiness [rad] and least correlation of each."""
+
+HELD_CHANGE = 2e-3
+"""Share of its size by which a measured field changes at least within half a second. Some phones
+give out a calibrated field that they carry on by their own gyroscope: of one size to 1e-4 for
+seconds, where a sensor's own changes by 1e-2."""
+
+_NO_FIELD_UT = 1e-9
+"""For a sensor that gives zeros [uT]: not divided by."""
+
+_HALF_SECOND, _TURNED_RAD, _OFTEN = 0.5, 0.05, 0.5
+"""Half seconds in which the field turns by so much in the sensor's axes are looked at; share of
+them from which on that deserves a word."""
+
+_UP_RAD = math.radians(20.0)
+_IRON_UT = 10.0
+_SURE = 5.0
+"""Size, horizontal size, dip and hard iron that deserve a word; the last counts from so many of its
+deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class MagneticFindings:
+    """Findings about a magnetometer.
+
+    Attributes:
+        samples: as recorded.
+        rate_hz: median rate [Hz].
+        size_uT: median size of the field [uT].
+        spread_uT: its 10th and 90th percentile [uT].
+        dip_rad: median angle below the horizontal [rad].
+        correlation: between dm/dt and -w x (m - b), None where the device hardly turns.
+        lag_s: by which the samples are stamped late [s], None likewise.
+        hard_iron_uT: b (3,) [uT], None likewise.
+        hard_iron_sigma_uT: its deviation (3,) [uT].
+        bearing_rms_rad: of the levelled bearing about its line within a minute, median [rad].
+        drift_rad_s: that line's slope, median: the gyroscope's drift in yaw [rad/s].
+        held: share of the half seconds in which the device turned over which it has carried the
+            field on by itself.
+        problems: what is wrong, one line each.
+    """
+
+    samples: int
+    rate_hz: float
+    size_uT: float
+    spread_uT: tuple[float, float]
+    dip_rad: float
+    correlation: float | None
+    lag_s: float | None
+    hard_iron_uT: FloatArray | None
+    hard_iron_sigma_uT: FloatArray | None
+    bearing_rms_rad: float
+    drift_rad_s: float
+    held: float = 0.0
+    problems: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """Whether the levelled bearing can hold a yaw: "good", "coarse" or "not usable"."""
+        level = self.size_uT * math.cos(self.dip_rad)
+        for word, steady, follows in _VERDICTS:
+            agrees = self.correlation is None or self.correlation > follows
+            if self.bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
+                return word
+        return "not usable"
+
+    def as_dict(self) -> dict[str, object]:
+        """The findings as plain values, units in the names."""
+        return {
+            "samples": self.samples,
+            "rate_hz": self.rate_hz,
+            "size_median_uT": self.size_uT,
+            "size_p10_p90_uT": self.spread_uT,
+            "dip_rad": self.dip_rad,
+            "correlation_with_gyroscope": self.correlation,
+            "lag_s": self.lag_s,
+            "hard_iron_uT": self.hard_iron_uT,
+            "hard_iron_sigma_uT": self.hard_iron_sigma_uT,
+            "levelled_bearing_rms_rad": self.bearing_rms_rad,
+            "gyroscope_drift_rad_s": self.drift_rad_s,
+            "held_share": self.held,
+            "verdict": self.verdict,
+        }
+
+    def lines(self) -> list[str]:
+        """The findings for a person."""
+        low, high = self.spread_uT
+        lines = [
+            f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, {self.size_uT:.1f} uT "
+            f"({low:.1f} to {high:.1f} in 80 %), dips by {math.degrees(self.dip_rad):.0f} deg"
+        ]
+        if self.correlation is not None and self.lag_s is not None:
+            lines.append(
+                f"  against the gyroscope: correlation {self.correlation:.3f}, "
+                f"{1e3 * self.lag_s:+.0f} ms late{self._iron_words()}"
+            )
+        lines.append(
+            f"  levelled bearing: steady to {math.degrees(self.bearing_rms_rad):.1f} deg within a "
+            f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
+            f"gyroscope: {self.verdict}"
+        )
+        if self.held > _OFTEN:
+            lines.append(
+                f"  by its size the device carries it on by its own gyroscope {self.held:.0%} of "
+                "the time: it counts for little there"
+            )
+        return lines
+
+    def _iron_words(self) -> str:
+        if self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
+            return ""
+        pairs = zip(self.hard_iron_uT, self.hard_iron_sigma_uT, strict=True)
+        return ", hard iron " + ", ".join(f"{b:+.1f}" + f" ± {s:.1f}" for b, s in pairs) + " uT"
+
+
+def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
+    """Findings about the first ten minutes; None where there is none or too little to judge.
+
+    Raises:
+        InputError: as for `clean_samples`.
+    """
+    if sequence.magnetometer is None:
+        return None
+    time, gyro, accel = clean_samples(sequence)
+    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0], default=(0, 0))
+    stop = min(stop, int(np.searchsorted(time, time[start] + _LONGEST_S))) if stop else 0
+    time, gyro, accel = time[start:stop], gyro[start:stop], accel[start:stop]
+    field = sequence.magnetometer
+    inside = slice(*np.searchsorted(field.time, [time[0], time[-1]])) if len(time) else slice(0)
+    stamps, values = field.time[inside], field.field[inside]
+    if len(stamps) < 20 or stamps[-1] - stamps[0] < _SHORTEST_S:
+        return None
+    turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
+    seen = _against_gyro(time, gyro, stamps, values) if turning > _TURNING_RAD_S else None
+    agreement, lag, iron, sigma = seen or (None, None, None, None)
+    taken = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
+    nearest = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
+    R_NB = levelled_attitudes(time, gyro, accel)[nearest]
+    field_N = np.einsum("nij,nj->ni", R_NB, values - taken)
+    level = np.hypot(field_N[:, 0], field_N[:, 1])
+    spread, drift = _steadiness(stamps, field_N[:, :2])
+    sizes = np.linalg.norm(values, axis=1)
+    low, median, high = np.percentile(sizes, [10.0, 50.0, 90.0]).tolist()
+    findings = MagneticFindings(
+        samples=len(field),
+        rate_hz=float(1.0 / np.median(np.diff(field.time))),
+        size_uT=median,
+        spread_uT=(low, high),
+        dip_rad=float(np.median(np.arctan2(-field_N[:, 2], level))),
+        correlation=agreement,
+        lag_s=lag,
+        hard_iron_uT=iron,
+        hard_iron_sigma_uT=sigma,
+        bearing_rms_rad=spread,
+        held=_held(stamps, values),
+        drift_rad_s=drift,
+    )
+    return _with_problems(sequence.name, findings)
+
+
+def _against_gyro(
+    time: FloatArray, gyro: FloatArray, stamps: FloatArray, values: FloatArray
+) -> tuple[float, float, FloatArray, FloatArray] | None:
+    """Correlation, lag [s] and hard iron with its deviation [uT] by dm/dt = -w x (m - b)."""
+    edge = _SPAN_S + float(np.abs(_LAGS_S).max())
+    grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
+    if len(grid) < 20:
+        return None
+    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    half = 0.5 * _SPAN_S
+    rate = (_at(grid + half, time, angle) - _at(grid - half, time, angle)) / _SPAN_S
+
+    def fit(lag: float) -> tuple[float, FloatArray, FloatArray]:
+        before, after = (_at(grid + lag + d, stamps, values) for d in (-half, half))
+        change, mean = (after - before) / _SPAN_S, 0.5 * (after + before)
+        # dm/dt + w x m = w x b, linear in b
+        cross = np.cross(rate[:, None, :], np.eye(3)[None]).transpose(0, 2, 1).reshape(-1, 3)
+        target = (change + np.cross(rate, mean)).ravel()
+        normal = cross.T @ cross + 1e-9 * np.eye(3)
+        iron = np.asarray(np.linalg.solve(normal, cross.T @ target), dtype=np.float64)
+        left = target - cross @ iron
+        # Neighbours share half their span and disturbances last: a tenth of the rows count.
+        spread = np.sqrt(10.0 * float(left.var()) * np.diag(np.linalg.inv(normal)))
+        seen = -np.cross(rate, mean - iron).ravel()
+        return correlation(change.ravel(), seen), iron, np.asarray(spread, dtype=np.float64)
+
+    scores = np.array([fit(lag)[0] for lag in _LAGS_S])
+    best = int(np.argmax(scores))
+    lag = float(_LAGS_S[best])
+    if 0 < best < len(scores) - 1:
+        a, b, c = scores[best - 1 : best + 2]
+        lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
+    agreement, iron, spread = fit(lag)
+    return agreement, lag, iron, spread
+
+
+def _at(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
+    return np.stack([np.interp(time, t, values[:, k]) for k in range(3)], axis=1)
+
+
+def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
+    """Whether an offset is one that must be taken out before the field is judged."""
+    sure = np.abs(iron) > _SURE * sigma
+    return bool(np.linalg.norm(iron[sure]) > _IRON_UT)
+
+
+def _held(time: FloatArray, field: FloatArray) -> float:
+    """Share of half seconds over which a field (n, 3) turns and its size stays the same."""
+    later = np.searchsorted(time, time + _HALF_SECOND)
+    first = np.flatnonzero(later < len(time))
+    size = np.maximum(np.linalg.norm(field, axis=1), _NO_FIELD_UT)
+    before, after = (field[k] / size[k, None] for k in (first, later[first]))
+    turned = np.linalg.norm(after - before, axis=1) > _TURNED_RAD
+    same = np.abs(size[later[first]] / size[first] - 1.0) < HELD_CHANGE
+    return float(same[turned].mean()) if turned.any() else 0.0
+
+
+def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
+    """Root mean square [rad] of the bearing about a line and the line's slope [rad/s].
+
+    Medians over windows of a minute. Turns are counted on means over a second, so that a sample
+    beside a magnet does not add one.
+
+    Args:
+        time: (N,) [s].
+        level: (N, 2) horizontal field.
+    """
+    count = max(1, round(1.0 / float(np.median(np.diff(time)))))
+    field = level[:, 0] + 1j * level[:, 1]
+    smooth = np.convolve(field, np.ones(count) / count, mode="same")
+    spreads, slopes = [], []
+    last = max(float(time[-1]) - 0.5 * _WINDOW_S, float(time[0]) + 1e-9)
+    for edge in np.arange(time[0], last, _WINDOW_S):
+        part = (time >= edge) & (time < edge + _WINDOW_S)
+        if part.sum() > count:
+            clock = time[part] - edge
+            line = np.polyfit(clock, np.unwrap(np.angle(smooth[part])), 1)
+            left = np.angle(field[part] * np.exp(-1j * np.polyval(line, clock)))
+            spreads.append(float(np.sqrt(np.square(left).mean())))
+            slopes.append(float(line[0]))
+    if not slopes:
+        return math.inf, 0.0
+    return float(np.median(spreads)), float(np.median(slopes))
+
+
+def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
+    field, problems = f"{name}: magnetometer", []
+    iron, sigma = findings.hard_iron_uT, findings.hard_iron_sigma_uT
+    if not _SIZES_UT[0] < findings.size_uT < _SIZES_UT[1]:
+        problems.append(
+            f"{field}: found {findings.size_uT:.3g} uT, expected the earth's 25 to 65; "
+            "is it uncalibrated, in another unit or beside a magnet?"
+        )
+    if findings.correlation is not None and findings.correlation < _VERDICTS[-1][2]:
+        problems.append(
+            f"{field}: does not follow the gyroscope (correlation {findings.correlation:.2f}): "
+            "a disturbed place, a held reading or other axes"
+        )
+    if iron is not None and sigma is not None and _is_iron(iron, sigma):
+        offset = ", ".join(f"{b:+.0f}" for b in iron)
+        problems.append(f"{field}: the device adds a constant field of {offset} uT (hard iron)")
+    if findings.dip_rad < -_UP_RAD:
+        problems.append(
+            f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
+            "magnetic equator; elsewhere the accelerometer has Apple's sign: --accel-sign apple"
+        )
+    return replace(findings, problems=tuple(problems))

@@ -1,0 +1,293 @@
+"""What a recording is like, and what is wrong with it, before anything is computed from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.magnetic import MagneticFindings, judge_magnetometer
+from stario.sequences.inspection.stillness import Rest, find_rest
+from stario.sequences.sequence import (
+    GAP_STEPS,
+    STANDARD_GRAVITY,
+    ImuSequence,
+    Trajectory,
+    is_gap,
+    too_slow,
+)
+from stario.sequences.truth.findings import fit_as_dict, fit_lines, fit_problems
+from stario.sequences.truth.fit import TruthFit, fit_truth
+from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How the samples are spread in time.
+
+    Attributes:
+        samples: as recorded.
+        duration_s: between the first and the last [s].
+        rate_hz: median rate [Hz].
+        jitter_s: median distance of a step from the median step [s].
+        gaps: start and length [s] of each step that has lost samples.
+        lost: samples that the gaps would have held.
+        repeated: samples at the time of the one before.
+        backward: samples earlier than the one before.
+        not_finite: samples with a time or a value that is no number.
+    """
+
+    samples: int
+    duration_s: float
+    rate_hz: float
+    jitter_s: float
+    gaps: tuple[tuple[float, float], ...]
+    lost: int
+    repeated: int
+    backward: int
+    not_finite: int
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the recording has a truth.
+
+    Attributes:
+        share: of the IMU's samples.
+        rate_hz: median rate of the truth [Hz].
+        gaps: in it, longer than what is interpolated across.
+        longest_gap_s: [s].
+        path_m: length of the path [m].
+    """
+
+    share: float
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+    path_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Findings about a recording.
+
+    Attributes:
+        name: the recording's.
+        timing: of its samples.
+        accel_norm: mean size of the accelerometer's samples [m/s^2].
+        gyro_norm: of the gyroscope's [rad/s].
+        rest: the sensors at rest, None if the device never rests.
+        coverage: of the truth, None without one.
+        fit: between truth and gyroscope, None where they cannot be compared.
+        problems: what is wrong, one line each, with what mends it.
+        truth: what is known of the true track, in words.
+        device_attitude: how many attitudes the device's own fusion has logged.
+        magnetic: the magnetometer's, None without one or where there is too little of it.
+        yaw: what turns the gyroscope's yaw away from the truth's, None where that cannot be told.
+    """
+
+    name: str
+    timing: Timing
+    accel_norm: float
+    gyro_norm: float
+    rest: Rest | None
+    coverage: Coverage | None
+    fit: TruthFit | None
+    problems: tuple[str, ...]
+    truth: str = "none"
+    magnetic: MagneticFindings | None = None
+    device_attitude: int = 0
+    yaw: YawDrift | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """The findings as plain values, units in the names."""
+        timing, rest, fit, coverage = self.timing, self.rest, self.fit, self.coverage
+        return {
+            "recording": self.name,
+            "samples": timing.samples,
+            "duration_s": timing.duration_s,
+            "rate_hz": timing.rate_hz,
+            "jitter_s": timing.jitter_s,
+            "gaps": [{"start_s": start, "length_s": length} for start, length in timing.gaps],
+            "samples_lost_in_gaps": timing.lost,
+            "times_repeated": timing.repeated,
+            "times_backward": timing.backward,
+            "samples_not_finite": timing.not_finite,
+            "accel_norm_mean_m_s2": self.accel_norm,
+            "gyro_norm_mean_rad_s": self.gyro_norm,
+            "rest": rest
+            and {
+                "seconds": rest.seconds,
+                "gyro_bias_rad_s": rest.gyro_bias,
+                "gyro_noise_rad_s_sqrt_hz": rest.gyro_noise,
+                "accel_norm_m_s2": rest.accel_norm,
+                "accel_noise_m_s2_sqrt_hz": rest.accel_noise,
+            },
+            "truth": coverage
+            and {
+                "coverage": coverage.share,
+                "rate_hz": coverage.rate_hz,
+                "gaps": coverage.gaps,
+                "longest_gap_s": coverage.longest_gap_s,
+                "path_m": coverage.path_m,
+            },
+            "truth_against_gyroscope": fit and fit_as_dict(fit, self.yaw),
+            "device_attitudes": self.device_attitude,
+            "known_of_truth": self.truth,
+            "magnetometer": self.magnetic and self.magnetic.as_dict(),
+            "problems": list(self.problems),
+        }
+
+    def lines(self) -> list[str]:
+        """The findings for a person."""
+        return [
+            *self._timing_lines(),
+            f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
+            f"gyroscope: {self.gyro_norm:.3f} rad/s",
+            *self._rest_lines(),
+            *(self.magnetic.lines() if self.magnetic else []),
+            *([f"device's own attitude: {self.device_attitude}"] if self.device_attitude else []),
+            *self._truth_lines(),
+            *(f"! {problem}" for problem in self.problems or ()),
+            *([] if self.problems else ["units, signs and axes: nothing wrong was found"]),
+        ]
+
+    def _timing_lines(self) -> list[str]:
+        t = self.timing
+        lines = [
+            f"{t.samples} samples, {t.duration_s:.1f} s, {t.rate_hz:.1f} Hz, "
+            f"jitter {1e3 * t.jitter_s:.2f} ms"
+        ]
+        if t.gaps:
+            start, length = max(t.gaps, key=lambda gap: gap[1])
+            lines.append(
+                f"gaps: {len(t.gaps)}, {t.lost} samples lost; "
+                f"longest {length:.3f} s at {start:.1f} s"
+            )
+        else:
+            lines.append("gaps: none")
+        lines.append(
+            f"times: {t.repeated} repeated, {t.backward} backward; "
+            f"{t.not_finite} samples not finite"
+        )
+        return lines
+
+    def _rest_lines(self) -> list[str]:
+        rest = self.rest
+        if rest is None:
+            return ["at rest: never for a second, so noise and bias are not known"]
+        bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
+        return [
+            f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",
+            f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise:.2e} rad/s/sqrt(Hz)",
+            f"  accelerometer: {rest.accel_norm:.4f} m/s^2 "
+            f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} to gravity), "
+            f"noise {rest.accel_noise:.2e} m/s^2/sqrt(Hz)",
+        ]
+
+    def _truth_lines(self) -> list[str]:
+        coverage, fit = self.coverage, self.fit
+        if coverage is None:
+            return [f"truth: {self.truth}"]
+        lines = [
+            f"truth: covers {100 * coverage.share:.1f} % of the samples, "
+            f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
+            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
+        ]
+        if fit is not None:
+            lines += fit_lines(fit, self.yaw)
+        return lines
+
+
+def inspect_recording(sequence: ImuSequence) -> Inspection:
+    """Look a recording over; what is wrong with it is found, not raised.
+
+    Raises:
+        InputError: it holds no finite sample.
+    """
+    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    if not finite.any():
+        raise InputError(f"{sequence.name}: samples", "none that is finite", "numbers")
+    problems = []
+    try:
+        check_units(sequence)
+    except InputError as error:
+        problems.append(str(error))
+    fit: TruthFit | None = None
+    coverage = None if sequence.truth is None else _coverage(sequence, sequence.truth)
+    slow = "" if sequence.truth is None else too_slow(sequence.truth)
+    if slow:
+        problems.append(f"{sequence.name}: truth: {slow}")
+    elif coverage is not None and coverage.share > 0.0:
+        try:
+            fit = fit_truth(sequence)
+        except InputError as error:
+            if not problems:  # wrong units explain it
+                problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+    if fit is not None:
+        problems += fit_problems(sequence.name, fit, " ".join(problems))
+    magnetic = _magnetic(sequence)
+    problems += magnetic.problems if magnetic else ()
+    return Inspection(
+        name=sequence.name,
+        timing=_timing(sequence, int((~finite).sum())),
+        accel_norm=float(np.linalg.norm(sequence.accel[finite], axis=1).mean()),
+        gyro_norm=float(np.linalg.norm(sequence.gyro[finite], axis=1).mean()),
+        rest=_rest(sequence),
+        coverage=coverage,
+        fit=fit,
+        problems=tuple(problems),
+        truth=sequence.truth_words(),
+        device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
+        magnetic=magnetic,
+        yaw=None if fit is None else yaw_drift(sequence, fit),
+    )
+
+
+def _rest(sequence: ImuSequence) -> Rest | None:
+    try:
+        return find_rest(sequence)
+    except InputError:  # a rate that `check_units` has named already
+        return None
+
+
+def _magnetic(sequence: ImuSequence) -> MagneticFindings | None:
+    try:
+        return judge_magnetometer(sequence)
+    except InputError:  # a rate that `check_units` has named already
+        return None
+
+
+def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
+    time = sequence.time[np.isfinite(sequence.time)]
+    steps = np.diff(time)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
+    gaps = np.flatnonzero(steps > GAP_STEPS * usual)
+    forward = steps[(steps > 0) & (steps <= GAP_STEPS * usual)]
+    return Timing(
+        samples=len(sequence),
+        duration_s=sequence.duration,
+        rate_hz=sequence.rate,
+        jitter_s=float(np.median(np.abs(forward - usual))) if len(forward) else math.nan,
+        gaps=tuple((float(time[k]), float(steps[k])) for k in gaps),
+        lost=int(np.round(steps[gaps] / usual - 1.0).sum()) if len(gaps) else 0,
+        repeated=int((steps == 0).sum()),
+        backward=int((steps < 0).sum()),
+        not_finite=not_finite,
+    )
+
+
+def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
+    times = np.unique(sequence.time[np.isfinite(sequence.time)])
+    known = truth.time[truth.valid]
+    steps = np.diff(known)
+    return Coverage(
+        share=float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
+        rate_hz=float(1.0 / np.median(steps)) if len(steps) else 0.0,
+        gaps=int(is_gap(steps).sum()),
+        longest_gap_s=float(steps.max(initial=0.0)),
+        path_m=truth.path_length(),
+    )

@@ -1,0 +1,136 @@
+"""Stillness: stretches in which a device lies still, and what its sensors say there.
+
+One test for all who ask, each with the factor that its question needs: the scatter of both sensors
+about their means against the white noise of a phone's IMU (`PHONE_NOISE`), by chi-square. The
+filter's own densities are no measure here: they stand for errors of scale and alignment, which only
+motion brings. (Whether a start's mean force shows the vertical is another question: a hand may
+tremble, but a trolley may not gain speed; `levelling`.)
+
+Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
+rate and whatever filter the sensor has above 10 Hz (IEEE Std 952, annex C).
+
+Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
+sensors); the scatter about the mean replaces their known gravity and bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.noise import PHONE_NOISE
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
+
+_LYING = 6.0
+"""Of a sensor that lies, which may be noisier than a phone's: what inspection measures noise by."""
+
+_SLOW = 0.06
+"""Mean rate [rad/s] that may be bias: 3.4 degrees per second."""
+
+_PROBABILITY = 0.999
+"""That a sensor at rest looks still."""
+
+_BIN_S = 0.05
+_BLOCK_BINS = 10
+_SHORTEST_S = 1.0
+
+
+def scatter_bound(count: float, seconds: float, factor: float) -> float:
+    """Largest sum of squares about the mean of white noise of density 1, times factor^2.
+
+    Args:
+        count: samples, each in three axes.
+        seconds: that they fill.
+        factor: on the noise's density.
+    """
+    return factor**2 * count / seconds * chi2_quantile(_PROBABILITY, 3.0 * (count - 1.0))
+
+
+def looks_still(gyro: float, accel: float, bound: float) -> bool:
+    """Whether sums of squares [rad^2/s^2], [m^2/s^4] are within a `scatter_bound`."""
+    noise = PHONE_NOISE
+    return gyro <= bound * noise.gyro_noise**2 and accel <= bound * noise.accel_noise**2
+
+
+def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float) -> bool:
+    """Whether samples (n, 3) [rad/s], [m/s^2] over some seconds are those of no motion.
+
+    A steady turn does not scatter: the mean rate must be one that may be bias, too.
+    """
+    if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _SLOW:
+        return False
+    rates, forces = (float(np.square(x - x.mean(axis=0)).sum()) for x in (gyro, accel))
+    return looks_still(rates, forces, scatter_bound(len(gyro), seconds, factor))
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What the sensors say at rest.
+
+    Attributes:
+        stretches: first and last time of each [s].
+        gyro_bias: (3,) mean rate [rad/s]; it holds the earth's 7e-5 rad/s.
+        gyro_noise: white noise density [rad/s/sqrt(Hz)], root mean square over the axes.
+        accel_norm: mean size of the force [m/s^2]; bias and scale along gravity show in it.
+        accel_noise: white noise density [m/s^2/sqrt(Hz)], root mean square over the axes.
+    """
+
+    stretches: tuple[tuple[float, float], ...]
+    gyro_bias: FloatArray
+    gyro_noise: float
+    accel_norm: float
+    accel_noise: float
+
+    @property
+    def seconds(self) -> float:
+        """Length of all stretches [s]."""
+        return sum(stop - start for start, stop in self.stretches)
+
+
+def find_rest(sequence: ImuSequence) -> Rest | None:
+    """The recording's rest; None if it never lies still for a second.
+
+    Raises:
+        InputError: as for `clean_samples`.
+    """
+    time, gyro, accel = clean_samples(sequence)
+    per_bin = max(1, round(_BIN_S / float(np.median(np.diff(time)))))
+    per_block = per_bin * _BLOCK_BINS
+    blocks = len(time) // per_block
+    if blocks == 0:
+        return None
+    used = blocks * per_block
+    start = time[:used:per_block]
+    stop = time[per_block - 1 : used : per_block]
+    steps = np.diff(time[:used], append=time[used - 1]).reshape(blocks, per_block)
+    unbroken = (steps < MAX_IMU_GAP).all(axis=1)  # also up to the next block
+    rates, forces = (
+        x[:used].reshape(blocks, _BLOCK_BINS, per_bin, 3).mean(2) for x in (gyro, accel)
+    )
+    pairs = zip(rates, forces, strict=True)
+    quiet = np.array([is_still(w, f, _BLOCK_BINS * _BIN_S, _LYING) for w, f in pairs])
+    joined = unbroken & quiet
+    spans = [(a, b) for a, b in runs(joined) if stop[b - 1] - start[a] >= _SHORTEST_S]
+    if not spans:
+        return None
+    tau = 2 * per_bin * float(np.median(np.diff(time)))
+    return Rest(
+        stretches=tuple((float(start[a]), float(stop[b - 1])) for a, b in spans),
+        gyro_bias=np.concatenate([rates[a:b] for a, b in spans]).mean(axis=(0, 1)),
+        gyro_noise=_density([rates[a:b] for a, b in spans], tau),
+        accel_norm=float(
+            np.linalg.norm(np.concatenate([forces[a:b] for a, b in spans]).mean(1), axis=1).mean()
+        ),
+        accel_noise=_density([forces[a:b] for a, b in spans], tau),
+    )
+
+
+def _density(stretches: list[FloatArray], tau: float) -> float:
+    """Allan deviation of means over two bins, as a density of white noise."""
+    squares = [
+        np.square(np.diff(part.reshape(-1, 2, 3).mean(axis=1), axis=0)) for part in stretches
+    ]
+    return float(np.sqrt(0.5 * np.concatenate(squares).mean() * tau))

@@ -1,0 +1,92 @@
+"""The attitude that a phone's own fusion logged beside its sensors.
+
+Apps differ in the order of a quaternion and in whether it takes the body to the world or back, so
+all are held against the gyroscope: over a step the attitude turns by R_k^T R_k+1 in the body's
+axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.phones.files import PhoneFiles
+from stario.sequences.readers.phones.sensor_table import Samples, read_quaternion
+from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.sequence import FloatArray
+from stario.sequences.time_order import advancing
+
+_ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
+"""Where x, y, z and w stand in rows without a header."""
+
+_EXPLAINED = 0.5
+"""Share of the turning that an attitude must explain to be the phone's."""
+
+_LONGEST_STEP_S = 0.3
+
+
+def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotation] | None:
+    """Time stamps (N,) [ns] and N rotations, body to a world with z up; None without a good one."""
+    table = files.first("attitude")
+    if table is None or not table.quaternion:
+        return None
+    try:
+        stamps, quaternion = read_quaternion(table)
+    except ReadError:  # a recording does without
+        return None
+    return agreeing_attitude(stamps, quaternion, gyro, table.quaternion[0].title != "")
+
+
+def agreeing_attitude(
+    stamps: IntArray, quaternion: FloatArray, gyro: Samples, named: bool = True
+) -> tuple[IntArray, Rotation] | None:
+    """Those of the ways to read an attitude that the gyroscope agrees with, the best; else None.
+
+    Args:
+        stamps: (N,) [ns].
+        quaternion: (N, 4), x, y, z and w; rows that are no unit quaternion are left out.
+        gyro: its samples, of the same clock.
+        named: whether the order is known, or it may as well be w, x, y and z.
+
+    Returns:
+        Time stamps (K,) [ns] and K rotations, body to a world with z up.
+    """
+    good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
+    stamps, quaternion = stamps[good], quaternion[good]
+    kept = advancing(stamps.astype(np.float64)) if len(stamps) else np.empty(0, dtype=np.int64)
+    if len(kept) < 2:
+        return None
+    stamps, quaternion = stamps[kept], quaternion[kept]
+    orders = _ORDERS[:1] if named else _ORDERS
+    ways = [Rotation.from_quat(quaternion[:, order]) for order in orders]
+    ways += [way.inv() for way in ways]
+    shares = [_explained(stamps, way, gyro) for way in ways]
+    best = int(np.argmax(shares))
+    return (stamps, ways[best]) if shares[best] > _EXPLAINED else None
+
+
+def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> float:
+    """Share of the gyroscope's turning that an attitude's steps tell of, by medians.
+
+    A phone's attitude jumps now and then, when its fusion thinks better of the field.
+    """
+    order = np.unique(gyro.stamps_ns, return_index=True)[1]
+    clock = seconds(gyro.stamps_ns[order], stamps_ns[0])
+    rate = gyro.values[order]
+    steps = 0.5 * np.diff(clock)[:, None] * (rate[1:] + rate[:-1])
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    time = seconds(stamps_ns, stamps_ns[0])
+    turned: FloatArray = np.stack([np.interp(time, clock, angle[:, k]) for k in range(3)], axis=1)
+    seen = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
+    inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1])
+    inside &= np.diff(time) < _LONGEST_STEP_S
+    if not inside.any():
+        return 0.0
+    measured = np.diff(turned, axis=0)[inside]
+    size, left = (
+        float(np.median(np.linalg.norm(steps, axis=1)))
+        for steps in (measured, seen[inside] - measured)
+    )
+    return 1.0 - left / size if size > 0.0 else 0.0

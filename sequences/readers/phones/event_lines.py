@@ -1,0 +1,181 @@
+"""Files of one line per event, whichever sensor it came from: `TYPE_...` traces and GetSensorData.
+
+Indoor Location's traces (blank-free words between tabs): time [ms since 1970], `TYPE_GYROSCOPE`,
+`TYPE_ACCELEROMETER` or `TYPE_MAGNETIC_FIELD` and xyz, uncalibrated ones with their biases behind;
+`TYPE_WAYPOINT` and x, y [m] on a floor plan, tapped by a surveyor. Some lines lack the break before
+them. GetSensorData's logfiles (IPIN's competitions; semicolons, `%` comments): `ACCE`, `GYRO` or
+`MAGN`, the app's and the sensor's time [s] and xyz; `POSI`, the app's time, a count, latitude and
+longitude [deg] of a reference point. Positions come as waypoints, horizontal and in metres. The
+device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last three of `AHRS`: x,
+y and z of a quaternion whose w is not negative.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked, magnetometer
+from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.phones.attitude import agreeing_attitude
+from stario.sequences.readers.phones.sensor_table import Samples
+from stario.sequences.readers.text import IntArray, head_lines, read_lines, seconds
+from stario.sequences.sequence import (
+    DeviceAttitude,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+)
+from stario.sequences.time_order import advancing
+
+_log = logging.getLogger(__name__)
+
+_TRACE = re.compile(r"\d{10,}\tTYPE_\w+")
+_GLUED = re.compile(r"(?<=[^\n])(\d{13}\tTYPE_)")
+_TYPES = {"accel": "TYPE_ACCELEROMETER", "gyro": "TYPE_GYROSCOPE", "mag": "TYPE_MAGNETIC_FIELD"}
+_WAYPOINT, _ROTATION = "TYPE_WAYPOINT", "TYPE_ROTATION_VECTOR"
+
+_EVENT = re.compile(r"(ACCE|GYRO|MAGN);\s*-?\d")
+_CODES = {"accel": "ACCE", "gyro": "GYRO", "mag": "MAGN"}
+_POINT, _AHRS = "POSI", "AHRS"
+_EARTH_M = 6_371_000.0
+
+Rows = tuple[IntArray, FloatArray]
+"""Time stamps (N,) [ns] and values (N, K) of one sensor's events."""
+
+
+def read_event_lines(path: Path) -> ImuSequence:
+    """Read a trace or a logfile.
+
+    Raises:
+        ReadError: a sensor is missing, a line is malformed, or the sensors do not overlap.
+    """
+    trace = any(_TRACE.match(line) for line in head_lines(path))
+    sensors, points = _trace(path) if trace else _logfile(path)
+    for name in ("gyro", "accel"):
+        if name not in sensors:
+            seen = ", ".join(sensors) or "none"
+            raise ReadError(path, "events", f"of {seen}", "of gyroscope and accelerometer")
+    stamps, gyro, accel = on_one_clock(path, *sensors["gyro"], *sensors["accel"])
+    field = sensors.get("mag")
+    attitude = _attitude(sensors)
+    return ImuSequence(
+        name=path.stem,
+        time=seconds(stamps, stamps[0]),
+        gyro=gyro,
+        accel=accel,
+        magnetometer=None
+        if field is None
+        else magnetometer(seconds(field[0], stamps[0]), field[1]),
+        device_attitude=None
+        if attitude is None
+        else DeviceAttitude(seconds(attitude[0], stamps[0]), attitude[1]),
+        positions=None if points is None else _waypoints(points, stamps[0]),
+    )
+
+
+def is_event_lines(path: Path) -> bool:
+    """Whether a text file's first lines hold an event of a sensor."""
+    if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
+        return False
+    return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
+
+
+def _add_attitude(
+    sensors: dict[str, Rows],
+    path: Path,
+    kind: str,
+    rows: list[list[str]],
+    unit_ns: int,
+    used: slice,
+) -> None:
+    try:
+        if rows:
+            sensors["attitude"] = _rows(path, kind, rows, unit_ns, used)
+    except ReadError as error:  # a recording does without
+        _log.info("attitude left out: %s", error)
+
+
+def _attitude(sensors: dict[str, Rows]) -> tuple[IntArray, Rotation] | None:
+    """The device's own attitude, where it was logged and the gyroscope agrees with it."""
+    if "attitude" not in sensors:
+        return None
+    stamps, xyz = sensors["attitude"]
+    w = np.sqrt(np.clip(1.0 - np.sum(xyz**2, axis=1), 0.0, None))
+    return agreeing_attitude(stamps, np.column_stack([xyz, w]), Samples(*sensors["gyro"]))
+
+
+def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
+    order = np.argsort(points[0], kind="stable")
+    time = seconds(points[0][order], start_ns)
+    keep = advancing(time)
+    return PositionTrack(time[keep], points[1][order][keep], "waypoints") if keep.any() else None
+
+
+def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
+    text = _GLUED.sub(r"\n\1", "\n".join(read_lines(path)))
+    events: dict[str, list[list[str]]] = {}
+    for line in text.splitlines():
+        cells = line.split("\t")
+        if len(cells) >= 4 and cells[1].startswith("TYPE_"):
+            events.setdefault(cells[1], []).append([cells[0], *cells[2:]])
+    sensors = {}
+    for sensor, kind in _TYPES.items():
+        raw = events.get(f"{kind}_UNCALIBRATED")
+        if kind in events:
+            sensors[sensor] = _rows(path, kind, events[kind], 10**6, slice(1, 4))
+        elif raw is not None:
+            stamps, values = _rows(path, kind, raw, 10**6, slice(1, 7))
+            sensors[sensor] = stamps, values[:, :3] - values[:, 3:]
+    _add_attitude(sensors, path, _ROTATION, events.get(_ROTATION, []), 10**6, slice(1, 4))
+    taps = events.get(_WAYPOINT)
+    return sensors, None if taps is None else _rows(path, _WAYPOINT, taps, 10**6, slice(1, 3))
+
+
+def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
+    events: dict[str, list[list[str]]] = {}
+    for line in read_lines(path):
+        cells = line.strip().split(";")
+        if cells[0] in (*_CODES.values(), _POINT, _AHRS):
+            events.setdefault(cells[0], []).append(cells[1:])
+    sensors = {
+        sensor: _rows(path, code, [[row[1], *row[2:]] for row in events[code]], 10**9, slice(1, 4))
+        for sensor, code in _CODES.items()
+        if code in events
+    }
+    _add_attitude(
+        sensors, path, _AHRS, [row[1:] for row in events.get(_AHRS, [])], 10**9, slice(4, 7)
+    )
+    if _POINT not in events or "ACCE" not in events:
+        return sensors, None
+    apart = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock is another
+    stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
+    return sensors, (stamps - round(float(np.median(apart)) * 1e9), _metres(degrees))
+
+
+def _metres(degrees: FloatArray) -> FloatArray:
+    """East and north [m] of the first point, of latitude and longitude (N, 2)."""
+    latitude, longitude = np.radians(degrees - degrees[0]).T
+    east = longitude * np.cos(np.radians(degrees[0, 0]))
+    return _EARTH_M * np.stack([east, latitude], axis=1)
+
+
+def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: slice) -> Rows:
+    """Stamps and values of events whose first cell is the time."""
+    try:
+        cells = [(row[0], [float(cell) for cell in row[used]]) for row in rows]
+        stamps = [round(float(time) * unit_ns) if "." in time else int(time) * unit_ns
+                  for time, _ in cells]  # fmt: skip
+        values = np.array([numbers for _, numbers in cells], dtype=np.float64)
+    except ValueError as error:
+        raise ReadError(path, kind, " ".join(str(error).split()), "time and numbers") from None
+    if values.ndim != 2 or values.shape[1] != used.stop - used.start:
+        expected = f"{used.stop - used.start} values a line"
+        raise ReadError(path, kind, "a line cut short", expected)
+    return np.array(stamps, dtype=np.int64), checked(path, kind, values)

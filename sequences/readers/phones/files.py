@@ -1,0 +1,113 @@
+"""Which of a folder's files hold a recording's sensors, by what their names say.
+
+A file is of the one sensor that its name tells of (`Gyroscope.csv`, `acce.txt`, `Eight_gyr.csv`);
+what the name says besides is the recording's, so that files of two recordings in one folder are
+two recordings, each named by its gyroscope's file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from stario.sequences.readers.phones.sensor_table import SensorTable, sensor_table
+from stario.sequences.readers.phones.sensor_words import (
+    Sensor,
+    is_sensor_word,
+    is_uncalibrated,
+    sensor_of,
+    words_of,
+)
+
+SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
+_MOTION = {"mot", "motion", "full"}
+"""Words of files that come from Apple's Core Motion, `MotMagnFull.txt`: no recording's name."""
+
+_NEEDED: tuple[Sensor, ...] = ("accel", "linear")
+
+
+@dataclass
+class PhoneFiles:
+    """A recording's files by sensor, the better variant first."""
+
+    key: str
+    tables: dict[Sensor, list[SensorTable]] = field(default_factory=dict)
+
+    @property
+    def gyro(self) -> Path:
+        """The file that names the recording where a folder holds several."""
+        return self.tables["gyro"][0].file
+
+    def first(self, sensor: Sensor) -> SensorTable | None:
+        """The better file of a sensor."""
+        return next(iter(self.tables.get(sensor, [])), None)
+
+
+def phone_recordings(folder: Path) -> list[PhoneFiles]:
+    """The recordings whose gyroscope and accelerometer lie in a folder; never raises."""
+    named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if _may_hold(file)]
+    groups: dict[str, PhoneFiles] = {}
+    for file, words in sorted(named, key=lambda item: _preference(*item)):
+        sensor = _sensor_of(words)
+        table = sensor_table(file) if sensor else None
+        if sensor is None or table is None:
+            continue
+        key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
+        group = groups.setdefault(key, PhoneFiles(key))
+        group.tables.setdefault(sensor, []).append(table)
+    whole = [group for group in groups.values() if _is_whole(group)]
+    if whole:
+        return whole
+    lone = _united(list(groups.values()))
+    return [lone] if _is_whole(lone) else []
+
+
+def lone_sensors(path: Path) -> list[Sensor]:
+    """The sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
+
+    Empty where it holds both, or neither.
+    """
+    sensors = _sensors(path)
+    whole = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
+    return [] if whole else sensors
+
+
+def _sensors(path: Path) -> list[Sensor]:
+    tables: list[tuple[Sensor | None, SensorTable | None]]
+    if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
+        tables = [(sensor_of(words_of(file.stem)), sensor_table(file)) for file in files]
+        return list(dict.fromkeys(s for s, table in tables if s is not None and table is not None))
+    table = sensor_table(path) if _may_hold(path) else None
+    sensors: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
+    return [sensor for sensor in sensors if table is not None and sensor in table.axes]
+
+
+def _may_hold(file: Path) -> bool:
+    return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
+
+
+def _sensor_of(words: list[str]) -> Sensor | None:
+    """The sensor of a file's name; iOS Logger's `Motion.txt` is an attitude."""
+    return "attitude" if words == ["motion"] else sensor_of(words)
+
+
+def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
+    """A total force comes before others, what is calibrated before what is raw."""
+    calibrated = {"calibrated", "mot"} & set(words)
+    return is_uncalibrated(words), "total" not in words, not calibrated, file
+
+
+def _is_whole(group: PhoneFiles) -> bool:
+    return "gyro" in group.tables and any(sensor in group.tables for sensor in _NEEDED)
+
+
+def _united(groups: list[PhoneFiles]) -> PhoneFiles:
+    """One recording of files whose names differ by more than the sensor: one file of each."""
+    lone = PhoneFiles("")
+    for group in groups:
+        for sensor, tables in group.tables.items():
+            if sensor in lone.tables:
+                return PhoneFiles("")
+            lone.tables[sensor] = tables
+    return lone

@@ -1,0 +1,278 @@
+"""Phone loggers: a folder with a text file for each sensor, or one wide file with all of them.
+
+Written by many apps, each in its way (Sensor Logger, phyphox, SensLogs, the Android and iOS loggers
+of several data sets), so what a file holds is told by its name and content; see `sensor_words` and
+`sensor_table`. Time without a unit is in the one that makes 10 to 1200 samples a second of it;
+values without a unit are rad/s, m/s^2 and uT.
+
+A wide file (AndroSensor, Physics Toolbox, phyphox, `*_IMU.txt`) has a clock and columns for each
+sensor; cells of sensors that were not sampled are empty.
+
+Both sensors are brought onto the gyroscope's times of their common stretch. Where the
+accelerometer's file has lost gravity and there is one of gravity, that is added. Apple's
+accelerometers report the opposite of specific force, in g: that is known by the app and system that
+the folder tells of (Sensor Logger's `Metadata.csv`), or by the phone's own attitude beside it. A
+pose that an ARCore or ARKit logger wrote beside is the truth, see `poses`; reference points
+(`*_ref.csv`: time, x, y [m]) are waypoints.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.own_csv import is_own_csv
+from stario.sequences.readers.phones.apps import app_of
+from stario.sequences.readers.phones.attitude import logged_attitude
+from stario.sequences.readers.phones.files import SUFFIXES, PhoneFiles, phone_recordings
+from stario.sequences.readers.phones.reference_points import reference_points
+from stario.sequences.readers.phones.sensor_table import (
+    Samples,
+    SensorTable,
+    read_samples,
+    sensor_table,
+)
+from stario.sequences.readers.phones.sensor_words import (
+    Sensor,
+    is_sensor_word,
+    without_sensor,
+    words_of,
+)
+from stario.sequences.readers.phones.sign import accel_sign, is_in_g
+from stario.sequences.readers.poses import pose_files, with_pose
+from stario.sequences.readers.text import IntArray, head_lines, seconds
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    DeviceAttitude,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+)
+
+_log = logging.getLogger(__name__)
+
+_GRAVITY_REMOVED = 5.0
+"""A median force below this [m/s^2] has lost gravity."""
+
+
+def read_phone(path: Path) -> ImuSequence:
+    """Read a logger's folder, or by its gyroscope's file one recording of a folder with several.
+
+    Raises:
+        ReadError: a file is missing or malformed, the folder holds more than one recording, or the
+            two sensors have no stretch in common.
+    """
+    folder = path if path.is_dir() else path.parent
+    files = _chosen(path)
+    name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
+    return assembled(folder, name, files, pose_files(folder, files.key))
+
+
+def read_wide(path: Path) -> ImuSequence:
+    """Read one file that holds all sensors in columns of their own.
+
+    Raises:
+        ReadError: the file is malformed.
+    """
+    files = _wide(path)
+    if files is None:
+        lines = head_lines(path)[:1]
+        found = repr(lines[0].strip()[:60]) if lines else "no line"
+        expected = "a header that names a clock, a gyroscope's and an accelerometer's axes"
+        raise ReadError(path, "header", found, expected)
+    return assembled(path.parent, path.stem, files, _wide_poses(path, files))
+
+
+def is_wide(path: Path) -> bool:
+    """Whether a file's header names a clock and the axes of both sensors.
+
+    A CSV of one's own is none, unless poses lie beside it or it holds forces of two kinds.
+    """
+    if not path.is_file() or path.suffix.lower() not in SUFFIXES:
+        return False
+    files = _wide(path)
+    if files is None:
+        return False
+    axes = files.tables["gyro"][0].axes
+    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx beside ax
+    return not is_own_csv(path) or bool(_wide_poses(path, files)) or more
+
+
+def _wide(path: Path) -> PhoneFiles | None:
+    table = sensor_table(path)
+    if table is None or not {"gyro"} < set(table.axes) or not {"accel", "linear"} & set(table.axes):
+        return None
+    words = words_of(path.stem)
+    key = " ".join(word for word in words if word != "imu" and not is_sensor_word(word))
+    sensors: tuple[Sensor, ...] = ("accel", "gyro", "mag", "gravity", "linear")
+    files = PhoneFiles(key, {sensor: [table] for sensor in sensors if sensor in table.axes})
+    if table.quaternion:
+        files.tables["attitude"] = [table]
+    return files
+
+
+def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
+    """Poses of the same name beside `*_IMU.txt`."""
+    return pose_files(path.parent, files.key) if "imu" in words_of(path.stem) else []
+
+
+def assembled(
+    folder: Path,
+    name: str,
+    files: PhoneFiles,
+    poses: list[Path],
+    orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
+    core_motion: bool = False,
+) -> ImuSequence:
+    """The recording of a set of files.
+
+    Args:
+        folder: where they lie, for errors.
+        name: the recording's.
+        files: by sensor.
+        poses: files of poses beside them.
+        orders: as for `with_pose`.
+        core_motion: whether an iPhone wrote them: numbers in g have Apple's sign.
+
+    Raises:
+        ReadError: a file is malformed or the sensors have no stretch in common.
+    """
+    gyro = _read(files.tables["gyro"][0], "gyro")
+    attitude = logged_attitude(files, gyro)
+    accel, converted = _force(files, gyro, attitude, core_motion)
+    stamps, rate, force = on_one_clock(
+        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
+    )
+    if gyro.unit not in ("", "rad/s"):
+        converted |= {"gyro"}
+    sequence = ImuSequence(
+        name=name,
+        time=seconds(stamps, stamps[0]),
+        gyro=rate,
+        accel=force,
+        converted=frozenset(converted),
+        magnetometer=_magnetometer(files, stamps[0]),
+        device_attitude=_device_attitude(attitude, stamps[0]),
+        source="" if core_motion else app_of(files),
+    )
+    sequence = with_pose(sequence, stamps[0], poses, orders)
+    if sequence.truth is not None:
+        return sequence
+    return replace(sequence, positions=reference_points(folder, files.key, stamps[0]))
+
+
+def is_phone(path: Path) -> bool:
+    """Whether a folder holds one recording's files, or a file is the gyroscope's of one of several.
+
+    Never raises.
+    """
+    if path.is_dir():
+        return len(phone_recordings(path)) == 1
+    if not path.is_file() or "gyr" not in path.name.lower():
+        return False
+    return any(files.gyro == path for files in phone_recordings(path.parent))
+
+
+def _chosen(path: Path) -> PhoneFiles:
+    folder = path if path.is_dir() else path.parent
+    found = phone_recordings(folder)
+    if path.is_dir() and len(found) > 1:
+        names = ", ".join(files.gyro.name for files in found)
+        fix = f"name one by its gyroscope's file: {found[0].gyro}"
+        raise ReadError(folder, "files", f"{len(found)} recordings, {names}", "one", fix)
+    chosen = [files for files in found if path.is_dir() or files.gyro == path]
+    if not chosen:
+        names = ", ".join(sorted(p.name for p in folder.glob("*"))[:6]) or "nothing"
+        expected = "a gyroscope's and an accelerometer's file of one recording"
+        raise ReadError(
+            folder, "files", names, expected, "put each recording into a folder of its own"
+        )
+    return chosen[0]
+
+
+def _read(table: SensorTable, sensor: Sensor) -> Samples:
+    """The sensor's columns: those that its header names so, or those of a file that names none."""
+    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
+    if axes is None:
+        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
+    return read_samples(table, sensor, axes)
+
+
+def _force(
+    files: PhoneFiles,
+    gyro: Samples,
+    attitude: tuple[IntArray, Rotation] | None,
+    core_motion: bool,
+) -> tuple[Samples, set[str]]:
+    """Specific force, and whether its unit or sign were converted."""
+    candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
+    gravity = _gravity(files)
+    whole = _with_gravity(candidates, or_g=gravity is None)
+    linear = files.first("linear")
+    if whole is None and not candidates and linear is not None:
+        candidates = [_read(linear, "linear")]
+    accel = whole or candidates[0]
+    apart = whole is None and gravity is not None
+    if apart and gravity is not None:
+        folder = gyro_folder(files)
+        stamps, force, gravity_B = on_one_clock(
+            folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
+        )
+        accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
+        _log.info("%s: gravity added from its own file", folder)
+    converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
+    in_g = not accel.unit and is_in_g(accel.values)
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, apart)
+    in_g &= sign < 0
+    if sign < 0:
+        converted |= {"accel"}
+    factor = sign * (STANDARD_GRAVITY if in_g else 1.0)
+    return replace(accel, values=factor * accel.values), converted
+
+
+def gyro_folder(files: PhoneFiles) -> Path:
+    """The folder that a recording's files lie in."""
+    return files.gyro.parent
+
+
+def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
+    """The first that holds gravity in m/s^2, or else the steadiest that may hold it in g."""
+    sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
+    for one, size in zip(candidates, sizes, strict=True):
+        if float(np.median(size)) >= _GRAVITY_REMOVED:
+            return one
+    shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
+    maybe = [k for k, one in enumerate(candidates) if or_g and is_in_g(one.values)]
+    return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
+
+
+def _gravity(files: PhoneFiles) -> Samples | None:
+    table = files.first("gravity")
+    return None if table is None else _read(table, "gravity")
+
+
+def _device_attitude(
+    attitude: tuple[IntArray, Rotation] | None, start_ns: np.int64
+) -> DeviceAttitude | None:
+    return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
+
+
+def _magnetometer(files: PhoneFiles, start_ns: np.int64) -> Magnetometer | None:
+    table = files.first("mag")
+    if table is None:
+        return None
+    try:
+        samples = _read(table, "mag")
+    except ReadError as error:  # a recording does without
+        _log.warning("magnetometer left out: %s", error)
+        return None
+    time: FloatArray = seconds(samples.stamps_ns, start_ns)
+    return magnetometer(time, samples.values)

@@ -1,0 +1,181 @@
+"""Where a text file's clocks and sensors' axes stand: by its titles or, without any, by its rows.
+
+With a header, columns are found by their names (`sensor_words`), in any order, among any others;
+without one a row is time and three values, or three values and time, a second clock between them
+is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stario.sequences.readers.phones.sensor_words import (
+    axis_of,
+    bias_axis_of,
+    is_time,
+    is_uncalibrated,
+    quaternion_of,
+    sensor_of,
+    time_unit_of,
+    unit_of,
+)
+from stario.sequences.sequence import FloatArray
+
+_CLOCK_FROM = 1e6
+"""A second column that grows and is larger than this is another clock."""
+
+_SAME_PACE = 0.02
+"""One that grows as fast as the first, in whatever unit, is another clock as well."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A column: where it stands, what its header says, and the unit named there."""
+
+    index: int
+    title: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Which columns hold what.
+
+    Attributes:
+        clock: the column with the sensor's time.
+        axes: x, y and z of each sensor; under "" those of a file that names none.
+        quaternion: x, y, z and w of an attitude, where the header names one.
+        biases: columns of what an uncalibrated sensor's values are too large by, if any.
+        clocks: a sensor's own clock, by the key of its axes, where it stands before them.
+    """
+
+    clock: Place
+    axes: dict[str, tuple[Place, Place, Place]]
+    quaternion: tuple[Place, ...] = ()
+    biases: tuple[Place, ...] = ()
+    clocks: dict[str, Place] = field(default_factory=dict)
+
+    def clock_of(self, axes: str) -> Place:
+        """The clock of the sensor with these axes."""
+        return self.clocks.get(axes, self.clock)
+
+
+def by_header(titles: list[str], head: FloatArray) -> Layout | None:
+    """The layout that titles tell of; None where they name no clock or no sensor.
+
+    Args:
+        titles: the header's cells.
+        head: (N, K) the first rows; NaN where a cell is no number.
+    """
+    groups: dict[tuple[str, ...], dict[str, Place]] = {}
+    quaternion: dict[str, Place] = {}
+    biases: dict[str, Place] = {}
+    for k, title in enumerate(titles):
+        part, axis, bias = quaternion_of(title), axis_of(title), bias_axis_of(title)
+        if part is not None:
+            quaternion.setdefault(part, Place(k, title))
+        elif axis is not None and not is_time(title):
+            place = Place(k, title, unit_of(title))
+            groups.setdefault(axis[1], {}).setdefault(axis[0], place)
+        elif bias is not None:
+            biases.setdefault(bias, Place(k, title))
+    axes: dict[str, tuple[Place, Place, Place]] = {}
+    for words in sorted(groups, key=_preference):
+        sensor = sensor_of(words)
+        if set(groups[words]) == set("xyz") and sensor != "attitude":
+            x, y, z = (groups[words][axis] for axis in "xyz")
+            if "gf" in words and not x.unit:
+                x = Place(x.index, x.title, "g")
+            axes.setdefault(sensor or "", (x, y, z))
+    attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
+    clocks = _clocks(titles, head)
+    if not clocks or not (axes or attitude):
+        return None
+    before = {key: _run_before(clocks, places[0].index) for key, places in axes.items()}
+    raw = len(axes) == 1 and set(biases) == set("xyz")  # an uncalibrated sensor's file
+    return Layout(
+        clock=_finest(clocks, head),
+        axes=axes,
+        quaternion=attitude,
+        biases=tuple(biases[axis] for axis in "xyz") if raw else (),
+        clocks={key: _finest(run, head) for key, run in before.items() if run},
+    )
+
+
+def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
+    """What is calibrated comes first, then a total force, then what is said in fewer words."""
+    return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)
+
+
+def _clocks(titles: list[str], head: FloatArray) -> list[Place]:
+    return [
+        Place(k, title, time_unit_of(title))
+        for k, title in enumerate(titles)
+        if is_time(title) and _grows(head[:, k])
+    ]
+
+
+def _run_before(clocks: list[Place], column: int) -> list[Place]:
+    """The clocks that stand side by side nearest before a column."""
+    run: list[Place] = []
+    for clock in reversed(clocks):
+        if clock.index < (run[-1].index if run else column):
+            if run and clock.index < run[-1].index - 1:
+                break
+            run.append(clock)
+    return run[::-1]
+
+
+def _finest(clocks: list[Place], head: FloatArray) -> Place:
+    """A sensor's own clock rather than the app's, and the finer unit."""
+    order = {"ns": 0, "us": 1, "": 2, "s": 3, "ms": 4}
+
+    def rank(place: Place) -> tuple[bool, int]:
+        own = "sensor" in place.title.lower()
+        large = not place.unit and head[0, place.index] > 1e15
+        return not own, 0 if large else order.get(place.unit, 2)
+
+    return min(clocks, key=rank)
+
+
+def _grows(column: FloatArray) -> bool:
+    steps = np.diff(column)
+    return bool(np.isfinite(column).all() and (steps >= 0).mean() > 0.8 and column[-1] > column[0])
+
+
+def by_rows(head: FloatArray) -> Layout | None:
+    """The layout of rows (N, K) without titles: time is first or fourth, whichever grows."""
+    if len(head) < 2:
+        return None
+    width = head.shape[1]
+    for time, start in ((0, 1), (3, 0)):
+        if time >= width or not (np.diff(head[:, time]) >= 0).all():
+            continue
+        if not head[-1, time] > head[0, time]:
+            continue
+        while start and start < width and _is_clock(head[:, start], head[:, time]):
+            start += 1
+        if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
+            continue
+        x, y, z = (Place(start + k) for k in range(3))
+        rest = width - start
+        quaternion = tuple(Place(start + k) for k in range(4)) if start and rest >= 4 else ()
+        biases: tuple[Place, ...] = ()
+        if rest == 6 and start and not np.ptp(head[:, start + 3 :], axis=0).any():
+            biases = tuple(Place(start + 3 + k) for k in range(3))
+        clock = Place(start - 1) if start > 1 and head[0, start - 1] <= _CLOCK_FROM else Place(time)
+        return Layout(clock=clock, axes={"": (x, y, z)}, quaternion=quaternion, biases=biases)
+    return None
+
+
+def _is_clock(column: FloatArray, time: FloatArray) -> bool:
+    """Whether a column beside the time is another clock: large, or of the time's pace."""
+    if not (np.diff(column) >= 0).all():
+        return False
+    if abs(column[0]) > _CLOCK_FROM:
+        return True
+    pace = (column[-1] - column[0]) / (time[-1] - time[0])
+    units = 1000.0 ** np.arange(-3, 4)
+    return len(column) > 4 and bool(np.abs(pace / units - 1.0).min() < _SAME_PACE)

@@ -1,0 +1,186 @@
+"""A text file of sensor samples: how its rows are written, and reading them in known units.
+
+Which columns hold what is told by `sensor_layout`. Cells stand between commas, semicolons, tabs or
+blanks; with the latter three numbers may be written with a decimal comma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked
+from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.phones.sensor_layout import Layout, Place, by_header, by_rows
+from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
+from stario.sequences.sequence import FloatArray
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
+
+_LOOKED_AT = 24
+UNITS = {
+    "accel": ACCEL_UNITS,
+    "linear": ACCEL_UNITS,
+    "gravity": ACCEL_UNITS,
+    "gyro": GYRO_UNITS,
+    "mag": MAGNETIC_UNITS,
+}
+_LIMITS = {"accel": 2e3, "linear": 2e3, "gravity": 2e3, "gyro": 1e4, "mag": 1e5}
+"""No sensor gives more, in m/s^2, deg/s and uT."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorTable(Layout):
+    """How a file's rows are to be read.
+
+    Attributes:
+        file: the file.
+        delimiter: between cells; None for blanks.
+        decimal: point or comma.
+        skip: lines before the first row.
+    """
+
+    file: Path
+    delimiter: str | None = ","
+    decimal: str = "."
+    skip: int = 0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A sensor's samples: time stamps (N,) [ns], values (N, 3), the unit that was named or none."""
+
+    stamps_ns: IntArray
+    values: FloatArray
+    unit: str = ""
+
+
+def sensor_table(file: Path) -> SensorTable | None:
+    """How a file's rows are to be read, or None if that cannot be told; never raises."""
+    numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
+    numbered = numbered[: 4 * _LOOKED_AT]
+    if len(numbered) < 2:
+        return None
+    found = first_row(numbered[:-1])  # the last line may be cut
+    if found is None:
+        return None
+    first, delimiter, decimal = found
+    skip = numbered[first][0]
+    rows = [_cells(line, delimiter, decimal) for _, line in numbered[first:-1]][:_LOOKED_AT]
+    width = max(set(map(len, rows)), key=list(map(len, rows)).count)
+    rows = [row for row in rows if len(row) == width]
+    if len(rows) < 2:
+        return None
+    head = np.array([[_number(cell) for cell in row] for row in rows])
+    layout = None
+    if first:
+        titles = [c.strip(" #\"'\ufeff") for c in numbered[first - 1][1].split(delimiter)]
+        if len(titles) == width or delimiter is not None:
+            layout = by_header(titles[:width], head)
+    layout = layout or by_rows(head)
+    if layout is None:
+        return None
+    return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
+
+
+def read_samples(
+    table: SensorTable, sensor: str, axes: str = "", per_second: int | None = None
+) -> Samples:
+    """A sensor's samples, in rad/s, m/s^2 or uT where the file names a unit.
+
+    Args:
+        table: the file's layout.
+        sensor: which one, a key of `UNITS`.
+        axes: the key of its columns in `table.axes`.
+        per_second: how many of the clock's units make a second where its header does not say.
+
+    Raises:
+        ReadError: a row is malformed, a unit is unknown, or a value is none that a sensor gives.
+    """
+    places, clock = table.axes[axes], table.clock_of(axes)
+    rows = _rows(table, [clock, *places, *table.biases])
+    kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
+    titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
+    values = rows.values[:, 1:4]
+    if table.biases:
+        values = values - rows.values[:, 4:7]
+    unit = next((place.unit for place in places if place.unit), "")
+    known = UNITS[sensor]
+    if unit and unit not in known:
+        raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
+    values = values * (known[unit] if unit else 1.0)
+    _check_size(table.file, titles, sensor, values[kept])
+    if per_second is None or clock.unit:
+        per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
+    stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
+    if sensor != "mag":
+        checked(table.file, titles, np.where(kept.reshape(-1, 1), values, 0.0), rows.first_row)
+    return Samples(stamps, values[kept], unit)
+
+
+def _rows(table: SensorTable, used: Sequence[Place]) -> Table:
+    """The columns asked for; what a killed recorder left of a last row is left out."""
+    indices = [place.index for place in used]
+    columns = max(indices) + 1
+    return read_table(
+        table.file, columns, table.skip, table.delimiter, indices, table.decimal, killed=True
+    )
+
+
+def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if largest > _LIMITS[sensor]:
+        unit = next(iter(UNITS[sensor]))
+        raise ReadError(
+            file, titles, f"{largest:.3g}", f"what a sensor can give, in {unit}",
+            "is another column meant, or a clock among them?",
+        )  # fmt: skip
+
+
+def read_quaternion(
+    table: SensorTable, per_second: int | None = None
+) -> tuple[IntArray, FloatArray]:
+    """Time stamps (N,) [ns] and the four numbers of an attitude (N, 4), in the table's order.
+
+    Raises:
+        ReadError: a row is malformed.
+    """
+    rows = _rows(table, [table.clock, *table.quaternion])
+    if per_second is None or table.clock.unit:
+        per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
+    return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
+
+
+def first_row(
+    numbered: list[tuple[int, str]], least: int = 4
+) -> tuple[int, str | None, str] | None:
+    """Which line is the first row of numbers, what separates its cells, and its decimal mark.
+
+    Args:
+        numbered: lines of a file with their numbers, blank ones left out.
+        least: numbers that a row must hold.
+    """
+    for k, (_, line) in enumerate(numbered):
+        if line.lstrip().startswith("#"):
+            continue
+        for delimiter, decimal in ((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."),
+                                   (None, "."), (None, ",")):  # fmt: skip
+            cells = _cells(line, delimiter, decimal)
+            numbers = sum(np.isfinite(_number(cell)) for cell in cells)
+            if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
+                return k, delimiter, decimal
+    return None
+
+
+def _cells(line: str, delimiter: str | None, decimal: str) -> list[str]:
+    return (line.replace(",", ".") if decimal == "," else line).split(delimiter)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell.strip(" \"'"))
+    except ValueError:
+        return float("nan")

@@ -1,0 +1,130 @@
+"""Whether a phone's accelerometer reports specific force or, as Apple's do, its opposite.
+
+The sign does not show in the accelerometer and the gyroscope: a world upside down moves alike. It
+is known by the system that an app names, or by the phone's own attitude where that was logged:
+specific force points up.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.readers.phones.files import PhoneFiles
+from stario.sequences.readers.phones.sensor_table import Samples
+from stario.sequences.readers.text import IntArray, head_lines, seconds
+from stario.sequences.sequence import FloatArray
+
+_log = logging.getLogger(__name__)
+
+_G_RANGE = (0.7, 1.4)
+_STEADY = 0.4
+"""Gravity keeps a tenth of the samples from falling below this share of their median."""
+
+_CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
+"""How files begin that only loggers on iOS write."""
+
+_SURE = 0.7
+"""Mean cosine between an attitude's vertical and the force from which it decides."""
+
+
+def is_in_g(values: FloatArray) -> bool:
+    """Whether an accelerometer's samples (N, 3) are about one long: gravity in g."""
+    size = np.linalg.norm(values, axis=1)
+    low, median = np.percentile(size, [10, 50])
+    return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
+
+
+def accel_sign(
+    files: PhoneFiles,
+    accel: Samples,
+    attitude: tuple[IntArray, Rotation] | None,
+    gravity_apart: bool = False,
+) -> float:
+    """1.0, or -1.0 where the accelerometer has Apple's sign.
+
+    Args:
+        files: the recording's.
+        accel: its accelerometer's samples.
+        attitude: the phone's own, as `logged_attitude` returns it.
+        gravity_apart: whether gravity was added from a file of its own.
+    """
+    folder = files.gyro.parent
+    in_g = is_in_g(accel.values)
+    sign = _by_attitude(attitude, accel)
+    if sign is None:
+        sign = _by_system(folder, in_g)
+    if sign is None and accel.unit == "g" and _has_core_motion(files):
+        sign = -1.0
+    if sign is None and in_g and not accel.unit:
+        _log.warning(
+            "%s: an accelerometer in g: pass `--accel-unit g`, and if an iPhone wrote it "
+            "`--accel-sign apple` as well", folder,
+        )  # fmt: skip
+    elif sign is None and gravity_apart:
+        _log.warning(
+            "%s: gravity stands in a file of its own, as Sensor Logger writes it on iPhones, whose "
+            "sign is the opposite: if one wrote it, pass `--accel-sign apple`", folder,
+        )  # fmt: skip
+    if sign == -1.0:
+        _log.info("%s: the accelerometer has Apple's sign, turned over", folder)
+    return sign or 1.0
+
+
+def _by_system(folder: Path, in_g: bool) -> float | None:
+    """By the system that an app names, or that its files show it ran on; None where neither does.
+
+    Sensor Logger's `Metadata.csv` names it: iOS has Apple's sign unless the app standardised it.
+    SensLogs writes `record.properties` on Android, `description.txt` on iOS; files of ARKit and of
+    Core Motion come from iOS, their numbers as Apple has them where they are in g.
+    """
+    names = {file.name.lower(): file for file in sorted(folder.glob("*"))}
+    if "metadata.csv" in names:
+        return _by_metadata(names["metadata.csv"])
+    if "record.properties" in names:
+        return 1.0
+    if "BootTime" in "".join(head_lines(names.get("description.txt", folder))):
+        return -1.0
+    apples = any(name.startswith(_CORE_MOTION) for name in names)
+    return -1.0 if apples and in_g else None
+
+
+def _by_metadata(file: Path) -> float | None:
+    lines = [line for line in head_lines(file) if line.strip()][:2]
+    if len(lines) < 2:
+        return None
+    titles, cells = ([c.strip().lower() for c in row] for row in csv.reader(lines))
+    told = dict(zip(titles, cells, strict=False))
+    system = told.get("platform", "") or told.get("device name", "")
+    if not any(word in system for word in ("ios", "iphone", "ipad")):
+        return 1.0 if system else None
+    return 1.0 if told.get("standardisation", told.get("standardization")) == "true" else -1.0
+
+
+def _has_core_motion(files: PhoneFiles) -> bool:
+    """Whether a wide file has columns that apps call after Apple's CMDeviceMotion."""
+    titles = [
+        place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
+    ]
+    return any(title.startswith("motion") for title in titles)
+
+
+def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> float | None:
+    """By the phone's own attitude: the mean cosine between its vertical and the force."""
+    if attitude is None:
+        return None
+    stamps_ns, attitude_WB = attitude
+    inside = (accel.stamps_ns >= stamps_ns[0]) & (accel.stamps_ns <= stamps_ns[-1])
+    if inside.sum() < 2:
+        return None
+    up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+    time, clock = (seconds(ns, stamps_ns[0]) for ns in (accel.stamps_ns[inside], stamps_ns))
+    seen = np.stack([np.interp(time, clock, up_B[:, k]) for k in range(3)], axis=1)
+    force = accel.values[inside]
+    sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
+    cosine = float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))
+    return float(np.sign(cosine)) if abs(cosine) > _SURE else None

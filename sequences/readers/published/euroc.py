@@ -1,0 +1,99 @@
+"""EuRoC and TUM-VI folders: `mav0/imu0/data.csv` with truth beside it (Burri et al., 2016).
+
+IMU rows: time [ns], gyroscope xyz [rad/s], accelerometer xyz [m/s^2]. Truth rows, in
+`state_groundtruth_estimate0` (EuRoC) or `mocap0` (TUM-VI, Schubert et al., 2018): time [ns],
+position xyz [m], quaternion w x y z, IMU to world; EuRoC adds velocity xyz. Time is returned as
+seconds since the first IMU row. Truth may start later, end earlier and have gaps; a pose whose
+quaternion is none, as captures write while they see nothing, is left out with a warning.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import read_lines, read_table, seconds
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.time_order import advancing
+
+_log = logging.getLogger(__name__)
+
+TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
+"""Poses of the IMU; EuRoC's `leica0` is a position alone and `vicon0` the markers' pose."""
+
+
+def read_euroc(path: Path) -> ImuSequence:
+    """Read a recording by its folder, its `mav0` folder or its `imu0/data.csv`.
+
+    Raises:
+        ReadError: the IMU's file is missing or malformed.
+    """
+    imu = imu_file(path)
+    if imu is None:
+        raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
+    table = read_table(imu, columns=7)
+    stamps = table.stamps_ns()
+    truth_file = _truth_file(imu.parent.parent)
+    return ImuSequence(
+        name=_name(imu),
+        time=seconds(stamps, stamps[0]),
+        gyro=table.values[:, 1:4],
+        accel=table.values[:, 4:7],
+        truth=None if truth_file is None else _truth(truth_file, stamps[0]),
+    )
+
+
+def is_euroc(path: Path) -> bool:
+    """Whether a path leads to an `imu0/data.csv`."""
+    return imu_file(path) is not None
+
+
+def imu_file(path: Path) -> Path | None:
+    """The recording's `imu0/data.csv`, or None if `path` does not lead to one."""
+    if path.is_file():
+        return path if path.name == "data.csv" and path.parent.name.startswith("imu") else None
+    candidates = (path / "mav0/imu0/data.csv", path / "imu0/data.csv", path / "data.csv")
+    return next((c for c in candidates if c.is_file() and c.parent.name.startswith("imu")), None)
+
+
+def _name(imu: Path) -> str:
+    folder = imu.resolve().parent.parent
+    return folder.parent.name if folder.name == "mav0" else folder.name
+
+
+def _truth_file(mav: Path) -> Path | None:
+    found = (mav / folder / "data.csv" for folder in TRUTH_FOLDERS)
+    return next((path for path in found if path.is_file()), None)
+
+
+def _holds_velocity(path: Path) -> bool:
+    """Some copies of EuRoC's truth are cut to the pose's eight columns."""
+    if not path.parent.name.startswith("state_groundtruth"):
+        return False
+    rows = (line for line in read_lines(path) if not line.lstrip().startswith("#"))
+    return len(next(rows, "").split(",")) >= 11
+
+
+def _truth(path: Path, start_ns: np.int64) -> Trajectory:
+    columns = 11 if _holds_velocity(path) else 8
+    rows = read_table(path, columns=columns)
+    table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
+    keep = advancing(time)
+    table, time = table[keep], time[keep]
+    norm = np.linalg.norm(table[:, 4:8], axis=1)
+    valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
+    if not valid.all():
+        _log.warning("%s: %d of %d poses are none, left out", path, (~valid).sum(), len(valid))
+    quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])
+    return Trajectory(
+        time=time,
+        position_W=table[:, 1:4],
+        attitude_WB=Rotation.from_quat(quat_xyzw),
+        velocity_W=table[:, 8:11] if columns == 11 else None,
+        valid=valid,
+    )

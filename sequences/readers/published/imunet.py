@@ -1,0 +1,97 @@
+"""IMUNet, raw: `acce.txt`, `gyro.txt`, `orientation.txt`, `pose.txt` in a folder (Zeinali, 2022).
+
+Rows of blank-separated numbers below `#` comments, each file at its own clock: time [ns] and
+values; specific force xyz [m/s^2], rate xyz [rad/s], game rotation vector xyzw, and of ARCore's
+pose at 30 Hz position xyz [m] and quaternion xyzw in a world with y up. Positions are turned
+upright as the authors do, (x, -z, y), and the attitude is theirs as well:
+pose[0] conj(orientation[0]) orientation, turned likewise. RIDI's raw folders have the same files in
+a world with z up already: the specific force tells them apart.
+
+Its authors' later recorder writes several files of poses (of the camera, the display, the sensor);
+of them the one is taken that agrees with the gyroscope, see `poses`.
+
+A processed recording, `processed/data.csv`, is read instead where there is one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
+from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.poses import pose_files, with_pose
+from stario.sequences.readers.published.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
+from stario.sequences.readers.text import IntArray, first_line, read_table, seconds
+from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
+
+_FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
+
+
+def read_imunet(path: Path) -> ImuSequence:
+    """Read a recording by its folder, processed or raw.
+
+    Raises:
+        ReadError: a file is missing or malformed.
+    """
+    if is_ridi(path):
+        return read_ridi(path)
+    folder = path if path.is_dir() else path.parent
+    gyro_ns, gyro = _rows(folder / "gyro.txt", 3)
+    accel_ns, accel = _rows(folder / "acce.txt", 3)
+    stamps, gyro, accel = on_one_clock(folder, gyro_ns, gyro, accel_ns, accel)
+    time = seconds(stamps, stamps[0])
+    poses = pose_files(folder)
+    sequence = ImuSequence(
+        name=folder.resolve().name,
+        time=time,
+        gyro=gyro,
+        accel=accel,
+        truth=_truth(folder, stamps[0], time, accel) if len(poses) == 1 else None,
+        magnetometer=_magnetometer(folder / "magnet.txt", stamps[0]),
+    )
+    return sequence if sequence.truth else with_pose(sequence, stamps[0], poses)
+
+
+def is_imunet(path: Path) -> bool:
+    """Whether a folder holds the raw files."""
+    return path.is_dir() and all((path / name).is_file() for name in _FILES)
+
+
+def _magnetometer(path: Path, start_ns: np.int64) -> Magnetometer | None:
+    if not path.is_file() or first_line(path) is None:
+        return None
+    stamps, field = _rows(path, 3)
+    return magnetometer(seconds(stamps, start_ns), field)
+
+
+def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:
+    table = read_table(path, columns=1 + width, delimiter=None)
+    return table.stamps_ns(), checked(path, "values", table.values[:, 1:], table.first_row)
+
+
+def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray) -> Trajectory:
+    pose_ns, pose = _rows(folder / "pose.txt", 7)
+    rv_ns, rv = _rows(folder / "orientation.txt", 4)
+    kept = np.unique(rv_ns, return_index=True)[1]
+    game_rv = rotations(folder / "orientation.txt", "quaternion", rv[kept], "xyzw")
+    inside = (pose_ns >= rv_ns[kept[0]]) & (pose_ns <= rv_ns[kept[-1]])
+    if not inside.any() or len(kept) < 2:
+        raise ReadError(folder / "pose.txt", "time", "no pose", "poses while orientation.txt lasts")
+    pose_ns, pose = pose_ns[inside], pose[inside]
+    known = Slerp(seconds(rv_ns[kept], start_ns), game_rv)
+    pose_time = seconds(pose_ns, start_ns)
+    start = rotations(folder / "pose.txt", "quaternion", pose[:, 3:7], "xyzw")[0]
+    R_WU = start * known(pose_time[0]).inv()
+    attitude_WB, position = R_WU * known(pose_time), pose[:, :3]
+    if y_is_up(folder / "pose.txt", _force_attitude(R_WU, known, time), accel):
+        attitude_WB, position = UPRIGHT * attitude_WB, UPRIGHT.apply(position)
+    return trajectory(pose_time, position, attitude_WB)
+
+
+def _force_attitude(R_WU: Rotation, known: Slerp, time: FloatArray) -> Rotation:
+    """The attitude at the IMU's samples, for the direction of its force alone."""
+    return R_WU * known(np.clip(time, known.times[0], known.times[-1]))

@@ -1,0 +1,213 @@
+"""OxIOD: `<carriage>/<dataN>/{syn,raw}/imuN.csv` with the capture beside it (Chen et al., 2018).
+
+`imuN.csv` has no header: time, roll, pitch, yaw [rad], gyroscope xyz [rad/s], gravity xyz [g],
+user acceleration xyz [g], magnetic field xyz [uT], in Apple's signs: the specific force is
+-(gravity + user acceleration) * 9.81. The capture is Vicon's `viN.csv` (`handN.csv` in one
+folder) or, at large scale, `tangoN.csv`: time, frame, position xyz [m], quaternion xyzw of the
+tracked body.
+
+In `syn` the printed times are rounded to uselessness; the rows of both files are synchronous at
+100 Hz. In `raw` each file has its own clock, in ns, us, ms or s: the rate tells which. There the
+IMU's rows are sorted (neighbours are swapped now and then), and the capture is brought onto the
+phone's clock by what both see of the turning. The Nexus 5 of `multi devices` writes other rows in
+`raw`: time, code of the sensor (1 accelerometer [m/s^2], 2 magnetometer [uT], 4 gyroscope [rad/s])
+and xyz.
+
+The phone sits turned in the tracked body, the capture glitches and flips, and its world is not
+quite level: see `stario.sequences.truth.alignment`.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import binary_dilation, median_filter
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.clocks import on_one_clock, time_unit
+from stario.sequences.readers.text import (
+    IntArray,
+    Table,
+    first_lines,
+    first_numbers,
+    numbers_in,
+    read_table,
+    seconds,
+)
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Magnetometer,
+    Trajectory,
+)
+from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.clock_offset import clock_offset
+
+RATE = 100.0
+_log = logging.getLogger(__name__)
+
+_G = 9.81
+_CAPTURES = ("vi", "hand", "tango")
+_ACCELEROMETER, _MAGNETIC, _GYROSCOPE = 1, 2, 4
+
+_JUMP_M_S = 4.0
+"""A tracked body that moves faster than this from row to row is a glitch."""
+
+_SPIKE_M = 0.1
+"""Nor is it ever this far from the median of the half second around it."""
+
+
+@dataclass(frozen=True)
+class _Phone:
+    """Its samples; the stamps [ns] are None where rows are all there is to go by."""
+
+    time: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+    stamps_ns: IntArray | None
+    magnetometer: Magnetometer | None
+
+
+def read_oxiod(path: Path) -> ImuSequence:
+    """Read `imuN.csv` and, where it lies beside it, the capture.
+
+    Truth is None, with a warning logged, where too little of it agrees with the gyroscope.
+
+    Raises:
+        ReadError: a file is missing, cut short, or two of `syn` do not have as many rows.
+    """
+    phone = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
+    capture = capture_file(path)
+    return ImuSequence(
+        name=_name(path),
+        time=phone.time,
+        gyro=phone.gyro,
+        accel=phone.accel,
+        truth=None if capture is None else _truth(capture, phone),
+        magnetometer=phone.magnetometer,
+    )
+
+
+def is_oxiod(path: Path) -> bool:
+    """Whether a file starts with 16 numbers whose gravity is one g long; there is no header."""
+    row = first_numbers(path)
+    apple = len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
+    return apple or _is_sensor_rows(path)
+
+
+def _is_sensor_rows(path: Path) -> bool:
+    rows = [numbers_in(line) for line in first_lines(path, 40)[:-1]]
+    if not rows or any(len(row) != 5 for row in rows):
+        return False
+    codes = {row[1] for row in rows}
+    return {_ACCELEROMETER, _GYROSCOPE} <= codes and all(c == int(c) for c in codes)
+
+
+def _name(path: Path) -> str:
+    """`handheld/data1/syn/imu3.csv` becomes `handheld-data1-imu3`."""
+    parts = [p.replace(" ", "_") for p in (*path.parent.parts[-3:], path.stem) if p != "syn"]
+    return "-".join(p for p in parts if p not in ("/", "..", "."))
+
+
+def _phone(path: Path) -> _Phone:
+    table = read_table(path, columns=16)
+    rows = table.values
+    gyro, accel = rows[:, 4:7], -_G * (rows[:, 7:10] + rows[:, 10:13])
+    field = rows[:, 13:16]
+    if path.parent.name == "syn" or len(np.unique(rows[:, 0])) < len(rows) / 2:
+        time = np.arange(len(rows)) / RATE
+        return _Phone(time, gyro, accel, None, magnetometer(time, field))
+    stamps = _stamps_ns(table)
+    order = np.argsort(stamps, kind="stable")
+    stamps = stamps[order]
+    time = seconds(stamps, stamps[0])
+    return _Phone(time, gyro[order], accel[order], stamps, magnetometer(time, field[order]))
+
+
+def _sensor_rows(path: Path) -> _Phone:
+    """A row for each sample of each sensor, at its own time."""
+    table = read_table(path, columns=5)
+    stamps, code = _stamps_ns(table), table.values[:, 1]
+    gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
+    xyz = table.values[:, 2:5]
+    imu_ns, rate, force = on_one_clock(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
+    field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
+    return _Phone(seconds(imu_ns, imu_ns[0]), rate, force, imu_ns, field)
+
+
+def _stamps_ns(table: Table) -> IntArray:
+    return table.stamps_ns(0, time_unit(table.path, table.values[:, 0]))
+
+
+def capture_file(path: Path) -> Path | None:
+    """The capture of the same number beside the IMU's file, or in a folder `tango` beside its."""
+    if not path.name.startswith("imu"):
+        return None
+    number = path.name.removeprefix("imu")
+    folders = (path.parent, path.parent.parent / "tango")
+    files = (folder / f"{name}{number}" for folder in folders for name in _CAPTURES)
+    return next((file for file in files if file.is_file()), None)
+
+
+def _truth(path: Path, phone: _Phone) -> Trajectory | None:
+    table = read_table(path, columns=max(8, len(first_numbers(path))))
+    position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
+    norm = np.linalg.norm(quat_xyzw, axis=1)
+    valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
+    valid &= (position != 0.0).any(axis=1)  # written while nothing was seen
+    quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
+    attitude_WV = Rotation.from_quat(quat_xyzw)
+    known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
+    imu = (phone.time[known], phone.gyro[known], phone.accel[known])
+    try:
+        time, kept = _capture_time(table, phone)
+        position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
+        valid &= ~_position_glitches(time, position)
+        if phone.stamps_ns is not None:
+            time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
+        aligned = align_tracked_body(*imu, time, attitude_WV, valid, position)
+    except InputError as error:
+        if isinstance(error, ReadError):
+            raise
+        _log.warning("%s: left out: %s", path, error)
+        return None
+    return Trajectory(
+        time=time + aligned.lag,
+        position_W=aligned.leveling_WW.apply(position),
+        attitude_WB=aligned.attitude_WB,
+        valid=aligned.valid,
+    )
+
+
+def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
+    """Seconds since the phone's first sample by the capture's clock, and the rows they are of."""
+    rows = np.arange(len(table.values))
+    if phone.stamps_ns is None:
+        if len(rows) != len(phone.time):
+            expected = f"{len(phone.time)} as in the IMU's file"
+            raise ReadError(table.path, "rows", str(len(rows)), expected)
+        return phone.time, rows
+    stamps, rows = np.unique(_stamps_ns(table), return_index=True)
+    return seconds(stamps, phone.stamps_ns[0]), rows
+
+
+def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
+    """Rows at either end of an impossible step or far from the median around them, widened."""
+    if len(time) < 2:
+        return np.zeros(len(time), dtype=np.bool_)
+    half = max(1, round(0.25 / float(np.median(np.diff(time)))))
+    median = median_filter(position, size=(2 * half + 1, 1), mode="nearest")
+    distance = np.linalg.norm(position - median, axis=1)
+    limit = _JUMP_M_S * np.maximum(np.diff(time), 1.0 / RATE)
+    jump = ~(np.linalg.norm(np.diff(position, axis=0), axis=1) < limit)
+    bad = ~(distance < _SPIKE_M)
+    bad[1:] |= jump
+    bad[:-1] |= jump
+    return np.asarray(binary_dilation(bad, iterations=2), dtype=np.bool_)

@@ -1,0 +1,77 @@
+"""RNIN: `{data_train,data_val,data_test}/<n>/SenseINS.csv` (Chen et al., ISMAR 2021), 200 Hz.
+
+Columns by name: `times` (or `time`) [s], `gyro_x..` [rad/s], `acce_x..` [m/s^2], the pose by motion
+capture `gt_q_w..z`, `gt_p_x..` [m] and by visual-inertial odometry `vio_q_w..z`, `vio_p_x..` [m],
+both of the IMU in a world with z up, and the biases that odometry estimated. As the authors do, the
+biases of the last row are subtracted, and the odometry's pose is the truth where there is no
+motion capture, which leaves `gt_q` constant.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import magnetometer, rotations, trajectory
+from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
+from stario.sequences.readers.text import seconds
+from stario.sequences.sequence import ImuSequence
+
+_FILE = "SenseINS.csv"
+_COLUMNS = (
+    *axes_of("gyro"),
+    *axes_of("acce"),
+    *axes_of("gt_q", "wxyz"),
+    *axes_of("gt_p"),
+    *axes_of("vio_q", "wxyz"),
+    *axes_of("vio_p"),
+    *axes_of("vio_gyro_bias"),
+    *axes_of("vio_acce_bias"),
+)
+_MAGNETIC = ("magnet", "mag", "magn")
+"""Stems of the field's columns [uT], in copies that have some."""
+
+_OWN = ("gt_q_w", "gt_p_x", "vio_q_w", "vio_p_x")
+
+
+def read_rnin(path: Path) -> ImuSequence:
+    """Read a recording by its folder or its `SenseINS.csv`.
+
+    Raises:
+        ReadError: the file is missing or malformed.
+    """
+    file = path / _FILE if path.is_dir() else path
+    if not file.is_file():
+        raise ReadError(file, "file", "nothing there", f"a recording's {_FILE}")
+    time_name = "times" if "times" in header_names(file) else "time"
+    columns = NamedColumns(file, (time_name, *_COLUMNS), optional=_MAGNETIC)
+    stamps = columns.table.stamps_ns(columns.file_column(time_name), per_second=1)
+    time = seconds(stamps, stamps[0])
+    captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
+    source = "gt" if captured else "vio"
+    first = columns.table.first_row
+    quat_wxyz = columns.stack(f"{source}_q", "wxyz")
+    attitude_WB = rotations(file, f"{source}_q", quat_wxyz, first_row=first)
+    return ImuSequence(
+        name=_name(file),
+        time=time,
+        gyro=columns.stack("gyro") - columns.stack("vio_gyro_bias")[-1],
+        accel=columns.stack("acce") - columns.stack("vio_acce_bias")[-1],
+        truth=trajectory(time, columns.stack(f"{source}_p"), attitude_WB),
+        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
+    )
+
+
+def is_rnin(path: Path) -> bool:
+    """Whether a path is a folder with `SenseINS.csv` or a CSV with its columns."""
+    if path.is_dir():
+        return (path / _FILE).is_file()
+    return path.name == _FILE or len(set(_OWN) & set(header_names(path))) >= 2
+
+
+def _name(file: Path) -> str:
+    """`data_train/12/SenseINS.csv` becomes `data_train-12`: the numbers start anew in each."""
+    folder = file.resolve().parent
+    return f"{folder.parent.name}-{folder.name}" if folder.name.isdecimal() else folder.name

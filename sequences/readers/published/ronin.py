@@ -1,0 +1,159 @@
+"""RoNIN: `<sequence>/data.hdf5` with `info.json` beside it (Herath et al., ICRA 2020), 200 Hz.
+
+`synced/time` [s], `synced/gyro_uncalib` [rad/s], `synced/acce` [m/s^2] and, where there is one,
+`synced/magnet` [uT] are those of a phone carried anyhow; `pose/tango_pos` [m] and `pose/tango_ori`
+those of a second device on the chest, in a world with z up. Quaternions are w x y z. As the authors
+do, `imu_init_gyro_bias` is subtracted from the gyroscope, the specific force is
+`imu_acce_scale (acce - imu_acce_bias)`, what comes before `start_frame` is left out, and the
+phone's attitude in the Tango's world is
+
+    tango_ori[0] start_calibration conj(source[0]) source
+
+where the source is the game rotation vector unless its error at the recording's end,
+`grv_ori_error`, exceeds 20 degrees: then the one of lowest error of the integrated gyroscope, the
+game rotation vector and `pose/ekf_ori`. So the truth's position is the chest's, its attitude the
+phone's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import (
+    checked,
+    magnetometer,
+    optional_package,
+    rotations,
+    trajectory,
+)
+from stario.sequences.readers.published.json_fields import JsonFields
+from stario.sequences.readers.text import magic
+from stario.sequences.sequence import FloatArray, ImuSequence
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_FIELDS = {
+    "synced/time": (),
+    "synced/gyro_uncalib": (3,),
+    "synced/acce": (3,),
+    "synced/game_rv": (4,),
+    "pose/tango_pos": (3,),
+    "pose/tango_ori": (4,),
+}
+_EKF = "pose/ekf_ori"
+_MAGNETIC = "synced/magnet"
+_OPTIONAL = {_EKF: (4,), _MAGNETIC: (3,)}
+
+_TRUSTED_DEG = 20.0
+"""The game rotation vector is taken if its error is not above this, whatever the others'."""
+
+
+def read_ronin(path: Path) -> ImuSequence:
+    """Read a recording by its folder or its `data.hdf5`.
+
+    Raises:
+        ReadError: a file is missing or cut short, or a field is missing or malformed.
+        InputError: h5py is not installed.
+    """
+    file = _data_file(path)
+    info = JsonFields(file.with_name("info.json"))
+    fields = _fields(file)
+    gyro = fields["synced/gyro_uncalib"] - info.array("imu_init_gyro_bias", 3)
+    bias, scale = info.array("imu_acce_bias", 3), info.array("imu_acce_scale", 3)
+    accel = scale * (fields["synced/acce"] - bias)
+    attitude_WB = _device_attitude(file, info, fields, gyro)
+    time = fields["synced/time"]
+    start = _start_frame(info, len(time))
+    time = time[start:] - time[start]
+    return ImuSequence(
+        name=file.resolve().parent.name,
+        time=time,
+        gyro=gyro[start:],
+        accel=accel[start:],
+        truth=trajectory(time, fields["pose/tango_pos"][start:], attitude_WB[start:]),
+        magnetometer=(
+            magnetometer(time, fields[_MAGNETIC][start:]) if _MAGNETIC in fields else None
+        ),
+    )
+
+
+def is_ronin(path: Path) -> bool:
+    """Whether a path is an HDF5 file or a folder with `data.hdf5`."""
+    return (path / "data.hdf5").is_file() or magic(path, len(_MAGIC)) == _MAGIC
+
+
+def _data_file(path: Path) -> Path:
+    file = path / "data.hdf5" if path.is_dir() else path
+    if not file.is_file():
+        raise ReadError(file, "file", "nothing there", "the recording's HDF5 file")
+    return file
+
+
+def _fields(file: Path) -> dict[str, FloatArray]:
+    """The fields needed, finite and of one length; the optional ones where there are."""
+    h5py = optional_package("h5py", "readers")
+    try:
+        with h5py.File(file, "r") as data:
+            names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
+            missing = [name for name in names if name not in data]
+            if missing:
+                raise ReadError(file, missing[0], "no such field", ", ".join(_FIELDS))
+            fields = {name: np.asarray(data[name], dtype=np.float64) for name in names}
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        if isinstance(error, ReadError):
+            raise
+        found = " ".join(str(error).split())
+        raise ReadError(file, "file", found, "HDF5", "is the download complete?") from None
+    count = len(fields["synced/time"]) if fields["synced/time"].ndim == 1 else 0
+    for name, values in fields.items():
+        shape = (count, *(_FIELDS | _OPTIONAL)[name])
+        if values.shape != shape or not count:
+            raise ReadError(file, name, f"shape {values.shape}", f"{shape} as synced/time")
+        if name not in _OPTIONAL:
+            checked(file, name, values, first_row=0)
+    return fields
+
+
+def _device_attitude(
+    file: Path, info: JsonFields, fields: dict[str, FloatArray], gyro: FloatArray
+) -> Rotation:
+    """Attitude of the phone in the Tango's world, from the source that the authors would take."""
+    game_rv = rotations(file, "synced/game_rv", fields["synced/game_rv"], first_row=0)
+    name = _source(info, _EKF in fields)
+    if name == "game_rv":
+        source = game_rv
+    elif name == "ekf":
+        source = rotations(file, _EKF, fields[_EKF], first_row=0)
+    else:
+        steps = np.diff(fields["synced/time"])[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
+        turned = Rotation.from_quat(cumulative_rotations(Rotation.from_rotvec(steps)))
+        source = game_rv[0] * turned
+    first = rotations(file, "pose/tango_ori", fields["pose/tango_ori"][:1], first_row=0)[0]
+    calibration = info.array("start_calibration", 4)[None]
+    R_TB = rotations(info.path, "start_calibration", calibration, first_row=0)[0]
+    return first * R_TB * source[0].inv() * source
+
+
+def _source(info: JsonFields, has_ekf: bool) -> str:
+    fields = {"gyro": "gyro_integration_error", "game_rv": "grv_ori_error", "ekf": "ekf_ori_error"}
+    if not has_ekf:
+        del fields["ekf"]
+    errors = {
+        name: float(info.array(field))
+        for name, field in fields.items()
+        if info.get(field) is not None
+    }
+    if errors.get("game_rv", 0.0) <= _TRUSTED_DEG:
+        return "game_rv"
+    return min(errors, key=lambda name: errors[name])
+
+
+def _start_frame(info: JsonFields, count: int) -> int:
+    start = info.get("start_frame", 0)
+    if not isinstance(start, int) or not 0 <= start < count:
+        raise ReadError(info.path, "start_frame", repr(start), f"a row from 0 to {count - 1}")
+    return start

@@ -1,0 +1,217 @@
+"""TLIO, the golden set: `<id>/imu0_resampled.npy`, and the raw `imu_samples_0.csv` beside it.
+
+Resampled (Liu et al., RA-L 2020; 200 Hz): `imu0_resampled_description.json` names the columns and
+their widths: time [us], gyroscope [rad/s] and specific force [m/s^2], compensated and already
+turned into the world, attitude `qxyzw_World_Device` (`qwxyz_...` in some copies: the name says),
+position [m] and, in most copies, velocity [m/s]. They are turned back into the device's axes by the
+attitude, unless they are in these already, as in copies of other data sets: the attitude tells.
+
+Raw: time [ns], temperature, gyroscope [rad/s], accelerometer [m/s^2] at about 1 kHz. With
+`calibration.json`, and as the authors' filter does, R^-1 x - b: R is the `RectificationMatrix`, b
+the bias's `Offset`. Truth is the resampled pose where that lies beside. `T_Device_Imu` takes the
+IMU's axes to those of the pose; in copies whose pose is that of the IMU itself it would turn them
+away. The gyroscope decides, by the attitude it agrees with.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import checked, rotations, trajectory
+from stario.sequences.readers.published.json_fields import JsonFields, as_array
+from stario.sequences.readers.text import IntArray, read_table, seconds
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+_RESAMPLED, _RAW = "imu0_resampled.npy", "imu_samples_0.csv"
+_DESCRIPTION, _CALIBRATION = "imu0_resampled_description.json", "calibration.json"
+
+_WIDTHS = {
+    "ts_us": 1,
+    "gyr_compensated_rotated_in_World": 3,
+    "acc_compensated_rotated_in_World": 3,
+    "pos_World_Device": 3,
+}
+_VELOCITY = "vel_World"
+_QUATERNIONS = {"qxyzw_World_Device": "xyzw", "qwxyz_World_Device": "wxyz"}
+_COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
+
+
+def read_tlio(path: Path) -> ImuSequence:
+    """Read a recording by its folder (resampled where there is both) or by one of its files.
+
+    Raises:
+        ReadError: a file is missing or malformed, or holds pickled objects.
+    """
+    file = _file(path)
+    if file is None:
+        raise ReadError(path, _RESAMPLED, "no such file", "a TLIO recording")
+    return _read_raw(file) if file.suffix == ".csv" else _read_resampled(file)[1]
+
+
+def is_tlio(path: Path) -> bool:
+    """Whether a path leads to one of the two files."""
+    return _file(path) is not None
+
+
+def _file(path: Path) -> Path | None:
+    if path.is_dir():
+        return next((path / n for n in (_RESAMPLED, _RAW) if (path / n).is_file()), None)
+    return path if path.is_file() and path.name in (_RESAMPLED, _RAW) else None
+
+
+def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
+    """The times as written [us], and the recording in the device's axes."""
+    places = _places(file.with_name(_DESCRIPTION))
+    table = _array(file)
+    width = max(place.stop for place in places.values())
+    if table.ndim != 2 or table.shape[1] < width or not len(table):
+        raise ReadError(file, "array", f"shape {table.shape}", f"(N, {width}) as {_DESCRIPTION}")
+    quat_name = next(name for name in _QUATERNIONS if name in places)
+    checked(file, "array", table[:, :width], first_row=0)
+    order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
+    attitude_WB = rotations(file, quat_name, quat, order, first_row=0)
+    stamps_us = np.rint(table[:, places["ts_us"]][:, 0]).astype(np.int64)
+    time = (table[:, places["ts_us"]][:, 0] - table[0, places["ts_us"]]) * 1e-6
+    gyro = table[:, places["gyr_compensated_rotated_in_World"]]
+    accel = table[:, places["acc_compensated_rotated_in_World"]]
+    if not _in_body_axes(time, gyro, attitude_WB):
+        gyro, accel = (attitude_WB.apply(values, inverse=True) for values in (gyro, accel))
+    velocity_W = table[:, places[_VELOCITY]] if _VELOCITY in places else None
+    sequence = ImuSequence(
+        name=file.resolve().parent.name,
+        time=time,
+        gyro=gyro,
+        accel=accel,
+        truth=trajectory(time, table[:, places["pos_World_Device"]], attitude_WB, velocity_W),
+    )
+    return stamps_us, sequence
+
+
+def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
+    """Whether rates (N, 3) are those of the body's axes, whatever their name says.
+
+    Over a step the attitude turns by R_k^T R_k+1 in the body's axes, R_k+1 R_k^T in the world's.
+    """
+    if len(time) < 2:
+        return False
+    turned = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    steps_B = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
+    steps_W = attitude_WB[:-1].apply(steps_B)
+    return bool(np.abs(turned - steps_B).sum() < np.abs(turned - steps_W).sum())
+
+
+def _array(file: Path) -> FloatArray:
+    try:
+        array = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        pickled = "pickle" in str(error).lower()
+        found = "pickled objects, which may run code" if pickled else " ".join(str(error).split())
+        fix = "save plain numbers" if pickled else "is the download complete?"
+        raise ReadError(file, "array", found, "an npy array of numbers", fix) from None
+    if array.dtype.kind not in "fiu":
+        raise ReadError(file, "array", f"dtype {array.dtype}", "numbers")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _places(description: Path) -> dict[str, slice]:
+    """Where each column stands, from a list such as ["ts_us(1)", ...]; the list's key may vary."""
+    fields = JsonFields(description).fields
+    lists = (x for x in fields.values() if isinstance(x, list) and x)
+    names = next((x for x in lists if all(isinstance(c, str) for c in x)), [])
+    places: dict[str, slice] = {}
+    start = 0
+    for text in names:
+        match = _COLUMN.match(text)
+        if match is None:
+            raise ReadError(description, "columns_name(width)", repr(text), "a name with its width")
+        places[match["name"]] = slice(start, start := start + int(match["width"]))
+    missing = [n for n, w in _WIDTHS.items() if n not in places or _width(places[n]) != w]
+    if not any(n in places and _width(places[n]) == 4 for n in _QUATERNIONS):
+        missing.append("qxyzw_World_Device")
+    if missing:
+        expected = ", ".join(f"{n}({w})" for n, w in (*_WIDTHS.items(), ("qxyzw_World_Device", 4)))
+        raise ReadError(description, "columns_name(width)", f"no {', '.join(missing)}", expected)
+    return places
+
+
+def _width(place: slice) -> int:
+    return int(place.stop - place.start)
+
+
+def _read_raw(file: Path) -> ImuSequence:
+    table = read_table(file, columns=8)
+    stamps = table.stamps_ns()
+    samples = checked(file, "samples", table.values[:, 2:8], table.first_row)
+    calibration = JsonFields(file.with_name(_CALIBRATION))
+    sequence = ImuSequence(
+        name=file.resolve().parent.name,
+        time=seconds(stamps, stamps[0]),
+        gyro=_calibrated(calibration, "Gyroscope", samples[:, :3]),
+        accel=_calibrated(calibration, "Accelerometer", samples[:, 3:]),
+    )
+    resampled = file.with_name(_RESAMPLED)
+    if not resampled.is_file():
+        return sequence
+    stamps_us, posed = _read_resampled(resampled)
+    return replace(
+        sequence, truth=_imu_pose(calibration, sequence, stamps_us, posed, int(stamps[0]))
+    )
+
+
+def _calibrated(calibration: JsonFields, sensor: str, raw: FloatArray) -> FloatArray:
+    name = f"{sensor}.Model.RectificationMatrix"
+    matrix = calibration.array(name, 3, 3)
+    if abs(np.linalg.det(matrix)) < 1e-6:
+        raise ReadError(calibration.path, name, "a singular matrix", "one that can be inverted")
+    bias = calibration.array(f"{sensor}.Bias.Offset", 3)
+    return np.asarray(raw @ np.linalg.inv(matrix).T - bias, dtype=np.float64)
+
+
+def _imu_pose(
+    calibration: JsonFields,
+    sequence: ImuSequence,
+    stamps_us: IntArray,
+    posed: ImuSequence,
+    start_ns: int,
+) -> Trajectory | None:
+    """The IMU's pose on the raw samples' clock, from the device's."""
+    offset = (int(stamps_us[0]) * 1000 - start_ns) * 1e-9
+    time = posed.time + offset
+    R_DI, p_DI = _device_imu(calibration)
+    inside = (time >= sequence.time[0]) & (time <= sequence.time[-1])
+    if posed.truth is None or not inside.any():
+        found = f"times {offset:.3f} s off"
+        raise ReadError(calibration.path.with_name(_RESAMPLED), "ts_us", found, f"those of {_RAW}")
+    rate_I = [np.interp(time[inside], sequence.time, sequence.gyro[:, k]) for k in range(3)]
+    misfit = [
+        float(np.square(R.apply(np.stack(rate_I, axis=1)) - posed.gyro[inside]).mean())
+        for R in (Rotation.identity(), R_DI)
+    ]
+    truth = posed.truth
+    truth = replace(truth, time=truth.time + offset)
+    if misfit[0] <= misfit[1]:
+        return truth
+    return Trajectory(
+        time=truth.time,
+        position_W=truth.position_W + truth.attitude_WB.apply(p_DI),
+        attitude_WB=truth.attitude_WB * R_DI,
+    )
+
+
+def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
+    """R_DI and p_DI [m]; the quaternion is [w, [x, y, z]] or flat, w first; identity if missing."""
+    quat = calibration.get("T_Device_Imu.UnitQuaternion")
+    if quat is None:
+        return Rotation.identity(), np.zeros(3)
+    nested = isinstance(quat, list) and len(quat) == 2 and isinstance(quat[1], list)
+    flat = [quat[0], *quat[1]] if nested else quat
+    name = "T_Device_Imu.UnitQuaternion"
+    quat_wxyz = as_array(calibration.path, name, flat, 4)[None]
+    R_DI = rotations(calibration.path, name, quat_wxyz, first_row=0)[0]
+    return R_DI, calibration.array("T_Device_Imu.Translation", 3)

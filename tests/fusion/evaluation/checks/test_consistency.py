@@ -1,0 +1,100 @@
+"""Monte Carlo: does the filter know how wrong it is?
+
+The average NEES of N runs of an honest filter follows chi-square with 15 N degrees of freedom,
+divided by N.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.checks.consistency import Consistency, analytic_walk, consistency
+from stario.fusion.imu.preintegration import preintegrate
+from stario.sequences.attitude.so3 import exp_so3
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.simulation.imu import PHONE_IMU
+
+# A first speed that is unknown by metres meets a yaw that is unknown by degrees beyond first order.
+CONFIG = NavigatorConfig(noise=ImuNoise(), filter=FilterConfig(velocity_sigma=0.1))
+PHONE = NavigatorConfig(
+    noise=PHONE_IMU.noise,
+    filter=FilterConfig(
+        velocity_sigma=0.1,
+        gyro_bias_sigma=PHONE_IMU.gyro_turn_on,
+        accel_bias_sigma=PHONE_IMU.accel_turn_on,
+    ),
+)
+
+
+def assert_honest(result: Consistency) -> None:
+    low, high = result.nees_bounds
+    assert low < result.nees < high
+    assert low < result.nees_end < high
+    assert 0.5 < result.yaw < 1.7
+    assert 2.5 < result.nis < 3.5
+
+
+def test_nees_of_a_short_walk_is_within_its_bounds() -> None:
+    assert_honest(consistency(CONFIG, runs=12, seconds=40.0))
+
+
+@pytest.mark.slow
+def test_nees_of_five_minutes_is_within_its_bounds() -> None:
+    result = consistency(CONFIG, seconds=300.0)
+    assert 12.7 < result.nees < 17.5
+    assert_honest(result)
+
+
+@pytest.mark.slow
+def test_nees_of_half_an_hour_with_a_phone_is_within_its_bounds() -> None:
+    result = consistency(PHONE, seconds=1800.0)
+    assert 12.7 < result.nees < 17.5
+    assert 0.5 < result.yaw < 1.7
+
+
+def test_the_analytic_walk_is_its_own_dead_reckoning() -> None:
+    walk = analytic_walk(5.0, np.random.default_rng(0), STANDARD_GRAVITY)
+    R, v, p, zero = walk.R_WB[0], walk.velocity_W[0], walk.position_W[0], np.zeros(3)
+    for k in range(0, len(walk.time) - 1, 20):
+        part = slice(k, k + 21)
+        samples = walk.time[part], walk.gyro[part], walk.accel[part]
+        segment = preintegrate(*samples, zero, zero, ImuNoise(), STANDARD_GRAVITY)
+        R, v, p = segment.predict(R, v, p, zero, zero)
+    np.testing.assert_allclose(p, walk.position_W[-1], atol=2e-3)
+    np.testing.assert_allclose(v, walk.velocity_W[-1], atol=2e-3)
+    np.testing.assert_allclose(R, walk.R_WB[-1], atol=1e-3)
+    np.testing.assert_allclose(exp_so3(zero), np.eye(3))
+
+
+def test_runs_come_from_the_seed() -> None:
+    first, again = (consistency(CONFIG, runs=2, seconds=5.0, seed=3) for _ in range(2))
+    assert first == again
+    assert first != consistency(CONFIG, runs=2, seconds=5.0, seed=4)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"update_rate": 1}, {"update_rate": 10, "covariance_scale": 1.0}],
+)
+def test_every_way_of_measuring_knows_how_wrong_it_is(settings: dict[str, Any]) -> None:
+    config = replace(CONFIG, filter=replace(CONFIG.filter, **settings))
+    result = consistency(config, runs=6, seconds=20.0)
+    # Chi-square with 90 degrees of freedom, over six runs: 0.999 of it lies below 22.9.
+    assert 9.0 < result.nees_end < 22.9
+    assert 2.0 < result.nis < 3.6
+
+
+def test_the_report_names_what_is_expected() -> None:
+    lines = consistency(CONFIG, runs=1, seconds=2.0).lines()
+    assert any("expected 15" in line for line in lines)
+
+
+@pytest.mark.parametrize(("runs", "seconds"), [(0, 10.0), (1, 1.5), (1, np.nan)])
+def test_nothing_to_run_is_refused(runs: int, seconds: float) -> None:
+    with pytest.raises(InputError, match="at least 1 run"):
+        consistency(CONFIG, runs=runs, seconds=seconds)

@@ -1,0 +1,94 @@
+"""The table of faults: none raises, none leaves a state that is not finite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stario.fusion.evaluation.checks.faults import (
+    FaultResult,
+    fault_table,
+    matched_walk,
+    run_faults,
+)
+from stario.fusion.evaluation.checks.spoiling import faults
+from stario.sequences.errors import InputError
+
+SECONDS = 20.0
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, FaultResult]:
+    sequence, config = matched_walk(SECONDS, seed=1)
+    return {r.fault: r for r in run_faults(sequence, config, backends=("ekf",))}
+
+
+def test_every_fault_ends_in_finite_states(results: dict[str, FaultResult]) -> None:
+    assert list(results) == [fault.name for fault in faults(SECONDS)]
+    assert all(result.finite for result in results.values())
+    assert results["none"].error_with == results["none"].error_without
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("gap of 3 s", "gap 3.0 s"),
+        ("one NaN in time", "not_finite 1"),
+        ("one NaN in gyro", "not_finite 1"),
+        ("one NaN in accel", "not_finite 1"),
+        ("one NaN from the network", "refused value that is not finite 1"),
+        ("one NaN in the covariance", "refused value that is not finite 1"),
+        ("1 % duplicated, 1 % swapped", "duplicate"),
+        ("three wild timestamps", "future 3"),
+        ("ten spikes", "spike 10"),
+        ("accelerometer clipped", "saturated"),
+    ],
+)
+def test_what_happened_is_reported(results: dict[str, FaultResult], fault: str, words: str) -> None:
+    assert words in results[fault].reported
+
+
+@pytest.mark.parametrize(
+    "fault",
+    ["one NaN in gyro", "5% of samples dropped", "20% of samples dropped", "190 Hz", "500 Hz"],
+)
+def test_small_faults_cost_little(results: dict[str, FaultResult], fault: str) -> None:
+    assert results[fault].error_with < results[fault].error_without + 0.3
+
+
+def test_behind_a_gap_sigma_covers_the_error(results: dict[str, FaultResult]) -> None:
+    after = results["gap of 3 s"]
+    assert after.end_error < 2.0 * after.end_sigma
+    assert after.end_sigma > results["none"].end_sigma
+
+
+def test_the_table_has_a_line_per_fault(results: dict[str, FaultResult]) -> None:
+    lines = fault_table(list(results.values())).splitlines()
+    assert len(lines) == len(results) + 1
+    assert "not_finite 1" in next(line for line in lines if line.startswith("one NaN in gyro"))
+
+
+def test_a_recording_without_truth_is_refused() -> None:
+    sequence, config = matched_walk(3.0)
+    with pytest.raises(InputError, match="truth"):
+        run_faults(sequence.without_truth(), config)
+
+
+def test_faults_are_drawn_from_the_seed() -> None:
+    sequence, _ = matched_walk(5.0)
+    for fault in faults(5.0):
+        if fault.spoil is not None:
+            first, again = (fault.spoil(sequence, np.random.default_rng(3)) for _ in range(2))
+            np.testing.assert_array_equal(first.time, again.time)
+            assert len(first) != len(sequence) or not (
+                np.array_equal(first.time, sequence.time)
+                and np.array_equal(first.gyro, sequence.gyro)
+                and np.array_equal(first.accel, sequence.accel)
+            )
+
+
+def test_five_false_seconds_cost_little_with_either_back_end() -> None:
+    sequence, config = matched_walk(60.0, seed=1)
+    block = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
+    for result in run_faults(sequence, config, only=block):
+        assert result.error_with < result.error_without + 0.3

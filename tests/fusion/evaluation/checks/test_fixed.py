@@ -1,0 +1,40 @@
+"""Tracks with fixes, judged by their truth."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import CONFIG
+
+from stario.fusion.evaluation.checks.fixed import fixed_table, fixed_track, true_fixes
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+
+
+def test_fixes_of_the_truth_hold_a_track_to_it(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    found = fixed_track(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
+    assert found.applied > 0.8
+    assert found.position_rms < 0.3
+    assert found.yaw_covered == 1.0
+    row = fixed_table([found]).splitlines()[1].split()
+    assert row[:2] == ["walks", "1"]
+    assert row[-1] == "100.0%"
+
+
+def test_fixes_err_as_much_as_they_say(walk: ImuSequence) -> None:
+    fixes = true_fixes(walk.truth, 0.05, 0.2, seed=1)
+    at = walk.truth.at(np.array([fix.time for fix in fixes])).position_W
+    error = np.array([fix.value for fix in fixes]) - at
+    assert np.sqrt((error**2).mean()) == pytest.approx(0.2, rel=0.1)
+
+
+def test_without_poses_there_is_nothing_to_judge_by(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="truth"):
+        fixed_track(still_model, replace(walk, truth=None), CONFIG, "walks")
+    with pytest.raises(InputError, match="fixes"):
+        fixed_track(still_model, walk, CONFIG, "walks", every=15.0)

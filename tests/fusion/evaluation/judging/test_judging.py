@@ -1,0 +1,255 @@
+"""Networks alone judged by groups, by a stub that answers the truth, or a known share of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.fusion.evaluation.judging.bootstrap import paired_ratio
+from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
+from stario.fusion.evaluation.judging.judge import Judged, judge, rows_of
+from stario.fusion.evaluation.judging.network_alone import answers
+from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
+from stario.fusion.evaluation.judging.table import Judgement, judgement_text, write_judgement
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.errors import InputError
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+ARCHIVES = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives"
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(9, 75.0), 100.0, PERFECT_IMU, 3, name="walk")
+
+
+def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:
+    truth = walk.truth
+    assert truth is not None
+    position_W = truth.position_W + np.where(truth.time > 40.0, jump, 0.0)[:, None]
+    return replace(walk, truth=None, positions=PositionTrack(truth.time, position_W, "positions"))
+
+
+def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
+    truth = walk.truth
+    assert truth is not None
+    time = np.arange(1.0, 70.0, every)
+    xy = truth.at(time).position_W[:, :2]
+    return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
+
+
+class Stub:
+    """Answers with the true displacements of a recording's windows, scaled and turned, in order."""
+
+    def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
+        [piece] = prepare(walk, Path("walk")).pieces
+        known = piece.position_W
+        steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
+        steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
+        steps = np.pad(steps, (0, piece.stream.window_count - len(steps)), "edge")
+        steps = np.exp(-1j * piece.stream.headings) * steps  # as it is shown them
+        self.displacement_N = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
+        self.given = 0
+
+    def predict(self, windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first, self.given = self.given, self.given + len(windows)
+        covariance = np.broadcast_to(0.01 * np.eye(3), (len(windows), 3, 3))
+        return self.displacement_N[first : self.given], covariance
+
+
+def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
+    prepared = prepare(recording, Path("walk"))
+    return recording_errors(prepared, answers(stub, prepared))
+
+
+def test_of_poses_nine_tenths_of_the_truth_is_told_as_such(walk: ImuSequence) -> None:
+    stub = Stub(walk)
+    size = float(np.sqrt(np.mean(np.sum(stub.displacement_N**2, axis=1))))
+    found = errors_of(walk, Stub(walk, 0.9))
+    assert found.kind == "poses"
+    assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    assert found.figures["rms_1s_m"] == pytest.approx(0.1 * size, rel=0.02)
+    assert found.figures["nis"] == pytest.approx(1.5 * (0.1 * size) ** 2 / 0.01, rel=0.05)
+    assert found.figures["rms_10s_m"] > 4.0 * found.figures["rms_1s_m"]
+    [sums] = [found.blocks["1"].sum(axis=0)]
+    assert np.sqrt(sums[0] / sums[1]) == pytest.approx(found.figures["rms_1s_m"])
+
+
+def test_of_poses_the_truth_has_no_error_and_a_turn_shows_in_displacements_alone(
+    walk: ImuSequence,
+) -> None:
+    exact = errors_of(walk, Stub(walk)).figures
+    assert exact["rms_1s_m"] < 1e-9
+    assert exact["rms_30s_m"] < 0.1  # windows overlap: a track through them is smoother
+    assert exact["ate_fit_m"] < 0.1
+    turned = errors_of(walk, Stub(walk, yaw=0.5)).figures
+    assert turned["ate_fit_m"] == pytest.approx(exact["ate_fit_m"], rel=0.01)
+    assert turned["ate_first_m"] > 10.0 * turned["ate_fit_m"]
+    assert turned["rms_1s_m"] > 0.3
+
+
+def test_of_positions_the_yaw_is_fitted_and_nothing_compared_across_a_jump(
+    walk: ImuSequence,
+) -> None:
+    smooth = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
+    jumped = errors_of(with_positions(walk, jump=9.0), Stub(walk, 0.9, yaw=2.0))
+    for found in (smooth, jumped):
+        assert found.kind == "positions"
+        assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+        assert found.figures["stretch_percent"] < 5.0
+        assert np.isnan(found.figures["ate_fit_m"])
+    assert jumped.figures["rms_10s_m"] == pytest.approx(smooth.figures["rms_10s_m"], rel=0.3)
+    assert jumped.blocks["10"][:, 1].sum() < smooth.blocks["10"][:, 1].sum()
+
+
+def test_of_waypoints_residuals_follow_a_fit_of_yaw_and_position(walk: ImuSequence) -> None:
+    exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
+    short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
+    assert exact.figures["ate_fit_m"] < 0.1
+    assert exact.figures["length_ratio"] == pytest.approx(1.0, abs=0.02)
+    assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    # Scaled about its centre, a track is off by a tenth of the waypoints' spread about theirs.
+    time = np.arange(1.0, 70.0, 8.0)
+    assert walk.truth is not None
+    xy = walk.truth.at(time).position_W[:, :2]
+    spread = float(np.sqrt(np.mean(np.sum((xy - xy.mean(axis=0)) ** 2, axis=1))))
+    assert short.figures["ate_fit_m"] == pytest.approx(0.1 * spread, rel=0.15)
+    [row] = [short.blocks["10"].sum(axis=0)]
+    assert np.sqrt(row[0] / row[1]) == pytest.approx(short.figures["ate_fit_m"])
+
+
+def test_a_recording_without_truth_is_refused(walk: ImuSequence) -> None:
+    with pytest.raises(InputError, match="truth: found none"):
+        prepare(walk.without_truth(), Path("walk"))
+
+
+@pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
+@pytest.mark.parametrize(
+    ("name", "kind", "path_m", "error"),
+    [
+        ("kipd.h5:yk_01", "poses", 127.4, "ate_fit_percent"),
+        ("rocip.h5:r4", "positions", 290.3, "stretch_percent"),
+        ("ilc.h5:site2_F1_5dd35c7527889b0006b76852", "waypoints", 65.2, "ate_fit_percent"),
+    ],
+)
+def test_of_real_recordings_the_steps_come_near_the_truth(
+    name: str, kind: str, path_m: float, error: str
+) -> None:
+    path = Path(f"{ARCHIVES}/{name}")
+    prepared = prepare(read_recording(path), path)
+    found = recording_errors(prepared, answers(PedestrianDeadReckoning(), prepared))
+    assert found.kind == kind
+    assert found.path_m == pytest.approx(path_m, rel=0.05)
+    assert found.figures["length_ratio"] == pytest.approx(1.0, abs=0.3)
+    assert found.figures[error] < 15.0
+
+
+def test_what_was_prepared_is_found_again(walk: ImuSequence, tmp_path: Path) -> None:
+    path = tmp_path / "walk.csv"
+    path.write_text("stands for the recording")
+    read: list[Path] = []
+
+    def reading(path: Path) -> ImuSequence:
+        read.append(path)
+        return with_waypoints(walk)
+
+    first, again = (
+        next(prepared_recordings([path], reading, {}, tmp_path / "cache", 1)) for _ in range(2)
+    )
+    assert len(read) == 1
+    assert isinstance(first, Prepared)
+    assert isinstance(again, Prepared)
+    assert again.kind == "waypoints"
+    np.testing.assert_array_equal(again.pieces[0].waypoint_W, first.pieces[0].waypoint_W)
+    np.testing.assert_array_equal(again.pieces[0].stream.imu_N, first.pieces[0].stream.imu_N)
+    path.write_text("another recording")
+    next(prepared_recordings([path], reading, {}, tmp_path / "cache", 1))
+    assert len(read) == 2
+
+
+def test_the_interval_of_a_ratio_grows_as_groups_differ() -> None:
+    rng = np.random.default_rng(0)
+    theirs = rng.uniform(1.0, 2.0, (6, 4, 5))
+
+    def strata(factor: np.ndarray) -> dict:
+        groups = {
+            f"g{g}": [(factor[g] ** 2 * theirs[g, r], theirs[g, r]) for r in range(4)]
+            for g in range(6)
+        }
+        return {"set": groups}
+
+    alike = paired_ratio(strata(np.full(6, 0.8)))
+    assert alike is not None
+    assert (alike.ratio, alike.low, alike.high) == pytest.approx((0.8, 0.8, 0.8))
+    spread = paired_ratio(strata(np.array([0.5, 0.6, 0.8, 0.8, 1.0, 1.28])))
+    assert spread is not None
+    assert spread.ratio == pytest.approx(0.793, abs=0.01)
+    assert spread.low < 0.72 < 0.9 < spread.high
+    assert paired_ratio({"set": {"g": []}}) is None
+
+
+def test_steps_are_judged_like_a_network(walk: ImuSequence) -> None:
+    found = errors_of(walk, PedestrianDeadReckoning())
+    assert 0.5 < found.figures["length_ratio"] < 1.6
+
+
+def judged_pair(walk: ImuSequence) -> list[Judged]:
+    ours = {"a": 0.95, "b": 0.9}
+    prepared = [
+        replace(prepare(recording, Path(name)), path=Path(name), attributes={"person": person})
+        for name, person, recording in (
+            ("one", "a", walk),
+            ("two", "b", with_waypoints(walk)),
+        )
+    ]
+    scale = {"one": ours["a"], "two": ours["b"]}
+    groups = {Path("one"): "walks a", Path("two"): "walks b"}
+    current = {"walks a": scale["one"], "walks b": scale["two"]}
+    models = {
+        "ours": lambda group: Stub(walk, current[group]),
+        "theirs": lambda group: Stub(walk, 0.8),
+    }
+    judged, skipped = judge([*prepared, Skipped("three", "why")], models, groups)
+    assert [one.item for one in skipped] == ["three"]
+    return judged
+
+
+def test_rows_compare_weights_by_group_and_over_all(walk: ImuSequence) -> None:
+    rows = {row.name: row for row in rows_of(judged_pair(walk), "person", "ours", "theirs")}
+    assert list(rows) == ["a", "b", "all"]
+    assert rows["a"].ratios["rms_1s_m"].ratio == pytest.approx(0.25, rel=0.01)
+    assert rows["b"].ratios["rms_10s_m"].ratio == pytest.approx(0.5, abs=0.05)
+    assert list(rows["b"].ratios) == ["rms_10s_m"]
+    assert rows["all"].ratios["rms_10s_m"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), abs=0.04)
+    assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path: Path) -> None:
+    judged = judged_pair(walk)
+    rows = rows_of(judged, "set", "ours", "theirs")
+    found = Judgement("ours", "theirs", rows, judged)
+    assert "ratio over 10 s" in judgement_text(found)
+    written = write_judgement(tmp_path, found)
+    assert [path.name for path in written] == [
+        "groups.csv",
+        "recordings.csv",
+        "groups.json",
+        "groups.png",
+    ]
+    with (tmp_path / "groups.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [line["weights"] for line in lines] == ["ours", "theirs"]
+    assert float(lines[0]["rms_1s_m_low"]) <= float(lines[0]["rms_1s_m_ratio"])
+    content = json.loads((tmp_path / "groups.json").read_text())
+    assert content["recordings"][1]["truth"] == "waypoints"
+    assert (tmp_path / "groups.png").stat().st_size > 10_000

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences.datasets.convert import convert
+from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_folder
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    """Uneven nanosecond stamps, a truth that starts earlier, has a gap and stamps of its own."""
+    rng = np.random.default_rng(4)
+    sequence = simulate_imu(generate_walk(5, 12.0), 200.0, seed=3, name="walk").slice(2.0, 10.0)
+    truth = sequence.truth
+    assert truth is not None
+    jitter_ns = np.sort(rng.choice(8 * 10**9, len(sequence), replace=False))
+    truth_ns = np.sort(rng.choice(9 * 10**9, len(truth), replace=False)) - 10**9
+    return replace(
+        sequence,
+        time=(jitter_ns - jitter_ns[0]) * 1e-9,
+        truth=replace(truth, time=truth_ns * 1e-9, valid=rng.random(len(truth)) > 0.1),
+    )
+
+
+def nanoseconds(sequence: ImuSequence) -> tuple[np.ndarray, np.ndarray]:
+    assert sequence.truth is not None
+    times = (sequence.time, sequence.truth.time[sequence.truth.valid])
+    return tuple(np.round(t * 1e9).astype(np.int64) for t in times)
+
+
+def assert_same(found: ImuSequence, expected: ImuSequence) -> None:
+    for name in ("gyro", "accel"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for a, b in zip(nanoseconds(found), nanoseconds(expected), strict=True):
+        np.testing.assert_array_equal(a, b)
+    there, here = found.truth, expected.truth
+    assert there is not None
+    assert here is not None
+    np.testing.assert_array_equal(there.position_W, here.position_W[here.valid])
+    np.testing.assert_allclose(there.quat_xyzw, here.quat_xyzw[here.valid], rtol=0, atol=3e-16)
+
+
+@pytest.mark.parametrize("layout", ["csv", "euroc"])
+def test_nothing_is_lost(walk: ImuSequence, tmp_path: Path, layout: str) -> None:
+    gyro = walk.gyro.copy()
+    gyro[17, 1] = np.nan
+    given = replace(walk, gyro=gyro)
+    path = tmp_path / ("walk.csv" if layout == "csv" else "walk")
+    written = convert(given, path)
+    assert all(file.exists() for file in written)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    found = read_recording(path, layout)
+    assert found.name == "walk"
+    assert_same(found, given)
+
+
+def test_there_and_back_are_the_same_bytes(walk: ImuSequence, tmp_path: Path) -> None:
+    convert(walk, tmp_path / "a.csv")
+    convert(read_recording(tmp_path / "a.csv"), tmp_path / "b")
+    convert(read_recording(tmp_path / "b"), tmp_path / "c.csv")
+    convert(read_recording(tmp_path / "c.csv"), tmp_path / "d")
+    first, second = (
+        {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*.csv")}
+        for folder in (tmp_path / "b", tmp_path / "d")
+    )
+    assert (
+        first.keys()
+        == second.keys()
+        == {str(Path("mav0", name, "data.csv")) for name in ("imu0", "state_groundtruth_estimate0")}
+    )
+    imu = str(Path("mav0/imu0/data.csv"))
+    assert first[imu] == second[imu]
+
+
+def test_the_euroc_layout_is_the_one_of_its_authors(walk: ImuSequence, tmp_path: Path) -> None:
+    """Whole nanoseconds without a sign, w first."""
+    imu, truth = (file.read_text().splitlines() for file in convert(walk, tmp_path / "r"))
+    for lines in (imu, truth):
+        assert lines[0].startswith("#timestamp")
+        assert all(line.split(",")[0].isdecimal() for line in lines[1:])
+    assert walk.truth is not None
+    row = [float(cell) for cell in truth[1].split(",")]
+    first = int(np.argmax(walk.truth.valid))
+    np.testing.assert_allclose(row[4:8], walk.truth.quat_xyzw[first, [3, 0, 1, 2]], atol=3e-16)
+
+
+def test_a_known_velocity_is_kept_by_euroc_and_missed_in_csv(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = walk.truth
+    assert truth is not None
+    velocity_W = np.gradient(truth.position_W, truth.time, axis=0)
+    moving = replace(walk, truth=replace(truth, velocity_W=velocity_W))
+    convert(moving, tmp_path / "r")
+    found = read_recording(tmp_path / "r").truth
+    assert found is not None
+    np.testing.assert_array_equal(found.velocity_W, velocity_W[truth.valid])
+    with caplog.at_level(logging.WARNING):
+        convert(moving, tmp_path / "r.csv")
+    assert "velocity has no column" in caplog.text
+
+
+def test_without_truth_there_is_none(walk: ImuSequence, tmp_path: Path) -> None:
+    for path in (tmp_path / "a.csv", tmp_path / "a"):
+        convert(walk.without_truth(), path)
+        assert read_recording(path).truth is None
+
+
+def test_wrong_units_are_not_passed_on(walk: ImuSequence, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--accel-unit g"):
+        convert(replace(walk, accel=walk.accel / STANDARD_GRAVITY), tmp_path / "a.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_second_is_too_short_to_judge_and_is_converted(walk: ImuSequence, tmp_path: Path) -> None:
+    convert(walk.without_truth().slice(0.0, 0.5), tmp_path / "short")
+    assert read_recording(tmp_path / "short").duration < 0.5
+
+
+def test_what_cannot_be_written_is_said(walk: ImuSequence, tmp_path: Path) -> None:
+    time = walk.time.copy()
+    time[3] = np.nan
+    with pytest.raises(InputError, match=r"time of sample 3: found nan.*convert to csv"):
+        convert(replace(walk.without_truth(), time=time), tmp_path / "r")
+    with pytest.raises(InputError, match="layout: found 'bag', expected one of csv, euroc"):
+        convert(walk, tmp_path / "r", "bag")
+    with pytest.raises(InputError, match="existing folder"):
+        convert(walk, tmp_path / "no" / "r")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/file").touch()
+    with pytest.raises(InputError, match="exists"):
+        convert(walk, tmp_path / "full")
+    assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    def fail(folder: Path) -> None:
+        (folder / "half").touch()
+        assert not (tmp_path / "whole").exists()
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "whole") as folder:
+        fail(folder)
+    assert not list(tmp_path.iterdir())
+
+
+def test_truth_alone_before_the_imu_keeps_the_offset(tmp_path: Path) -> None:
+    """Stamps have no sign: both files move together."""
+    sequence = simulate_imu(generate_walk(5, 6.0), 100.0, name="w")
+    truth = sequence.truth
+    assert truth is not None
+    early = replace(sequence, truth=replace(truth, time=truth.time - 2.5))
+    convert(early, tmp_path / "w")
+    found = read_recording(tmp_path / "w").truth
+    assert isinstance(found, Trajectory)
+    np.testing.assert_allclose(found.time, truth.time - 2.5, atol=1e-9)

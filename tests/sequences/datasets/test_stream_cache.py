@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences import stream_cache
+from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.stream_cache import cache_folder, cached, recorded, recording_files
+from stario.sequences.readers import find_recordings, read_recording, write_csv
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.windows import WorldStream, world_streams
+
+WALK = simulate_imu(generate_walk(6, 9.0), 100.0, seed=4, name="walk")
+
+
+class Reader:
+    """Reads, and counts how often."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, path: Path) -> ImuSequence:
+        self.calls += 1
+        return read_recording(path)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A walk whose truth has a hole, so that it makes two streams."""
+    truth = WALK.truth
+    assert truth is not None
+    hole = (truth.time > 4.0) & (truth.time < 4.5)
+    path = tmp_path / "walk.csv"
+    write_csv(path, replace(WALK, truth=replace(truth, valid=~hole)))
+    return path
+
+
+def one(path: Path, folder: Path, read: Reader, **options: object) -> list[WorldStream]:
+    (streams,) = recorded([path], read, options, folder)
+    assert not isinstance(streams, Skipped)
+    return streams
+
+
+def assert_equal(found: list[WorldStream], expected: list[WorldStream]) -> None:
+    assert [s.name for s in found] == [s.name for s in expected]
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a.imu_W, b.imu_W)
+        np.testing.assert_array_equal(a.position_W, b.position_W)
+        assert a.imu_W.dtype == a.position_W.dtype == np.float32
+
+
+def is_mapped(array: np.ndarray) -> bool:
+    base: object = array
+    while isinstance(base, np.ndarray) and not isinstance(base, np.memmap):
+        base = base.base
+    return isinstance(base, np.memmap)
+
+
+def test_streams_from_the_cache_are_those_that_are_built(recording: Path, tmp_path: Path) -> None:
+    read = Reader()
+    expected = world_streams(read_recording(recording))
+    assert len(expected) == 2
+    for _ in range(3):
+        found = one(recording, tmp_path / "cache", read)
+        assert_equal(found, expected)
+        assert all(is_mapped(s.imu_W) and is_mapped(s.position_W) for s in found)
+    assert read.calls == 1
+
+
+def test_another_content_option_or_code_is_another_key(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, folder = Reader(), tmp_path / "cache"
+    one(recording, folder, read)
+    one(recording, folder, read, axes="y,-x,z")
+    assert read.calls == 2
+    one(recording, folder, read)
+    assert read.calls == 2
+    write_csv(recording, WALK.slice(0.0, 5.0))
+    assert len(one(recording, folder, read)) == 1
+    assert read.calls == 3
+    os.utime(recording, ns=(0, 0))
+    one(recording, folder, read)
+    assert read.calls == 4
+    monkeypatch.setattr(stream_cache, "_code", lambda: "later")
+    one(recording, folder, read)
+    assert read.calls == 5
+
+
+@pytest.mark.parametrize("damage", ["cut", "header", "empty", "noise", "longer"])
+def test_a_file_that_is_not_whole_is_built_anew(
+    recording: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    read, folder = Reader(), tmp_path / "cache"
+    expected = world_streams(read_recording(recording))
+    one(recording, folder, read)
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    broken = {
+        "cut": whole[: len(whole) // 2],
+        "header": whole[:20],
+        "empty": b"",
+        "noise": b"\xff" * 1000,
+        "longer": whole + b"\0",
+    }[damage]
+    file.write_bytes(broken)
+    assert_equal(one(recording, folder, read), expected)
+    assert read.calls == 2
+    assert "not whole" in caplog.text
+    assert file.read_bytes() == whole
+
+
+def test_writers_at_once_do_not_harm_each_other(recording: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    expected = world_streams(read_recording(recording))
+    with ThreadPoolExecutor(8) as pool:
+        calls = [pool.submit(one, recording, folder, Reader()) for _ in range(16)]
+        for call in calls:
+            assert_equal(call.result(), expected)
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
+def test_a_killed_writer_leaves_nothing_that_is_read(recording: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "cache"
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from stario.sequences.readers import read_recording\n"
+        "from stario.sequences.datasets.stream_cache import recorded\n"
+        "os.fsync = lambda file: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "list(recorded([Path(sys.argv[1])], read_recording, {}, Path(sys.argv[2])))\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, recording, folder])
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = folder.iterdir()
+    assert left.name.endswith(".tmp")
+    read = Reader()
+    assert_equal(one(recording, folder, read), world_streams(read_recording(recording)))
+    assert read.calls == 1
+    # What is left is swept away by the next writer, once it is surely abandoned.
+    os.utime(left, (0, 0))
+    (whole,) = (p for p in folder.iterdir() if p != left)
+    whole.unlink()
+    one(recording, folder, read)
+    assert [p.name for p in folder.iterdir()] == [whole.name]
+
+
+def test_without_a_folder_to_write_to_it_works_from_memory(
+    recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    streams = one(recording, tmp_path / "file" / "cache", Reader())
+    assert_equal(streams, world_streams(read_recording(recording)))
+    assert "not kept" in caplog.text
+
+
+def test_processes_hand_over_files(recording: Path, tmp_path: Path) -> None:
+    paths = [recording, tmp_path / "missing.csv", recording]
+    first, missing, second = recorded(paths, read_recording, {}, tmp_path / "cache", jobs=2)
+    assert isinstance(missing, Skipped)
+    assert "missing.csv" in missing.reason
+    for streams in (first, second):
+        assert not isinstance(streams, Skipped)
+        assert all(is_mapped(s.imu_W) for s in streams)
+
+
+def test_what_cannot_be_learned_from_is_skipped(tmp_path: Path) -> None:
+    truth = WALK.truth
+    assert truth is not None
+    wrong = {
+        "blind": WALK.without_truth(),
+        "degrees": replace(WALK, gyro=np.degrees(WALK.gyro)),
+        "short": replace(WALK, truth=truth.slice(1.0, 2.5)),
+        "sparse": replace(WALK, truth=truth.at(truth.time[::20])),
+    }
+    for name, sequence in wrong.items():
+        write_csv(tmp_path / f"{name}.csv", sequence)
+    paths = [tmp_path / f"{name}.csv" for name in wrong]
+    outcomes = list(recorded(paths, read_recording, {}, tmp_path / "cache"))
+    reasons = [outcome.reason for outcome in outcomes if isinstance(outcome, Skipped)]
+    told = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz, at least 10 Hz are needed")
+    for reason, words in zip(reasons, told, strict=True):
+        assert words in reason
+
+
+def test_what_is_built_is_kept_by_its_key(tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def build() -> list[WorldStream]:
+        calls.append(1)
+        return world_streams(WALK)
+
+    for seed in (1, 2, 1):
+        assert_equal(cached({"seed": seed}, build, tmp_path), world_streams(WALK))
+    assert len(calls) == 2
+    assert cached({"seed": 3}, list, tmp_path) == []
+
+
+def test_the_files_of_a_recording(tmp_path: Path) -> None:
+    """A neighbour that is not read must not make a recording be built anew, its truth must."""
+    mav = tmp_path / "room" / "mav0"
+    for name in ("imu0", "mocap0"):
+        (mav / name).mkdir(parents=True)
+        (mav / name / "data.csv").write_text("0,0,0,0,0,0,9.8\n")
+    both = [mav / "imu0/data.csv", mav / "mocap0/data.csv"]
+    for path in (tmp_path / "room", mav, mav / "imu0/data.csv"):
+        assert recording_files(path) == both
+    syn = tmp_path / "data1" / "syn"
+    syn.mkdir(parents=True)
+    row = ",".join(["0"] * 7 + ["0", "0", "1"] + ["0"] * 6)
+    for name in ("imu1", "vi1", "imu2", "vi2"):
+        (syn / f"{name}.csv").write_text(row + "\n")
+    assert recording_files(syn / "imu2.csv") == [syn / "imu2.csv", syn / "vi2.csv"]
+    raw, tango = tmp_path / "floor1" / "raw", tmp_path / "floor1" / "tango"
+    for folder, name in ((raw, "imu1"), (tango, "tango1"), (tango, "tango2")):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.csv").write_text(row + "\n")
+    assert recording_files(raw / "imu1.csv") == [raw / "imu1.csv", tango / "tango1.csv"]
+    for name in ("a", "b"):
+        write_csv(tmp_path / f"{name}.csv", WALK)
+    assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]
+
+
+def test_a_recording_of_an_archive_is_kept_by_its_name(tmp_path: Path) -> None:
+    archive, read = tmp_path / "walks.h5", Reader()
+    write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
+    whole, part = find_recordings(archive)
+    for _ in range(2):
+        for path in (whole, part):
+            (stream,) = one(path, tmp_path / "cache", read)
+            assert is_mapped(stream.imu_W)
+    assert read.calls == 2
+    write_archive(archive, [WALK.slice(0.0, 6.0)])
+    one(whole, tmp_path / "cache", read)
+    assert read.calls == 3
+
+
+def test_the_folder_is_the_users_choice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    monkeypatch.delenv("STARIO_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "stario"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder() == Path.home() / ".cache" / "stario"

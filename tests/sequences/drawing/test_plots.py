@@ -1,0 +1,184 @@
+"""Figures fit the good tracks, break at gaps, say what they cut, and touch no global state."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.drawing.figures import save_figure
+from stario.sequences.drawing.plots import (
+    error_over_time,
+    imu_overview,
+    innovations,
+    plan_view,
+)
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence, Trajectory
+
+
+@pytest.fixture
+def truth() -> Trajectory:
+    t = np.arange(0.0, 60.0, 0.05)
+    position = np.stack([10 * np.sin(0.1 * t), 6 * np.cos(0.13 * t), 0 * t], axis=1)
+    return Trajectory(t, position, Rotation.identity(len(t)))
+
+
+def off_by(track: Trajectory, growth: float, power: int = 1) -> Trajectory:
+    error = growth * track.time**power
+    return replace(track, position_W=track.position_W + np.outer(error, [1.0, 0.5, 0.1]))
+
+
+@pytest.fixture
+def tracks(truth: Trajectory) -> dict[str, Trajectory]:
+    sigma = 0.02 * truth.time + 0.01
+    covariance = np.einsum("n,ij->nij", sigma**2, np.eye(3))
+    return {
+        "inertial": off_by(truth, 0.5, power=2),
+        "network": off_by(truth, 0.03),
+        "ekf": replace(off_by(truth, 0.01), position_covariance_W=covariance),
+    }
+
+
+def labels(holder) -> list[str]:
+    return [text.get_text() for text in holder.get_texts()]
+
+
+def line(axes, label: str):
+    return next(item for item in axes.get_lines() if item.get_label().startswith(label))
+
+
+def test_plan_view_fits_the_truth_and_says_who_leaves(truth, tracks):
+    fig = plan_view(tracks, truth, "a walk")
+    (axes,) = fig.axes
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0  # the inertial track runs to 1.8 km
+    assert axes.get_aspect() == 1.0
+    legend = labels(fig.legends[0])
+    assert legend[:2] == ["truth", "inertial (leaves the figure, by 1.8 km)"]
+    assert legend[2:] == ["network", "EKF", "start", "end"]
+    for track in (truth, tracks["network"], tracks["ekf"]):
+        assert (track.position_W[:, 0] < axes.get_xlim()[1]).all()
+        assert (track.position_W[:, 1] > axes.get_ylim()[0]).all()
+
+
+def test_plan_view_without_truth_is_not_stretched_by_a_runaway(tracks):
+    (axes,) = plan_view(tracks, None, "a walk").axes
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0
+
+
+def test_colours_are_those_of_the_name_whatever_is_drawn_beside(truth, tracks):
+    (all_axes,) = plan_view(tracks, truth, "").axes
+    (one_axes,) = plan_view({"ekf": tracks["ekf"]}, truth, "").axes
+    assert line(all_axes, "EKF").get_color() == line(one_axes, "EKF").get_color()
+    assert line(all_axes, "truth").get_color() == "black"
+    colours = {line(all_axes, name).get_color() for name in ("inertial", "network", "EKF")}
+    assert len(colours) == 3
+
+
+@pytest.mark.parametrize("kind", ["marked", "missing"])
+def test_gaps_of_the_truth_are_breaks(truth, kind):
+    keep = (truth.time < 20.0) | (truth.time > 34.0)
+    if kind == "marked":
+        cut = replace(truth, valid=keep)
+    else:
+        cut = Trajectory(truth.time[keep], truth.position_W[keep], truth.attitude_WB[keep])
+    (axes,) = plan_view({}, cut, "").axes
+    x = np.asarray(line(axes, "truth").get_xdata())
+    assert np.isnan(x).sum() == 1
+    assert np.isnan(x[np.searchsorted(truth.time, 20.0)])
+    errors = error_over_time({"network": off_by(truth, 0.03)}, cut).axes[0]
+    assert np.isnan(np.asarray(line(errors, "network").get_ydata())).sum() == 1
+
+
+def test_error_panels_show_the_error_and_three_sigma(truth, tracks):
+    fig = error_over_time(tracks, truth)
+    top, in_x, *_ = fig.axes
+    np.testing.assert_allclose(
+        line(top, "network").get_ydata(), 0.03 * truth.time * np.hypot(1, 0.5), atol=1e-9
+    )
+    assert top.get_ylim()[1] < 5.0
+    assert "inertial (leaves the figure, up to 2.0 km)" in labels(top.get_legend())
+    # Per axis only the track that states a covariance, within a band of three sigma.
+    assert labels(in_x.get_legend()) == ["EKF", "EKF, 3 sigma"]
+    (band,) = in_x.collections
+    edge = np.abs(band.get_paths()[0].vertices[:, 1]).max()
+    assert edge == pytest.approx(3 * (0.02 * truth.time[-1] + 0.01))
+
+
+def test_errors_without_any_covariance_are_drawn_per_axis_too(truth, tracks):
+    in_x = error_over_time({"network": tracks["network"]}, truth).axes[1]
+    np.testing.assert_allclose(line(in_x, "network").get_ydata(), 0.03 * truth.time, atol=1e-9)
+    assert len(in_x.collections) == 0
+
+
+def test_innovations_mark_what_was_gated_and_keep_it_in_the_frame():
+    rng = np.random.default_rng(2)
+    time, residual = np.arange(0.0, 30.0, 0.2), rng.normal(0, 0.1, (150, 3))
+    residual[40] = 50.0
+    nis, gated = (residual**2).sum(axis=1) / 0.01, np.arange(150) == 40
+    fig = innovations(time, residual, np.full((150, 3), 0.1), nis, 3, gated)
+    for axes in fig.axes[:3]:
+        low, high = axes.get_ylim()
+        assert high < 1.0
+        crosses = line(axes, "gated")
+        assert list(crosses.get_xdata()) == [8.0]
+        assert low <= crosses.get_ydata()[0] <= high
+    assert "0.7 % gated" in fig.axes[3].get_title(loc="left")
+    assert line(fig.axes[3], "expected 3").get_ydata()[0] == 3
+
+
+def test_imu_overview_survives_the_samples_that_readers_keep(truth):
+    rng = np.random.default_rng(4)
+    n = 20_000
+    time = np.arange(n) / 200.0
+    gyro, accel = rng.normal(0, 0.1, (n, 3)), rng.normal([0, 0, 9.8], 0.5, (n, 3))
+    gyro[100] = np.nan
+    time[5000], time[7000] = time[4000], time[6999]  # out of order, repeated
+    gyro[12345, 1] = 30.0
+    fig = imu_overview(ImuSequence("walk", time, gyro, accel, truth))
+    assert len(fig.axes) == 3
+    tallest = max(
+        path.vertices[:, 1].max() for band in fig.axes[0].collections for path in band.get_paths()
+    )
+    assert tallest == 30.0  # a single spike outlives the thinning
+    assert len(imu_overview(ImuSequence("walk", time[:50], gyro[:50], accel[:50])).axes) == 2
+
+
+def test_figures_are_saved_whole_as_png(truth, tracks, tmp_path):
+    path = tmp_path / "plan.png"
+    save_figure(plan_view(tracks, truth, "a walk"), path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert path.stat().st_size > 10_000
+    assert [item.name for item in tmp_path.iterdir()] == ["plan.png"]
+
+
+def test_what_cannot_be_drawn_is_refused(truth):
+    nowhere = replace(truth, valid=np.zeros(len(truth), dtype=bool))
+    with pytest.raises(InputError, match="no valid pose"):
+        plan_view({"ekf": nowhere}, None, "")
+    with pytest.raises(InputError, match="at least one track"):
+        error_over_time({}, truth)
+    with pytest.raises(InputError, match=r"sigma: found shape \(4,\)"):
+        innovations(np.arange(4.0), np.ones((4, 3)), np.ones(4), np.ones(4), 3, np.zeros(4))
+    empty = np.full((3, 3), np.nan)
+    with pytest.raises(InputError, match="no finite sample"):
+        imu_overview(ImuSequence("empty", np.arange(3.0), empty, empty))
+
+
+def test_matplotlib_is_imported_late_and_pyplot_never():
+    code = """
+import sys
+import numpy as np
+from stario.sequences import ImuSequence
+from stario.sequences.drawing.plots import imu_overview
+assert "matplotlib" not in sys.modules
+ones = np.ones((9, 3))
+imu_overview(ImuSequence("x", np.arange(9.0), ones, ones)).canvas.draw()
+assert "matplotlib.figure" in sys.modules
+assert "matplotlib.pyplot" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

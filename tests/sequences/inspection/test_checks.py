@@ -1,0 +1,206 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.conventions import with_axes, with_conventions
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.checks import check_units
+from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.units import with_units
+
+DATA = Path(
+    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+)
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(4, 30.0, style=WalkStyle()), rate=200.0)
+
+
+def in_degrees(sequence: ImuSequence) -> ImuSequence:
+    return replace(sequence, gyro=np.degrees(sequence.gyro))
+
+
+def without_gravity(sequence: ImuSequence) -> ImuSequence:
+    assert sequence.truth is not None
+    return replace(sequence, accel=sequence.accel - sequence.truth.attitude_WB.apply(UP, True))
+
+
+def refused(sequence: ImuSequence) -> str:
+    with pytest.raises(InputError) as caught:
+        check_units(sequence)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(sequence.name)
+    return text
+
+
+@pytest.mark.parametrize("carry", CARRYING_MODES)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
+    """Swinging arms and pockets turn fast and press the device outward: still rad/s and m/s^2."""
+    style = WalkStyle(carry=carry, preferred_speed=1.4, vigor=1.5)
+    walk = simulate_imu(generate_walk(seed, 30.0, style=style), 100.0, PHONE_IMU, seed)
+    check_units(walk)
+    check_units(walk.without_truth())
+    assert "--gyro-unit deg/s" in refused(in_degrees(walk).without_truth())
+    assert "--accel-unit g" in refused(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
+    assert "--gravity removed" in refused(without_gravity(walk))
+    check_units(with_conventions(without_gravity(walk), gravity="removed"))
+    assert "record the raw accelerometer" in refused(without_gravity(walk).without_truth())
+
+
+def test_a_device_shaken_harder_than_it_weighs_passes_and_its_motion_alone_does_not() -> None:
+    """Its samples are of 14 m/s^2 in the median, their average is gravity all the same."""
+    shaken = simulate_imu(generate_walk(19, 10.0), 200.0, PHONE_IMU, 19)
+    assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 14.0
+    check_units(shaken)
+    assert "--gravity removed" in refused(without_gravity(shaken))
+
+
+def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
+    """In deg/s even a bias of 0.01 rad/s turns gravity away within seconds."""
+    t = np.arange(2001) / 100.0
+    rest = Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
+    still = simulate_imu(rest, 100.0, PHONE_IMU).without_truth()
+    biased = replace(still, gyro=still.gyro + np.array([0.01, -0.004, 0.002]))
+    check_units(still)
+    check_units(biased)
+    assert "accelerometer does not see" in refused(in_degrees(biased))
+    assert "record the raw accelerometer" in refused(replace(still, accel=still.accel - UP))
+
+
+def test_both_wrong_are_told_one_after_the_other(walk: ImuSequence) -> None:
+    both = in_degrees(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
+    assert "--gyro-unit deg/s" in refused(both)
+    half = with_units(both, gyro_unit="deg/s")
+    assert "--accel-unit g" in refused(half)
+    check_units(with_units(half, accel_unit="g"))
+
+
+def test_force_in_a_unit_nobody_knows_is_refused(walk: ImuSequence) -> None:
+    for factor in (1000.0 / STANDARD_GRAVITY, 100.0, 0.5, STANDARD_GRAVITY):
+        assert "accelerometer" in refused(replace(walk, accel=factor * walk.accel))
+    assert "accelerometer" in refused(replace(walk, accel=0.0 * walk.accel))
+
+
+def test_a_turned_sign_is_seen_in_a_true_attitude_only(walk: ImuSequence) -> None:
+    apple = replace(walk, accel=-walk.accel)
+    assert "--accel-unit=-m/s^2" in refused(apple)
+    check_units(with_units(apple, accel_unit="-m/s^2"))
+    check_units(apple.without_truth())
+
+
+def test_a_truth_with_its_quaternion_in_another_order_is_refused(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    shuffled = Rotation.from_quat(walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
+    text = refused(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
+    assert "x y z w" in text
+
+
+def test_axes_that_are_not_the_truths_are_named(walk: ImuSequence) -> None:
+    """Also where gravity points exactly down, which a wrong sign would explain as well."""
+    for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
+        turned = with_axes(walk, axes)
+        assert f"--axes={undone}" in refused(turned)
+        check_units(with_axes(turned, undone))
+        check_units(turned.without_truth())
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_time_in_another_unit_is_named(walk: ImuSequence, unit: str) -> None:
+    factor = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+    alone = walk.without_truth()
+    assert f"`t [{unit}]`" in refused(replace(alone, time=factor * alone.time))
+    assert "`t [s]`" in refused(replace(alone, time=alone.time / factor))
+
+
+def test_a_rate_out_of_range_is_told(walk: ImuSequence) -> None:
+    slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
+    assert "found 10 samples/s, expected 50 to 1000" in refused(slow)
+
+
+def test_too_short_and_empty_of_numbers(walk: ImuSequence) -> None:
+    assert "duration" in refused(walk.without_truth().slice(0.0, 1.2))
+    check_units(walk.without_truth().slice(0.0, 1.6))
+    one = ImuSequence("one", walk.time[:1], walk.gyro[:1], walk.accel[:1])
+    assert "samples: found 1" in refused(one)
+    for field in ("time", "gyro", "accel"):
+        void = replace(walk.without_truth(), **{field: np.nan * getattr(walk, field)})
+        assert f"{field}: found no finite sample" in refused(void)
+    never = ImuSequence("never", walk.time, walk.gyro.copy(), walk.accel.copy())
+    never.gyro[::2], never.accel[1::2] = np.nan, np.nan
+    assert "usable" in refused(never)
+
+
+def test_bad_samples_do_not_disturb_the_check(walk: ImuSequence) -> None:
+    rng = np.random.default_rng(0)
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    gyro[rng.integers(0, len(gyro), 200)] = np.nan
+    accel[rng.integers(0, len(gyro), 200), 1] = np.inf
+    time[500], time[700] = time[499], time[600]
+    keep = rng.random(len(time)) > 0.2
+    dirty = ImuSequence("dirty", time[keep], gyro[keep], accel[keep])
+    check_units(dirty)
+    assert "--gyro-unit" in refused(in_degrees(dirty))
+
+
+@pytest.mark.parametrize(("period", "lost"), [(4.0, 1.0), (3.0, 0.5), (4.0, 0.3), (30.0, 20.0)])
+@pytest.mark.parametrize("carry", ["swinging", "rig", "pocket"])
+def test_gaps_are_not_taken_for_wrong_units(carry: str, period: float, lost: float) -> None:
+    """The device turns within them and nobody sees it; the stretches between tell the units."""
+    style = WalkStyle(carry=carry)
+    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
+    kept = walk.time % period > lost
+    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept])
+    check_units(holed)
+    assert "--gyro-unit deg/s" in refused(in_degrees(holed))
+
+
+def test_stretches_too_short_to_tell_are_not_asked() -> None:
+    style = WalkStyle(carry="pocket")
+    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2)
+    kept = walk.time % 0.9 > 0.6
+    check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
+
+
+def test_units_by_name(walk: ImuSequence) -> None:
+    assert np.array_equal(with_units(walk).gyro, walk.gyro)
+    assert np.allclose(with_units(in_degrees(walk), "deg/s").gyro, walk.gyro)
+    assert np.allclose(with_units(walk, accel_unit="g").accel, STANDARD_GRAVITY * walk.accel)
+    assert with_units(walk).truth is walk.truth
+    with pytest.raises(InputError, match="gyro_unit: found 'rpm', expected one of rad/s, deg/s"):
+        with_units(walk, gyro_unit="rpm")
+    with pytest.raises(InputError, match="accel_unit: found 'mg'"):
+        with_units(walk, accel_unit="mg")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
+def test_recordings_pass_and_their_units_are_told() -> None:
+    paths = [path for name in ("euroc", "oxiod", "tumvi") for path in find_recordings(DATA / name)]
+    for path in paths[::3]:
+        recording = read_recording(path)
+        check_units(recording)
+        assert "--gyro-unit deg/s" in refused(in_degrees(recording))
+        alone = recording.without_truth()
+        in_g = replace(alone, accel=alone.accel / STANDARD_GRAVITY)
+        assert "--accel-unit g" in refused(in_g)
+        assert "points down" in refused(replace(recording, accel=-recording.accel))
+
+
+def test_a_clock_among_the_values_is_no_sensor() -> None:
+    walk = simulate_imu(generate_walk(3, 5.0), 100.0)
+    clock = 1.7e18 + 1e7 * np.arange(len(walk))
+    for name in ("gyro", "accel"):
+        values = np.column_stack([clock, np.ones((len(walk), 2))])
+        with pytest.raises(InputError, match=f"{name}: found 1.7e.18 on average, expected what"):
+            check_units(replace(walk, **{name: values}))

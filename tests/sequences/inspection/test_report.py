@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.conventions import with_axes
+from stario.sequences.drawing.plots import imu_overview
+from stario.sequences.errors import InputError
+from stario.sequences.files import json_text
+from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+DATA = Path(
+    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
+)
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(8, 30.0, style=WalkStyle()), 100.0, seed=2, name="walk")
+
+
+def truth_of(sequence: ImuSequence) -> Trajectory:
+    assert sequence.truth is not None
+    return sequence.truth
+
+
+def problem(sequence: ImuSequence) -> str:
+    (text,) = inspect_recording(sequence).problems
+    assert text in "\n".join(inspect_recording(sequence).lines())
+    return text
+
+
+def test_nothing_is_wrong_with_a_good_recording(walk: ImuSequence) -> None:
+    found = inspect_recording(walk)
+    assert found.problems == ()
+    assert "nothing wrong" in found.lines()[-1]
+    assert found.timing.samples == len(walk)
+    assert found.timing.rate_hz == pytest.approx(100.0)
+    assert found.timing.gaps == ()
+    assert found.accel_norm == pytest.approx(STANDARD_GRAVITY, abs=0.5)
+    assert found.coverage is not None
+    assert found.coverage.share > 0.99
+    assert found.coverage.path_m == pytest.approx(truth_of(walk).path_length())
+
+
+def test_gaps_and_times_are_counted(walk: ImuSequence) -> None:
+    keep = np.ones(len(walk), dtype=bool)
+    keep[500:750] = keep[1200:1203] = False
+    time = walk.time.copy()
+    time[100], time[200] = time[99], time[190]
+    accel = walk.accel.copy()
+    accel[300, 1] = np.nan
+    timing = inspect_recording(
+        ImuSequence("dirty", time[keep], walk.gyro[keep], accel[keep])
+    ).timing
+    lengths = {round(start, 2): round(length, 2) for start, length in timing.gaps}
+    assert lengths[4.99] == 2.51
+    assert lengths[11.99] == 0.04
+    assert timing.repeated == 1
+    assert timing.backward == 1
+    assert timing.not_finite == 1
+    # The two samples with wrong times leave a hole where they should have been.
+    assert timing.lost >= 250 + 3
+    assert timing.jitter_s < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("spoil", "option"),
+    [
+        (lambda s: replace(s, gyro=np.degrees(s.gyro), truth=None), "--gyro-unit deg/s"),
+        (lambda s: replace(s, accel=s.accel / STANDARD_GRAVITY), "--accel-unit g"),
+        (lambda s: replace(s, accel=-s.accel), "--accel-unit=-m/s^2"),
+        (lambda s: with_axes(s, "y,-x,z"), "--axes=-y,x,z"),
+        (lambda s: with_axes(s, "y,z,x"), "--axes=z,x,y"),
+        (
+            lambda s: replace(
+                s,
+                accel=s.accel - s.truth.at(s.time).attitude_WB.apply([0, 0, STANDARD_GRAVITY], 1),
+            ),
+            "--gravity removed",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named_with_the_option_that_mends_it(walk, spoil, option) -> None:
+    assert option in problem(spoil(walk))
+
+
+def test_a_truth_on_another_clock_is_named_with_the_offset(walk: ImuSequence) -> None:
+    late = replace(walk, truth=replace(truth_of(walk), time=truth_of(walk).time - 0.25))
+    assert "add +0.25" in problem(late)
+
+
+def test_a_truth_too_slow_to_compare_is_named_as_that(walk: ImuSequence) -> None:
+    """Nothing is known of its attitude between two poses: no clock and no axes are to be blamed."""
+    truth = walk.truth
+    assert truth is not None
+    found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
+    (problem,) = found.problems
+    assert "5 Hz, at least 10 Hz" in problem
+    assert found.fit is None
+
+
+def test_a_truth_of_another_body_is_named_in_degrees(walk: ImuSequence) -> None:
+    truth = truth_of(walk)
+    # About the vertical of a device held level, so that gravity says nothing.
+    turned = truth.attitude_WB * Rotation.from_rotvec([0.0, 0.0, 0.6])
+    text = problem(replace(walk, truth=replace(truth, attitude_WB=turned)))
+    assert "34." in text
+    assert "no option mends" in text
+
+
+def test_rest_is_reported(walk: ImuSequence) -> None:
+    assert any("at rest: never" in line for line in inspect_recording(walk).lines())
+    rng = np.random.default_rng(0)
+    time = np.arange(500) / 100.0
+    gyro, accel = 0.003 * rng.normal(size=(500, 3)), 0.02 * rng.normal(size=(500, 3))
+    accel[:, 2] += STANDARD_GRAVITY
+    found = inspect_recording(ImuSequence("r", time, gyro, accel))
+    assert found.rest is not None
+    assert any("at rest: 5.0 s in 1 stretches" in line for line in found.lines())
+    assert "truth: none" in found.lines()
+
+
+def test_findings_are_plain_values(walk: ImuSequence) -> None:
+    content = json.loads(json_text(inspect_recording(walk).as_dict()))
+    assert content["truth"]["coverage"] > 0.99
+    assert abs(content["truth_against_gyroscope"]["time_offset_s"]) < 0.005
+    assert len(content["truth_against_gyroscope"]["misalignment_rotvec_rad"]) == 3
+    bare = json.loads(json_text(inspect_recording(walk.without_truth()).as_dict()))
+    assert bare["truth"] is None
+    assert bare["truth_against_gyroscope"] is None
+
+
+def test_poor_recordings_are_described_not_refused(walk: ImuSequence) -> None:
+    for poor in (
+        walk.slice(0.0, 0.5),
+        walk.slice(0.0, 5.0),
+        ImuSequence("one", walk.time[:1], walk.gyro[:1], walk.accel[:1]),
+        ImuSequence("slow", walk.time[::10], walk.gyro[::10], walk.accel[::10]),
+        replace(walk, truth=replace(truth_of(walk), time=truth_of(walk).time + 1000.0)),
+    ):
+        found = inspect_recording(poor)
+        assert found.lines()
+        json_text(found.as_dict())
+    with pytest.raises(InputError, match="none that is finite"):
+        inspect_recording(replace(walk, gyro=np.nan * walk.gyro))
+
+
+def test_the_figure_shows_rest_gaps_and_the_truths_rotation(walk: ImuSequence) -> None:
+    fit = inspect_recording(walk).fit
+    assert fit is not None
+    figure = imu_overview(walk, (fit.times, fit.speed), rest=[(1.0, 2.0)], gaps=[(5.0, 6.0)])
+    labels = {
+        text.get_text()
+        for axes in figure.axes
+        if (legend := axes.get_legend())
+        for text in legend.get_texts()
+    }
+    assert {"at rest", "gap", "gyroscope", "truth"} <= labels
+    assert len(figure.axes) == 4
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
+@pytest.mark.parametrize("name", ["tumvi/dataset-room1_512_16", "oxiod/trolley/data2/syn/imu4.csv"])
+def test_real_recordings_are_in_order(name: str) -> None:
+    found = inspect_recording(read_recording(DATA / name))
+    assert found.problems == ()
+    assert found.fit is not None
+    assert found.fit.correlation > 0.95
+    assert abs(found.fit.time_offset) < 0.01
+    assert np.degrees(found.fit.misalignment) < 2.0

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stario.sequences.inspection.stillness import find_rest
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
+BIAS = np.array([0.01, -0.02, 0.005])
+
+
+def lying(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
+    """A device on a table, tilted."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(seconds * rate)) / rate
+    gyro = BIAS + NOISE.gyro_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))
+    up_B = np.array([0.6, 0.0, 0.8])
+    accel = (STANDARD_GRAVITY + 0.05) * up_B
+    accel = accel + NOISE.accel_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))
+    return ImuSequence("lying", time, gyro, accel)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+def test_noise_and_bias_are_those_of_the_sensor_at_any_rate(rate: float) -> None:
+    rest = find_rest(lying(60.0, rate))
+    assert rest is not None
+    assert rest.seconds == pytest.approx(60.0, abs=0.6)
+    assert len(rest.stretches) == 1
+    np.testing.assert_allclose(rest.gyro_bias, BIAS, atol=5e-4)
+    assert rest.accel_norm == pytest.approx(STANDARD_GRAVITY + 0.05, abs=2e-3)
+    assert rest.gyro_noise == pytest.approx(NOISE.gyro_noise, rel=0.1)
+    assert rest.accel_noise == pytest.approx(NOISE.accel_noise, rel=0.1)
+
+
+def test_a_walk_is_no_rest() -> None:
+    assert find_rest(simulate_imu(generate_walk(2, 20.0, style=WalkStyle()), 200.0)) is None
+
+
+def test_rest_between_motions_is_found_and_not_across_a_gap() -> None:
+    still = lying(10.0, 100.0)
+    rng = np.random.default_rng(1)
+    gyro = still.gyro.copy()
+    gyro[300:500] += rng.normal(size=(200, 3)).cumsum(axis=0) * 0.05
+    time = still.time + np.where(np.arange(len(still)) >= 700, 2.0, 0.0)
+    rest = find_rest(ImuSequence("m", time, gyro, still.accel))
+    assert rest is not None
+    (a, b), (c, d), (e, f) = rest.stretches
+    assert a == 0.0
+    assert 2.4 <= b <= 3.0
+    assert 5.0 <= c <= 5.6
+    assert d <= 7.0
+    assert e >= 9.0
+    assert f == pytest.approx(12.0, abs=0.5)
+
+
+def test_a_slow_turn_is_not_taken_for_bias() -> None:
+    still = lying(10.0, 100.0)
+    turning = ImuSequence("t", still.time, still.gyro + np.array([0.0, 0.0, 0.1]), still.accel)
+    assert find_rest(turning) is None
+
+
+def test_a_moment_is_too_short() -> None:
+    assert find_rest(lying(0.8, 100.0)) is None
+    assert find_rest(lying(0.2, 100.0)) is None
