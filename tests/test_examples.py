@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from recorded import DATA
 
 from stario.fusion import Navigator, demonstration
 from stario.network import DisplacementModel, load_model
@@ -180,9 +180,7 @@ def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-9)
 
 
-BAGS = sorted(Path(os.environ.get("STARIO_DATA", ROOT.parent / "shared" / "data")).glob(
-    "raw/rosbag/*.bag"
-))  # fmt: skip
+BAGS = sorted(DATA.glob("raw/rosbag/*.bag"))
 
 
 @pytest.mark.skipif(not BAGS, reason="the data folder holds no recorded bags")

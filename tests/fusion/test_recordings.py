@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.config import NavigatorConfig
@@ -14,9 +12,6 @@ from stario.fusion.evaluation.compare import compare
 from stario.network import DisplacementModel, load_model
 from stario.sequences import ImuSequence, read_recording
 
-DATA = Path(
-    os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "data"
-)
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 
 OXIOD = "oxiod/handheld/data1/syn/imu7.csv"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.fusion.evaluation.pedestrian import (
     WEINBERG_CONSTANT,
@@ -22,7 +22,7 @@ from stario.sequences.readers import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.windows import WINDOW_RATE
 
-RIDI = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives/ridi.h5"
+RIDI = DATA / "archives/ridi.h5"
 RATE, SIZE = 1.8, 2.0
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.backends import BackendName
@@ -22,9 +21,6 @@ from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU
 
-DATA = Path(
-    os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"
-)
 CONFIG = NavigatorConfig()
 BLIND = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])

@@ -2,13 +2,12 @@
 
 import csv
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recorded import DATA
 
 from stario.fusion.live.merging import LONGEST_WAIT, Join, Merger
 from stario.fusion.live.payload import GYRO, TOTAL, Reading, parse_push
@@ -112,10 +111,7 @@ def test_what_a_device_does_not_send_is_named():
     assert len(merger._waiting) < 600
 
 
-SENSOR_LOGGER = (
-    Path(os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
-    / "raw/sensor_logger/university_loop"
-)
+SENSOR_LOGGER = DATA / "raw/sensor_logger/university_loop"
 
 
 @pytest.mark.skipif(

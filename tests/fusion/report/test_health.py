@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from recorded import DATA
 
 from stario.fusion import Health, Navigator
 from stario.fusion.report.health import findings, told
 from stario.network import load_model
 from stario.sequences import read_recording
 
-DATA = Path(
-    os.environ.get("STARIO_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data"
-)
 BAGS = DATA / "raw" / "rosbag"
 
 UNFAMILIAR = "60% of the windows move unlike all that the weights were trained on"

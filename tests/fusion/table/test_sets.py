@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
+from recorded import DATA
 
 from stario.fusion.table import sets
 from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
 from stario.sequences.datasets.splits import Listed
 from stario.sequences.errors import InputError
 
-DATA = Path(os.environ.get("STARIO_DATA", "../shared/data"))
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
 

@@ -1,9 +1,8 @@
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import with_axes, with_conventions
@@ -15,9 +14,6 @@ from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.units import with_units
 
-DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
-)
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 

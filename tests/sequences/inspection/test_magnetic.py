@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
@@ -26,7 +25,6 @@ from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import clean_samples
 
-DATA = Path(os.environ.get("STARIO_DATA", "../shared/data"))
 IRON = (15.0, -6.0, 9.0)
 
 

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import with_axes
@@ -18,10 +17,6 @@ from stario.sequences.readers import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-
-DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data")
-)
 
 
 @pytest.fixture(scope="module")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.readers.archive import archive_members
 
-ARCHIVES = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives"
+ARCHIVES = DATA / "archives"
 
 
 def _archive(path: Path) -> Path:

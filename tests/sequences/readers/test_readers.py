@@ -1,10 +1,10 @@
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
@@ -16,9 +16,6 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajec
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")
-)
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 
 START_NS = 1520531124153717567

@@ -1,8 +1,8 @@
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
@@ -11,9 +11,6 @@ from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.vicon import clean_capture, read_vicon_walks, smooth_rows
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")
-)
 WALKS = DATA / "walks" / "oxiod_vicon.npz"
 
 

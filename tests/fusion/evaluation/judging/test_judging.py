@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.fusion.evaluation.judging.bootstrap import paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
@@ -25,7 +25,7 @@ from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
-ARCHIVES = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "archives"
+ARCHIVES = DATA / "archives"
 
 
 @pytest.fixture(scope="module")

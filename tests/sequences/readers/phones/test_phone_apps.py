@@ -6,7 +6,6 @@ simulated, so that values, signs and axes are known.
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
@@ -29,7 +29,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-RAW = Path(os.environ.get("STARIO_DATA", "../shared/data")) / "raw"
+RAW = DATA / "raw"
 FIELD_W = np.array([18.0, 5.0, -43.0])
 START_NS = 1_718_030_736_872_695_300
 ZYX = "time,seconds_elapsed,z,y,x"

@@ -1,17 +1,14 @@
 """The recorded part of OxIOD: mount and lag are found, glitches masked, the world is level."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded import DATA
 
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
-DATA = Path(
-    os.environ.get("STARIO_DATA", Path(__file__).resolve().parents[3].parent / "shared" / "data")
-)
 OXIOD = DATA / "oxiod"
 needs_data = pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
 
