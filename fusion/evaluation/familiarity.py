@@ -1,17 +1,23 @@
-"""Whether a recording moves as what a model's weights were trained on."""
+"""Whether a recording moves as what a model's weights were trained on, and they walk its way."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.evaluation.judging.direction import Direction, direction
+from stario.fusion.evaluation.judging.network_alone import along
 from stario.fusion.imu.intervals import UNFAMILIAR_SHARE
 from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SECONDS, turned_windows
+from stario.sequences.windows import WINDOW_SECONDS
+
+_TURNED, _VAGUE = math.radians(45.0), math.radians(20.0)
+"""A turn that is told of, and a deviation beyond which none is."""
 
 _WORDS = {
     "acceleration": ("acceleration", "m/s^2 rms"),
@@ -33,11 +39,13 @@ class Familiarity:
             known.
         medians: of each of the features, of step rate and speed.
         ranges: 1st and 99th percentile of the training's.
+        direction: of the network's displacements against the accelerometer.
     """
 
     outside: float | None
     medians: dict[str, float]
     ranges: dict[str, tuple[float, float]]
+    direction: Direction
 
     @property
     def strange(self) -> bool:
@@ -46,10 +54,31 @@ class Familiarity:
 
     def as_dict(self) -> dict[str, object]:
         """Plain values."""
-        return {"outside": self.outside, "medians": self.medians, "known": self.ranges}
+        turn, sigma = (math.degrees(v) for v in (self.direction.turn, self.direction.sigma))
+        return {
+            "outside": self.outside,
+            "medians": self.medians,
+            "known": self.ranges,
+            "direction": {"turn_deg": None if math.isnan(turn) else turn, "sigma_deg": sigma},
+        }
 
     def lines(self) -> list[str]:
         """The findings for a person."""
+        return self._motion_lines() + self._direction_lines()
+
+    def _direction_lines(self) -> list[str]:
+        turn, sigma = self.direction.turn, self.direction.sigma
+        known = f"{math.degrees(turn):.0f} (+-{math.degrees(sigma):.0f}) degrees"
+        if abs(turn) > max(_TURNED, 3.0 * sigma):
+            return [
+                f"! the network walks another way than the accelerometer says, by {known}: its "
+                "track is turned by as much, and fusing both suffers; take other weights"
+            ]
+        if sigma < _VAGUE:
+            return [f"  the network walks where the accelerometer says: turned by {known}"]
+        return []
+
+    def _motion_lines(self) -> list[str]:
         told = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
                          self.medians.items())  # fmt: skip
         lines = [f"motion: {told}"]
@@ -77,11 +106,11 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     """
     streams = levelled_streams(sequence)
     if not streams or not any(stream.window_count for stream in streams):
-        return Familiarity(None, {}, {})
+        return Familiarity(None, {}, {}, Direction())
     windows = np.concatenate([stream.windows()[::2] for stream in streams])
-    headings = np.concatenate([stream.headings[::2] for stream in streams])
-    displacement_H = model.predict(turned_windows(windows, -headings))[0]
-    speeds = np.linalg.norm(displacement_H[:, :2], axis=1) / WINDOW_SECONDS
+    told = [along(model, s).displacement_N if s.window_count else np.empty((0, 3)) for s in streams]
+    towards = sum(map(direction, streams, told), Direction())
+    speeds = np.linalg.norm(np.concatenate(told)[:, :2], axis=1) / WINDOW_SECONDS
     found = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
     rates = np.concatenate([step_rates(stream.imu_N) for stream in streams])
     if len(rates):
@@ -89,6 +118,6 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     found["speed"] = float(np.median(speeds))
     known = model.card.known_motion
     if known is None:
-        return Familiarity(None, found, {})
+        return Familiarity(None, found, {}, towards)
     outside = float(np.mean(known.strangeness(windows) > 1.0))
-    return Familiarity(outside, found, dict(known.ranges))
+    return Familiarity(outside, found, dict(known.ranges), towards)

@@ -64,15 +64,12 @@ def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
     """
     if isinstance(model, Answering):
         return model.answers(prepared)
+    return [along(model, piece.stream) for piece in prepared.pieces]
+
+
+def along(model: Predictor, stream: LevelledStream) -> Answers:
+    """A network's answers on an unbroken stretch, in the frame N."""
     network = StatefulInference(model, UPDATES)
-    found = []
-    for piece in prepared.pieces:
-        network.restart()
-        found.append(_along(network, piece.stream))
-    return found
-
-
-def _along(network: StatefulInference, stream: LevelledStream) -> Answers:
     windows, heading = stream.windows(), stream.headings
     parts = [
         network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
