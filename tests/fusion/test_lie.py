@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import expm
 
 from stario.fusion import lie
-from stario.sequences import so3
+from stario.sequences.attitude import so3
 
 ANGLES = [0.0, 1e-9, 1e-4, 0.0316, 0.0317, 0.2, 1.0, 2.5, np.pi - 1e-6]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences import stream_cache
+from stario.sequences.datasets import stream_cache
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import cache_folder, cached, recorded, recording_files
