@@ -92,10 +92,8 @@ def train_cell(
     material = gather(streams, [], [] if poses else simulated(_WALKS, 0))
     kept = gather(held_out, [], [])
     clock = _Clock(folder / SPARE[1])
-    reports: list[EpochReport] = []
 
     def finished(report: EpochReport) -> None:
-        reports.append(report)
         clock.keep()
         clock.pause()
 
