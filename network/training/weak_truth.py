@@ -19,10 +19,12 @@ velocities of two seconds in a row differ by
     d_k+1 - d_k = integral of w(t) a(t) dt = a_k,   w rising from 0 to 1 and falling to 0 again,
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
-the error of levelling hardly change within a stretch and are taken out by the mean. With
-c = sum_k conj(d_k+1 - d_k) a_k a turn of the displacements takes 2 (|c| - Re c) from the sum of
-|d_k+1 - d_k - a_k|^2, and that over s_a^2, times q, is the loss. The whole sum would have a network
-that cannot tell every second shorten them all (Indoor Location left out: errors 10 % larger).
+the error of levelling hardly change within a stretch and are taken out by the mean. The angle of
+c = sum_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. What is beyond 60
+degrees costs 2 (|c| / 2 - Re c) q / s_a^2, a part of what turning it would take from the sum of
+|d_k+1 - d_k - a_k|^2; below, where noise makes the angle, nothing does. The whole sum would have a
+network that cannot tell every second shorten them all (Indoor Location left out: errors 10 %
+larger), and every angle, lengths less exact.
 """
 
 from __future__ import annotations
@@ -48,6 +50,9 @@ VARIANCE_RATE = 0.05
 
 VELOCITY_SIGMA = 0.1
 """Deviation per axis of a change of velocity that the accelerometer tells, s_a [m/s]."""
+
+_COS_TURNED = 0.5
+"""Of the angle beyond which a stretch is walked another way than the accelerometer says."""
 
 _HUBER = 3.0
 """Whitened residuals beyond this many deviations count linearly."""
@@ -287,13 +292,13 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
 
 
 def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
-    """What a turn of each stretch's displacements (S, K, 3) would take off its error [m^2]."""
+    """What displacements (S, K, 3) in N cost that go another way than the accelerometer [m^2]."""
     d, a = displacement_N[..., :2].diff(dim=1), legs.velocity_change
     real = (d * a).sum((1, 2))
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves
-    by_turn = 2.0 * (size - real) / a.shape[1]
-    return VARIANCE_RATE * by_turn.mean() / VELOCITY_SIGMA**2
+    away = 2.0 * (_COS_TURNED * size - real).clamp(min=0.0) / a.shape[1]
+    return VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
 
 
 def _robust(white: Tensor) -> Tensor:

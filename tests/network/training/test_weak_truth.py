@@ -153,14 +153,13 @@ def test_velocity_changes_as_the_accelerometer_says() -> None:
     assert float((velocity_change(accel_W)[0] - changes).norm(dim=-1).max()) < 0.02
 
 
-def test_the_accelerometer_turns_back_who_walks_another_way_and_leaves_lengths_alone() -> None:
+def test_the_accelerometer_turns_back_who_walks_another_way() -> None:
     recording = known("positions", 0.1)
     batch = batch_of(recording)
     told_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
     right = float(direction_loss(told_N, batch))
-    assert float(direction_loss(0.5 * told_N, batch)) == pytest.approx(0.5 * right, abs=1e-6)
     losses = []
-    for degrees in (-30.0, 30.0, -90.0, 90.0, -170.0, 170.0):
+    for degrees in (-90.0, 90.0, -130.0, 130.0, -170.0, 170.0):
         angle = torch.tensor(np.radians(degrees), dtype=torch.float32, requires_grad=True)
         loss = direction_loss(turned(told_N, angle), batch)
         loss.backward()
@@ -168,7 +167,7 @@ def test_the_accelerometer_turns_back_who_walks_another_way_and_leaves_lengths_a
         assert float(angle.grad) * degrees > 0.0
         losses.append(float(loss.detach()))
     assert losses == sorted(losses)
-    assert right < 0.5 * losses[0]
+    assert right < 0.2 * losses[0]
 
 
 def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
