@@ -33,6 +33,7 @@ class Augmentation:
         swung: share of windows in which the device is swung besides.
         swing_rate: largest angular rate of a swing [rad/s].
         lever: largest distance of the device from the point it is swung about [m].
+        mirrored: share of windows that are shown as their mirror image, left to right.
         yaw: deviation of the error of the device's heading [rad].
         any_yaw: share of windows that are shown at any yaw instead.
         tilt: largest error of the gravity direction [rad], about a random horizontal axis.
@@ -47,6 +48,7 @@ class Augmentation:
     swung: float = 0.35
     swing_rate: float = 2.5
     lever: float = 0.35
+    mirrored: float = 0.5
     yaw: float = 0.3
     any_yaw: float = 0.3
     tilt: float = 0.05
@@ -232,7 +234,7 @@ def show(
     error = a.yaw * torch.randn(len(imu), generator=generator)
     anywhere = uniform(len(imu)) < a.any_yaw
     R_HW = _about_z(torch.where(anywhere, symmetric(len(imu)) * torch.pi, error) - heading)
-    sign = torch.where(uniform(groups) < 0.5, -1.0, 1.0)
+    sign = torch.where(uniform(groups) < a.mirrored, -1.0, 1.0)
     one = torch.ones_like(sign)
     mirror = of_each(torch.stack([one, sign, sign, sign, one, one], dim=1))
     R_tilt = of_each(_small_tilt(symmetric(groups, 2) * a.tilt / 2**0.5))

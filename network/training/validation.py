@@ -109,8 +109,8 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
     """The same stretches for every epoch, as the device gives them."""
     found = {}
     plain = replace(
-        config.augmentation, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0, accel_bias=0.0,
-        gyro_noise=0.0, accel_noise=0.0,
+        config.augmentation, mirrored=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
+        accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
     )  # fmt: skip
     for kind, members, seconds, _ in by_kind(legs, config):
         if any(len(stream) > seconds * WINDOW_SAMPLES for stream in members):

@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ NOTHING = Augmentation(
     speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,
     accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
 )  # fmt: skip
-"""No range at all, at any yaw; the mirror image is drawn always."""
+"""No range at all, at any yaw; one in two is the mirror image."""
 
 TO_MIRROR_IMAGE = np.diag([1.0, -1.0, 1.0])
 
@@ -104,6 +104,9 @@ def test_without_ranges_windows_are_those_of_the_navigator_turned_or_mirrored() 
     windows, displacements = windows_at_every_start(STREAM)
     draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=0), windows, 32)
     assert {d.mirrored for d in draws} == {True, False}
+    plain = WindowSampler([STREAM], [1.0], replace(NOTHING, mirrored=0.0), seed=0)
+    draws += (unmirrored := drawn(plain, windows, 32))
+    assert {d.mirrored for d in unmirrored} == {False}
     for d in draws:
         # Angular rate is an axial vector: a mirror image turns its sign over.
         axial = d.turn * np.linalg.det(d.turn)
