@@ -20,11 +20,13 @@ velocities of two seconds in a row differ by
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
 the error of levelling hardly change within a stretch and are taken out by the mean. The angle of
-c = sum_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. What is beyond 60
-degrees costs 2 (|c| / 2 - Re c) q / s_a^2, a part of what turning it would take from the sum of
-|d_k+1 - d_k - a_k|^2; below, where noise makes the angle, nothing does. The whole sum would have a
-network that cannot tell every second shorten them all (Indoor Location left out: errors 10 %
-larger), and every angle, lengths less exact.
+c = sum_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. It costs
+
+    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = |d_k+1 - d_k| |a_k| / 4 of the whole stretches:
+
+nothing below 60 degrees and where chance could make the angle, else a part of what turning the
+stretch would take from the sum of |d_k+1 - d_k - a_k|^2. With that whole sum for a loss a network
+that cannot tell every second shortens them all (Indoor Location left out: errors 10 % larger).
 """
 
 from __future__ import annotations
@@ -51,8 +53,9 @@ VARIANCE_RATE = 0.05
 VELOCITY_SIGMA = 0.1
 """Deviation per axis of a change of velocity that the accelerometer tells, s_a [m/s]."""
 
-_COS_TURNED = 0.5
-"""Of the angle beyond which a stretch is walked another way than the accelerometer says."""
+_COS_TURNED, _CHANCE = 0.5, 0.25
+"""Of the angle beyond which a stretch is walked another way than the accelerometer says, and what
+chance makes of the correlation of a dozen changes of velocity."""
 
 _HUBER = 3.0
 """Whitened residuals beyond this many deviations count linearly."""
@@ -297,7 +300,8 @@ def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     real = (d * a).sum((1, 2))
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves
-    away = 2.0 * (_COS_TURNED * size - real).clamp(min=0.0) / a.shape[1]
+    chance = _CHANCE * d.detach().norm(dim=(1, 2)) * a.norm(dim=(1, 2))
+    away = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
     return VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
 
 
