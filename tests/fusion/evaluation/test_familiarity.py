@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from stario.fusion import Navigator
 from stario.fusion.evaluation.familiarity import familiarity
 from stario.network.known_motion import KnownMotion, known_motion
 from stario.network.model import DisplacementModel, load_model
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import world_streams
@@ -55,6 +56,28 @@ def test_a_walk_as_in_training_is_familiar_and_a_trembling_one_is_not(
     [line] = [line for line in strange.lines() if line.startswith("!")]
     assert "share of power above 10 Hz" in line
     assert strange.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
+
+
+class Backwards(DisplacementModel):
+    """Weights that walk the other way."""
+
+    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        displacement, covariance = super().predict(windows)
+        return -displacement, covariance
+
+
+def test_weights_that_walk_backwards_are_told(model: DisplacementModel) -> None:
+    walk = simulated(60.0)
+    right = familiarity(model, walk)
+    wrong = familiarity(Backwards(model._engine, model.card), walk)
+    assert not [line for line in right.lines() if "another way" in line]
+    [line] = [line for line in wrong.lines() if "another way" in line]
+    assert line.startswith("!")
+    turned = abs(wrong.direction.turn - right.direction.turn)
+    assert turned == pytest.approx(np.pi)
+    told = wrong.as_dict()["direction"]
+    assert isinstance(told, dict)
+    assert abs(told["turn_deg"]) > 120.0
 
 
 def test_health_says_so_in_batch_and_stream(model: DisplacementModel) -> None:
