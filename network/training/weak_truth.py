@@ -302,7 +302,8 @@ def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves
     chance = _CHANCE * d.detach().norm(dim=(1, 2)) * a.norm(dim=(1, 2))
     away = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
-    return VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
+    loss: Tensor = VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
+    return loss
 
 
 def _robust(white: Tensor) -> Tensor:
