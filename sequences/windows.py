@@ -105,6 +105,10 @@ def facing(R_NB: FloatArray) -> FloatArray:
 HEADING_STEP = 20
 """Samples between the attitudes that a window's heading is the mean of."""
 
+VELOCITY_WEIGHTS = (np.arange(WINDOW_SAMPLES) + 0.5) / (WINDOW_SAMPLES * WINDOW_RATE)
+"""Of the accelerations in a window [s]: with those in the next, weighted in reverse, they add up to
+how the mean velocity changes from the one second to the other."""
+
 
 def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
     """Heading (B,) [rad] of windows from which way the device faces at ten instants (B, 10, 2)."""

@@ -20,9 +20,9 @@ velocities of two seconds in a row differ by
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
 the error of levelling hardly change within a stretch and are taken out by the mean. The angle of
-c = sum_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. It costs
+c = mean_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. It costs
 
-    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = |d_k+1 - d_k| |a_k| / 4 of the whole stretches:
+    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+1 - d_k| rms |a_k| / 4:
 
 nothing below 60 degrees and where chance could make the angle, else a part of what turning the
 stretch would take from the sum of |d_k+1 - d_k - a_k|^2. With that whole sum for a loss a network
@@ -45,7 +45,12 @@ from stario.network.training.parallel import Workers
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES
+from stario.sequences.windows import (
+    HEADING_STEP,
+    VELOCITY_WEIGHTS,
+    WINDOW_RATE,
+    WINDOW_SAMPLES,
+)
 
 VARIANCE_RATE = 0.05
 """Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
@@ -247,9 +252,9 @@ def velocity_change(accel_N: Tensor) -> Tensor:
     Returns:
         (S, K - 1, 2), less its mean over the stretch.
     """
-    rising = (torch.arange(WINDOW_SAMPLES) + 0.5) / (WINDOW_SAMPLES * WINDOW_RATE)
-    before = torch.einsum("skic,i->skc", accel_N[:, :-1], rising)
-    after = torch.einsum("skic,i->skc", accel_N[:, 1:], rising.flip(0))
+    weights = torch.from_numpy(VELOCITY_WEIGHTS).float()
+    before = torch.einsum("skic,i->skc", accel_N[:, :-1], weights)
+    after = torch.einsum("skic,i->skc", accel_N[:, 1:], weights.flip(0))
     changes = before + after
     return changes - changes.mean(dim=1, keepdim=True)
 

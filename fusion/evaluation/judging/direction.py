@@ -17,12 +17,10 @@ import numpy as np
 
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS
+from stario.sequences.windows import VELOCITY_WEIGHTS, WINDOW_SECONDS
 
 _STRETCH = round(20.0 / TICK_SECONDS)
 _SECOND = round(WINDOW_SECONDS / TICK_SECONDS)
-
-_RISING = (np.arange(WINDOW_SAMPLES) + 0.5) / (WINDOW_SAMPLES * WINDOW_RATE)
 
 Complex = np.ndarray[Any, np.dtype[np.complex128]]
 
@@ -76,7 +74,7 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
     accel_N = stream.windows()[:, 3:5].astype(np.float64)
     if len(accel_N) <= 2 * _SECOND:
         return Direction()
-    told = accel_N[:-_SECOND] @ _RISING + accel_N[_SECOND:] @ _RISING[::-1]
+    told = accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
     moved = displacement_N[_SECOND:, :2] - displacement_N[:-_SECOND, :2]
     a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
     apart = len(d) / (2.0 * _SECOND)  # a change takes two seconds
