@@ -25,7 +25,7 @@ c = mean_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. It 
     2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+1 - d_k| rms |a_k| / 4:
 
 nothing below 60 degrees and where chance could make the angle, else a part of what turning the
-stretch would take from the sum of |d_k+1 - d_k - a_k|^2. With that whole sum for a loss a network
+stretch would take from the mean of |d_k+1 - d_k - a_k|^2. With that whole mean for a loss a network
 that cannot tell every second shortens them all (Indoor Location left out: errors 10 % larger).
 """
 
