@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from alike import assert_same_samples
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
@@ -280,10 +281,7 @@ def test_a_variant_is_the_same_walk(variant: str, walk: ImuSequence, tmp_path: P
     VARIANTS[variant](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     read = read_recording(found)
-    assert len(read) == len(walk)
-    np.testing.assert_allclose(read.time, walk.time, atol=1e-3)
-    np.testing.assert_allclose(read.gyro, walk.gyro, atol=1e-9)
-    np.testing.assert_allclose(read.accel, walk.accel, atol=1e-8)
+    assert_same_samples(read, walk)
     if read.magnetometer is not None:
         np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
 
