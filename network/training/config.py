@@ -34,17 +34,17 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
 SIGMA_WEIGHT = 0.05
 """Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
 
-_COUNTS = (
-    "epochs",
-    "epoch_windows",
-    "batch",
-    "patience",
-    "successive",
-    "waypoint_stretches",
-    "waypoint_seconds",
-    "track_stretches",
-    "track_seconds",
-)
+_COUNTS = {
+    "epochs": 1,
+    "epoch_windows": 1,
+    "batch": 1,
+    "patience": 1,
+    "successive": 1,
+    "waypoint_stretches": 1,
+    "waypoint_seconds": 4,  # two changes of velocity over two seconds
+    "track_stretches": 1,
+    "track_seconds": 4,
+}
 
 _RANGES = (
     ("rate", 1e-8, 1.0),
@@ -122,10 +122,10 @@ class TrainingConfig:
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
-        for name in _COUNTS:
+        for name, least in _COUNTS.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and value >= 1):
-                raise ConfigError(name, repr(value), "a count of at least 1")
+            if not (isinstance(value, int) and value >= least):
+                raise ConfigError(name, repr(value), f"a count of at least {least}")
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
         if self.architecture not in ARCHITECTURES:

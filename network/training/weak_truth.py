@@ -16,16 +16,18 @@ psi leaves the direction of the displacements open: a network that learns so alo
 backwards, and no track that is fitted in yaw shows it. The accelerometer closes it. The mean
 velocities of two seconds in a row differ by
 
-    d_k+1 - d_k = integral of w(t) a(t) dt = a_k,   w rising from 0 to 1 and falling to 0 again,
+    d_k+1 - d_k = integral of w(t) a(t) dt,   w rising from 0 to 1 and falling to 0 again,
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
-the error of levelling hardly change within a stretch and are taken out by the mean. The angle of
-c = mean_k conj(d_k+1 - d_k) a_k is how far a stretch is walked another way. It costs
+the error of levelling hardly change within a stretch and are taken out by the mean. Two such
+integrals in a row are a_k = d_k+2 - d_k. (From one second to the next a walk sways with its steps:
+a network learned from scratch with those told the sway rightly and still walked backwards.) The
+angle of c = mean_k conj(d_k+2 - d_k) a_k is how far a stretch is walked another way. It costs
 
-    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+1 - d_k| rms |a_k| / 4:
+    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+2 - d_k| rms |a_k| / 4:
 
 nothing below 60 degrees and where chance could make the angle, else a part of what turning the
-stretch would take from the mean of |d_k+1 - d_k - a_k|^2. With that whole mean for a loss a network
+stretch would take from the mean of |d_k+2 - d_k - a_k|^2. With that whole mean for a loss a network
 that cannot tell every second shortens them all (Indoor Location left out: errors 10 % larger).
 """
 
@@ -79,8 +81,8 @@ class LegBatch:
         variance: (S, M) of the legs by their ends alone [m^2].
         seconds: (S, M) of the legs, 1 where there is none.
         known: (S, M) whether there is a leg.
-        velocity_change: (S, K - 1, 2) of the mean velocity in N from each second to the next, by
-            the accelerometer [m/s].
+        velocity_change: (S, K - 2, 2) of the mean velocity in N from each second to the next but
+            one, by the accelerometer [m/s].
     """
 
     windows: Tensor
@@ -244,18 +246,19 @@ def ends_covariance(start: FloatArray, stop: FloatArray, sigma: FloatArray) -> F
 
 
 def velocity_change(accel_N: Tensor) -> Tensor:
-    """How the mean velocity changes from one second to the next [m/s].
+    """How the mean velocity changes from one second to the next but one [m/s].
 
     Args:
         accel_N: (S, K, 200, 2) horizontal acceleration in N through K seconds [m/s^2].
 
     Returns:
-        (S, K - 1, 2), less its mean over the stretch.
+        (S, K - 2, 2), less its mean over the stretch.
     """
     weights = torch.from_numpy(VELOCITY_WEIGHTS).float()
     before = torch.einsum("skic,i->skc", accel_N[:, :-1], weights)
     after = torch.einsum("skic,i->skc", accel_N[:, 1:], weights.flip(0))
-    changes = before + after
+    change = before + after
+    changes = change[:, :-1] + change[:, 1:]
     return changes - changes.mean(dim=1, keepdim=True)
 
 
@@ -301,7 +304,7 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
 
 def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     """What displacements (S, K, 3) in N cost that go another way than the accelerometer [m^2]."""
-    d, a = displacement_N[..., :2].diff(dim=1), legs.velocity_change
+    d, a = displacement_N[:, 2:, :2] - displacement_N[:, :-2, :2], legs.velocity_change
     real = (d * a).sum((1, 2))
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves

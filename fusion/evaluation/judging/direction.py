@@ -1,10 +1,12 @@
 """Whether a network walks where the accelerometer says that the device moves.
 
 Truth without attitude cannot tell: a track that is fitted in yaw looks the same walked backwards.
-The mean velocities of two seconds in a row differ by the integral of w(t) a(t), w rising from 0 to
-1 and falling again, a the specific force without gravity; the network's displacements d must differ
-alike. The angle of sum conj(d_k+1 - d_k) a_k, horizontal vectors as complex numbers, is what the
-network is turned by. Bias and tilt hardly change within 20 s and are taken out by the mean.
+The mean velocities of two seconds in a row differ by a_k, the integral of w(t) a(t), w rising from
+0 to 1 and falling again, a the specific force without gravity; the network's displacements d must
+differ alike. The angle of sum conj(d_k+2 - d_k) (a_k + a_k+1), horizontal vectors as complex
+numbers, is what the network is turned by. Over two seconds, because from one to the next a walk
+sways with its steps: a network that tells the sway rightly and walks backwards passes there.
+Bias and tilt hardly change within 20 s and are taken out by the mean.
 """
 
 from __future__ import annotations
@@ -72,12 +74,13 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
         displacement_N: (M, 3) over the second from each tick [m].
     """
     accel_N = stream.windows()[:, 3:5].astype(np.float64)
-    if len(accel_N) <= 2 * _SECOND:
+    if len(accel_N) <= 3 * _SECOND:
         return Direction()
     told = accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
-    moved = displacement_N[_SECOND:, :2] - displacement_N[:-_SECOND, :2]
+    told = told[:-_SECOND] + told[_SECOND:]
+    moved = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
     a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
-    apart = len(d) / (2.0 * _SECOND)  # a change takes two seconds
+    apart = len(d) / (3.0 * _SECOND)  # a change takes three seconds
     return Direction(complex(np.vdot(d, a)), _square(d), _square(a), apart)
 
 
