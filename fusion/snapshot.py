@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 12
+FORMAT, VERSION = "stario snapshot", 13
 
 
 @cache
@@ -64,12 +64,21 @@ def _classes() -> dict[str, type]:
         keyframes,
         whitening,
     )
-    from stario.fusion.imu import front_end, gyro_unit, intervals, outliers, preintegration
+    from stario.fusion.imu import (
+        field_buffer,
+        front_end,
+        gyro_unit,
+        intervals,
+        outliers,
+        preintegration,
+        window_buffer,
+    )
     from stario.sequences import noise
     from stario.sequences.attitude import levelling
 
     classes: tuple[type, ...] = (
         *(config.FilterConfig, config.GraphConfig, config.NavigatorConfig, noise.ImuNoise),
+        *(window_buffer.WindowBuffer, window_buffer.Block, field_buffer.FieldBuffer),
         *(front_end.FrontEnd, gyro_unit.GyroUnitWatch, intervals.ImuInterval),
         *(intervals.SampleCounts, intervals.Start, outliers.Flags, outliers.OutlierDetector),
         *(levelling.LevelledAttitude, preintegration.Segment),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.changed import changed
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 
 
@@ -76,7 +77,7 @@ class NavState:
 
     def shifted(self, by: FloatArray) -> NavState:
         """The state in a frame whose origin lies at -`by` (3,) [m]."""
-        return replace(self, p_W=self.p_W + by)
+        return changed(self, p_W=self.p_W + by)
 
 
 @dataclass(frozen=True, eq=False)

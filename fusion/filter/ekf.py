@@ -13,10 +13,10 @@ as measurements).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
@@ -76,7 +76,7 @@ class StateCloningEkf(ErrorStateEngine):
 
     @P.setter
     def P(self, value: FloatArray) -> None:
-        self.state = replace(self.state, P=value)
+        self.state = changed(self.state, P=value)
 
     def initialise(self, state: NavState) -> None:
         """Set the state, with plain errors as callers know them, and forget every clone.
@@ -105,7 +105,7 @@ class StateCloningEkf(ErrorStateEngine):
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
         P = self._propagated(s.P, end.transition, end.noise)
-        self.state = replace(s, time=segment.stop, X=X, P=P)
+        self.state = changed(s, time=segment.stop, X=X, P=P)
 
     def clone(self, instead_of: int | None = None) -> int:
         """Copy the current pose into a slot and return its number.
@@ -132,7 +132,7 @@ class StateCloningEkf(ErrorStateEngine):
         P[:, first : first + CLONE] = rows.T
         rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
         rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
-        self.state = replace(s, X=X, P=P, clone_times=_with(s.clone_times, slot, s.time))
+        self.state = changed(s, X=X, P=P, clone_times=_with(s.clone_times, slot, s.time))
         return slot
 
     def release(self, slot: int) -> None:
@@ -146,7 +146,7 @@ class StateCloningEkf(ErrorStateEngine):
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
         P[:, first : first + CLONE] = 0.0
-        self.state = replace(s, P=P, clone_times=_with(s.clone_times, slot, None))
+        self.state = changed(s, P=P, clone_times=_with(s.clone_times, slot, None))
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -309,7 +309,7 @@ class StateCloningEkf(ErrorStateEngine):
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
         field = None if s.field is None else _moved(s.field, dx[s.first_field :])
         turn = s.network_turn + float(dx[s.turn_row])
-        self.state = replace(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
+        self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
 
 

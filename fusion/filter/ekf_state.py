@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.attitude.so3 import skew
@@ -216,8 +217,8 @@ class EkfState:
         P = A @ self.P @ A.T
         field = self.field
         if field is not None:
-            field = replace(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        return replace(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T), field=field)
+            field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
+        return changed(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T), field=field)
 
     def with_yaw_inflated(
         self, about_W: FloatArray, sigma: float, field_too: bool = True
@@ -237,14 +238,14 @@ class EkfState:
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
         if self.field is not None and field_too:
             N[self.first_field, 0] = 1.0
-        return replace(self, P=self.P + sigma**2 * (N @ N.T))
+        return changed(self, P=self.P + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:
         """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""
         N = np.zeros((len(self.P), 3))
         for _, rho in self._poses():
             N[rho : rho + 3] = np.eye(3)
-        return replace(self, P=self.P + sigma**2 * (N @ N.T))
+        return changed(self, P=self.P + sigma**2 * (N @ N.T))
 
     def _estimate(
         self, time: float, X: FloatArray, P: FloatArray, in_gap: bool, map_frame: int

@@ -7,10 +7,10 @@ right-invariant error (Barrau and Bonnabel 2017).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.accelerometer import AccelerometerWorth
 from stario.fusion.filter.displacements import DisplacementUpdates
@@ -110,7 +110,7 @@ class Estimator:
         """
         factor = self._displacements.accelerometer.factor
         if factor != interval.accel_factor:
-            interval = replace(interval, accel_factor=factor)
+            interval = changed(interval, accel_factor=factor)
         self._remember(interval, displacement, fixes)
         if interval.gap or fixes:
             self._opinion.sceptic = None
@@ -141,7 +141,7 @@ class Estimator:
             return None
         stops = [step.interval.stop for step in steps[:-1]]
         k = int(np.searchsorted(stops, fix.time))
-        self.state = replace(steps[k].before, history=steps[:k])
+        self.state = changed(steps[k].before, history=steps[:k])
         accepted = []
         for n, step in enumerate(steps[k:]):
             fixes = sorted((*step.fixes, fix), key=by_time) if n == 0 else step.fixes
@@ -152,7 +152,7 @@ class Estimator:
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix]
     ) -> None:
         if self._streaming:
-            before = replace(self.state, history=())
+            before = changed(self.state, history=())
             step = Step(before, interval.without_window(), displacement, tuple(fixes))
             oldest = interval.stop - WINDOW_SECONDS - _ROUNDING
             kept = (s for s in self._history if s.interval.stop >= oldest)
@@ -168,7 +168,7 @@ class Estimator:
         if interval.anew is not None:
             # Fixes within a long gap are of no use: nothing ties their time to what is behind it.
             for _ in fixes:
-                self._counts = replace(
+                self._counts = changed(
                     self._counts, fixes=counted(self._counts.fixes, "in a long gap")
                 )
             reinitialise(self.ekf, interval, interval.anew, self._config)
@@ -349,4 +349,4 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """The report so far, with the sigmas of another estimator's state where one is given."""
         health = self._counts.health(counts, state or self.nav_state())
-        return replace(health, accel_noise_factor=self._displacements.accelerometer.factor)
+        return changed(health, accel_noise_factor=self._displacements.accelerometer.factor)

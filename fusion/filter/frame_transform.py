@@ -8,11 +8,12 @@ it were independent of theirs; that is on the safe side, for the fix saw the tra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.changed import changed
 from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -63,7 +64,7 @@ class FrameTransform:
         if state.time >= self.time:
             return state
         if state.time < self.since:
-            return replace(state, map_frame=state.map_frame + 1)
+            return changed(state, map_frame=state.map_frame + 1)
         v_W, p_W = self.R @ state.v_W, self.position(state.p_W)
         A = np.eye(15)
         for first in (0, 3, 6):
@@ -76,7 +77,7 @@ class FrameTransform:
         covariance += self.yaw_sigma**2 * (turn @ turn.T)
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
-        return replace(
+        return changed(
             state,
             R_WB=self.R @ state.R_WB,
             v_W=v_W,

@@ -10,10 +10,11 @@ wide where it is large, or where the data say clearly that it lies outside the p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.filter.sceptic import SecondOpinion
@@ -71,7 +72,7 @@ class GyroBiasPrior:
 
     def before_gravity_tells(self) -> GyroBiasPrior:
         """As wide as while levelling knows nothing of the bias."""
-        return replace(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
+        return changed(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
 
     def wanted(
         self,
@@ -147,7 +148,7 @@ class FollowedBiasPrior:
     def widen_for_rest(self) -> None:
         """Rest tells the bias, be it what it may."""
         wide = max(self.prior.variance, _AT_REST**2)
-        self._exchange(replace(self.prior, variance=wide))
+        self._exchange(changed(self.prior, variance=wide))
 
     def _exchange(self, wanted: GyroBiasPrior) -> None:
         """Everything as if it had been the prior from the start."""

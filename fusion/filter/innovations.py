@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.intervals import SampleCounts
 from stario.fusion.state import Health, Innovations, NavState
@@ -41,8 +42,8 @@ class UpdateCounts:
         """One more measurement of the network's."""
         offered = self.offered + 1
         if result.residual is None:
-            return replace(self, offered=offered, refused=counted(self.refused, result.reason))
-        return replace(
+            return changed(self, offered=offered, refused=counted(self.refused, result.reason))
+        return changed(
             self,
             offered=offered,
             gated=self.gated + is_gated(result),
@@ -55,19 +56,19 @@ class UpdateCounts:
         fixes = counted(self.fixes, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
             fixes = counted(fixes, "gated")
-        return replace(self, fixes=fixes)
+        return changed(self, fixes=fixes)
 
     def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
         """One more measurement at rest."""
         what = "applied" if result.accepted else result.reason
-        return replace(self, zero_velocity=counted(self.zero_velocity, what))
+        return changed(self, zero_velocity=counted(self.zero_velocity, what))
 
     def add_bearing(self, result: UpdateResult) -> UpdateCounts:
         """One more bearing of the magnetic field."""
         bearings = counted(self.bearings, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
             bearings = counted(bearings, "gated")
-        return replace(self, bearings=bearings)
+        return changed(self, bearings=bearings)
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
         """The report: what became of the samples, of the updates, and the state's sigmas."""
@@ -80,7 +81,7 @@ class UpdateCounts:
             "gyro_bias_rad_s": sigma[9:12],
             "accel_bias_m_s2": sigma[12:15],
         }
-        return replace(
+        return changed(
             counts.health(),
             updates=self.offered,
             gated=self.gated,

@@ -18,10 +18,11 @@ The field is slow and its errors alike for metres: two bearings a second are all
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
@@ -136,19 +137,19 @@ class MagneticReference:
         """
         count = self.count + 1
         if count == 1:
-            return replace(self, time=time, count=1, size=size, dip=dip)
+            return changed(self, time=time, count=1, size=size, dip=dip)
         share = 1.0 / min(count, _MEMORY)
         near = 2.0 * _USUAL_SIZE * self.size
         usual_size = self.size + share * min(max(size - self.size, -near), near)
         off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
         usual_dip = self.dip + share * off
-        found = replace(self, time=time, count=count, size=usual_size, dip=usual_dip)
+        found = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
         if not news:
             return found
         distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
         walked = self.walked + 1
         late = 1.0 / min(walked + _FIRST_COUNT, _MEMORY)
-        return replace(found, spread=self.spread + late * (distance - self.spread), walked=walked)
+        return changed(found, spread=self.spread + late * (distance - self.spread), walked=walked)
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -178,7 +179,7 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
     n = len(s.P)
     P = np.zeros((n + len(variances),) * 2)
     P[:n, :n], P[n:, n:] = s.P, np.diag(variances)
-    return replace(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
+    return changed(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
 def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
@@ -193,7 +194,7 @@ def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
     P = gauss_markov(s.P, s.first_field + 1, kept, sigma)
-    return replace(s, P=P, field=replace(s.field, wander=kept * s.field.wander))
+    return changed(s, P=P, field=changed(s.field, wander=kept * s.field.wander))
 
 
 def update_bearing(
@@ -215,12 +216,12 @@ def update_bearing(
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _LEAST_HORIZONTAL:
-        return UpdateResult(math.nan, 1, False, reason="no horizontal field"), replace(
+        return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
     held = reference.is_held(measured)
     news = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
-    reference = replace(reference.seen(now, size, dip, news), measured=measured)
+    reference = changed(reference.seen(now, size, dip, news), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
     )

@@ -16,11 +16,12 @@ position places it, the next direction turns it, and what was before the gap sta
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.linalg import norm
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
@@ -106,14 +107,14 @@ class MapFrame:
             return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known")
         result = self._update(ekf, fix)
         done = self._with_uncertainty(transform, _nav_state(ekf))
-        self.state = replace(self.state, transforms=(*self.state.transforms, done))
+        self.state = changed(self.state, transforms=(*self.state.transforms, done))
         return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
         now = _nav_state(ekf)
         if self.state.oriented and now.covariance[2, 2] > KNOWN_YAW**2:
-            self.state = replace(
+            self.state = changed(
                 self.state, placed=False, oriented=False, pivot=now.p_W, since=now.time
             )
 
@@ -124,7 +125,7 @@ class MapFrame:
         left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
         sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
         ekf.state = ekf.state.with_position_inflated(sigma)
-        self.state = replace(self.state, placed=True, pivot=fix.value, seen=SeenPositions())
+        self.state = changed(self.state, placed=True, pivot=fix.value, seen=SeenPositions())
         self._remember(ekf, fix)
         return transform
 
@@ -144,7 +145,7 @@ class MapFrame:
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since)
         moved = ekf.state.transformed(transform.R, transform.shift)
         ekf.state = moved.with_yaw_inflated(pivot, inflation)
-        self.state = replace(self.state, oriented=True, seen=SeenPositions())
+        self.state = changed(self.state, oriented=True, seen=SeenPositions())
         return transform
 
     def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
@@ -154,12 +155,12 @@ class MapFrame:
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
         drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
         seen_now = self.state.seen.and_one(track, seen, variance, drift)
-        self.state = replace(self.state, seen=seen_now)
+        self.state = changed(self.state, seen=seen_now)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
         """A transform with what is not known of it, by the state behind it."""
         P, oriented = state.covariance, self.state.oriented
-        return replace(
+        return changed(
             transform,
             yaw_sigma=math.sqrt(P[2, 2]) if oriented else 0.0,
             position_covariance=np.zeros((3, 3)) if oriented else P[6:9, 6:9],
@@ -181,13 +182,13 @@ class MapFrame:
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
         off = result.residual
         if off is None or not is_gated(result):
-            self.state = replace(self.state, off=())
+            self.state = changed(self.state, off=())
             return result
         alike = tuple(r for r in self.state.off if r @ off > _ALIKE * norm(r) * norm(off))
-        self.state = replace(self.state, off=(*alike, off))
+        self.state = changed(self.state, off=(*alike, off))
         if len(self.state.off) < _CONVINCING:
             return result
-        self.state = replace(self.state, off=())
+        self.state = changed(self.state, off=())
         ekf.state = before.with_position_inflated(float(norm(off)))
         return ekf.update_position_W(fix.value, fix.covariance, gate)
 

@@ -10,8 +10,9 @@ tell turn and yaw apart, and a track in a frame of its own gains nothing from it
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.sequences.sequence import FloatArray
@@ -49,7 +50,7 @@ def begun(s: EkfState, sigma: float) -> EkfState:
         return s
     P = s.P.copy()
     P[s.turn_row, s.turn_row] = sigma**2
-    return replace(s, P=P)
+    return changed(s, P=P)
 
 
 def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
@@ -58,4 +59,4 @@ def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
         return s
     kept = math.exp(-seconds / SECONDS)
     P = gauss_markov(s.P, s.turn_row, kept, sigma)
-    return replace(s, P=P, network_turn=kept * s.network_turn)
+    return changed(s, P=P, network_turn=kept * s.network_turn)

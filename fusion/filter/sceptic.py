@@ -9,9 +9,10 @@ displacements agree with that one again, and no longer with the filter, they tak
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
+from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 
@@ -50,8 +51,8 @@ class Sceptic:
         """With whether a displacement fits it, and whether it fits the filter."""
         if not fits:
             alone = self.right if not fits_filter else 0
-            return replace(self, right=alone, alike=0)
-        return replace(
+            return changed(self, right=alone, alike=0)
+        return changed(
             self, right=self.right + (not fits_filter), alike=self.alike + 1 if fits_filter else 0
         )
 
@@ -87,7 +88,7 @@ class SecondOpinion:
         if self.sceptic is not None:
             mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
             work()
-            self.sceptic, self.ekf.state = replace(self.sceptic, ekf=self.ekf.state), mine
+            self.sceptic, self.ekf.state = changed(self.sceptic, ekf=self.ekf.state), mine
         return made
 
     def ask(self, fits: Callable[[], bool], fits_filter: bool) -> None:
@@ -101,6 +102,6 @@ class SecondOpinion:
             return
         mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
         fitted = fits()
-        asked = replace(self.sceptic, ekf=self.ekf.state).judged(fitted, fits_filter)
+        asked = changed(self.sceptic, ekf=self.ekf.state).judged(fitted, fits_filter)
         self.ekf.state = asked.ekf if asked.is_convincing else mine
         self.sceptic = None if asked.is_convincing or asked.is_over else asked

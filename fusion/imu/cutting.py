@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.fixes import Fix
 from stario.fusion.imu.intervals import ImuInterval
 
@@ -55,6 +55,6 @@ def cut(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
         at = (1.0 - weight) * values[k - 1] + weight * values[k]
         first[name] = np.vstack([values[:k], at])
         second[name] = np.vstack([at, values[len(values) - len(second["time"]) + 1 :]])
-    return replace(interval, **first, update=False, window=None, R_NB_window=None), replace(
+    return changed(interval, **first, update=False, window=None, R_NB_window=None), changed(
         interval, **second
     )

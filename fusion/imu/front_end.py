@@ -17,31 +17,22 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.field_buffer import FieldBuffer
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.outliers import Flags, OutlierDetector
+from stario.fusion.imu.outliers import ABSURD, Flags, OutlierDetector
+from stario.fusion.imu.window_buffer import WindowBuffer
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
-from stario.sequences.windows import (
-    MAX_IMU_GAP,
-    WINDOW_RATE,
-    WINDOW_SECONDS,
-    facing,
-    mean_heading,
-    resample,
-)
-
-_TAIL = 4
-"""Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
+from stario.sequences.windows import MAX_IMU_GAP
 
 BRIDGED = 0.2
 """A hole no longer than this [s] is bridged by what was measured at its ends, which a walker's step
@@ -52,15 +43,6 @@ _HOLE = 0.05
 
 _ALONE = 20
 """Samples in a row that stand alone: then their times are not in seconds."""
-
-_FIELDS = 64
-"""Magnetic fields that are kept: more than come between two intervals."""
-
-_FIELD_SECONDS = 0.11
-"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
-
-_ABSURD = 1e5
-"""No sensor reads this much in any unit used here; also catches infinities."""
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -77,21 +59,16 @@ class FrontEnd:
         self._config = config
         rate = config.filter.output_rate
         self._period = 1.0 / rate
-        self._blocks = round(rate * WINDOW_SECONDS)  # intervals in a window
-        self._block_grid = np.arange(round(WINDOW_RATE / rate)) / WINDOW_RATE
         self._samples: list[Sample] = []
         self._attitude: LevelledAttitude | None = None
         self._origin, self._index = 0.0, 0
         self._next = -math.inf
         self._newest = -math.inf
-        self._window: deque[NDArray[np.float32]] = deque(maxlen=self._blocks)
-        self._starts: deque[FloatArray] = deque(maxlen=self._blocks)
-        self._flagged: deque[bool] = deque(maxlen=self._blocks)
+        self._window = WindowBuffer(rate)
         self._hole = (-math.inf, -math.inf)  # the last one, its ends [s]
-        self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
-        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
+        self._fields = FieldBuffer()
         self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
         self.counts = SampleCounts()
@@ -100,7 +77,7 @@ class FrontEnd:
     def push(self, sample: Sample) -> list[ImuInterval]:
         """Take one sample in; returns the intervals it completes (mostly none, seldom several)."""
         time = sample[0]
-        if not (math.isfinite(time) and sum(map(abs, sample[1:])) < _ABSURD):
+        if not (math.isfinite(time) and sum(map(abs, sample[1:])) < ABSURD):
             self.counts.not_finite += 1
             return []
         if self._ahead and time > self._newest:
@@ -118,19 +95,8 @@ class FrontEnd:
 
     def push_field(self, time: float, field_B: FloatArray) -> None:
         """Take in a magnetic field (3,) [uT] in B, before the samples that follow it."""
-        newest = self._fields[-1][0] if self._fields else -math.inf
-        if not self._config.filter.magnetometer:
-            return
-        if math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < _ABSURD:
-            self._fields.append((time, field_B))
-        else:
+        if self._config.filter.magnetometer and not self._fields.add(time, field_B):
             self.counts.field_dropped += 1
-
-    def _field_at(self, time: float) -> FloatArray | None:
-        """The newest one at a time; fields from ahead of it wait."""
-        return next(
-            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
-        )
 
     def finish(self) -> None:
         """Nothing follows: what still waits for others to confirm its time is dropped."""
@@ -189,7 +155,7 @@ class FrontEnd:
             self.start = start
         elif self._before_long_gap is not None:
             ends = np.array([self._before_long_gap, self._samples[0]])
-            intervals.append(replace(_interval(ends, self._attitude, gap=True), anew=start))
+            intervals.append(changed(_interval(ends, self._attitude, gap=True), anew=start))
             self._before_long_gap = None
         return intervals + self._complete()
 
@@ -208,9 +174,6 @@ class FrontEnd:
         self._samples = [sample]
         self._check_pace()
         self._window.clear()
-        self._starts.clear()
-        self._flagged.clear()
-        self._tail = None
         if self._attitude is None:
             self._next = -math.inf
             return []
@@ -264,37 +227,23 @@ class FrontEnd:
         return flags
 
     def _with_window(self, table: FloatArray, flags: Flags) -> ImuInterval:
-        attitude = self._attitude
-        assert attitude is not None  # no interval is cut before the start
-        self._starts.append(attitude.R_NB)
-        self._flagged.append(flags.gyro or flags.accel or flags.missing)
+        assert self._attitude is not None  # no interval is cut before the start
         # _cut() has counted this interval already.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
-        field_B = self._field_at(table[-1, 0])
-        interval = _interval(table, attitude, update=update, flags=flags, field_B=field_B)
-        self._window.append(self._block(interval))
-        if not update or len(self._window) < self._blocks:
+        field_B = self._fields.at(table[-1, 0])
+        interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
+        flagged = flags.gyro or flags.accel or flags.missing
+        self._window.add(interval.time, interval.gyro, interval.accel, interval.attitudes, flagged)
+        window = self._window.window() if update else None
+        if window is None:
             return interval
-        window = np.concatenate(self._window, axis=1)
-        window_flagged = any(self._flagged)
-        heading = float(mean_heading(facing(np.stack(self._starts))))
-        return replace(
+        return changed(
             interval,
-            window=window,
-            R_NB_window=self._starts[0],
-            heading=heading,
-            window_flagged=window_flagged,
+            window=window.imu_N,
+            R_NB_window=window.R_NB,
+            heading=window.heading,
+            window_flagged=window.flagged,
         )
-
-    def _block(self, interval: ImuInterval) -> NDArray[np.float32]:
-        """An interval's part (6, n) of a window; averages reach half a step back: the tail."""
-        imu_N = _turned(interval.attitudes, interval.gyro, interval.accel)
-        time, tail = interval.time, self._tail
-        self._tail = np.column_stack([time[-_TAIL - 1 : -1], imu_N[-_TAIL - 1 : -1]])
-        if tail is not None:
-            time, imu_N = np.append(tail[:, 0], time), np.vstack([tail[:, 1:], imu_N])
-        grid = interval.start + self._block_grid
-        return resample(time, imu_N, grid).astype(np.float32).T
 
 
 def cut_recording(
@@ -333,12 +282,6 @@ def _interval(
         levelled_bias_sigma=attitude.bias_sigma,
         **measured,
     )
-
-
-def _turned(R: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-    """Both vectors of each sample (n, 3) turned by R (n, 3, 3), side by side (n, 6)."""
-    rows: FloatArray = np.stack([gyro, accel], axis=1) @ R.transpose(0, 2, 1)
-    return rows.reshape(-1, 6)
 
 
 def _interpolated(before: FloatArray, after: FloatArray, time: float) -> Sample:

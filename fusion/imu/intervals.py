@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.fusion.changed import changed
 from stario.fusion.imu.outliers import NO_FLAGS, Flags
 from stario.fusion.state import Health
 from stario.sequences.sequence import FloatArray
@@ -66,7 +67,7 @@ class ImuInterval:
 
     def without_window(self) -> ImuInterval:
         """What an estimator needs of it, without what only the network sees."""
-        return replace(self, window=None, attitudes=_NONE_KEPT)
+        return changed(self, window=None, attitudes=_NONE_KEPT)
 
     @property
     def start(self) -> float:

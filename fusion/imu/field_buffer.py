@@ -1,0 +1,38 @@
+"""Magnetic fields on their way to the intervals that they belong to."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from stario.fusion.imu.outliers import ABSURD
+from stario.sequences.sequence import FloatArray
+
+_FIELDS = 64
+"""Fields that are kept: more than come between two intervals."""
+
+_FIELD_SECONDS = 0.11
+"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
+
+
+class FieldBuffer:
+    """The newest magnetic fields of a stream."""
+
+    def __init__(self) -> None:
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
+
+    def add(self, time: float, field_B: FloatArray) -> bool:
+        """Take in a field (3,) [uT] in B; False where its value or its time cannot be right."""
+        newest = self._fields[-1][0] if self._fields else -math.inf
+        right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD
+        if right:
+            self._fields.append((time, field_B))
+        return right
+
+    def at(self, time: float) -> FloatArray | None:
+        """The newest one at a time [s]; fields from ahead of it wait."""
+        return next(
+            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
+        )
