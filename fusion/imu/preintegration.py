@@ -13,7 +13,6 @@ design", 1998 (coning, sculling).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,7 +26,6 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.outliers import Flags
 from stario.sequences.attitude.so3 import skew
-from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 
@@ -201,12 +199,7 @@ def preintegrate(
         noise: noise densities over this interval, or over each of the n steps; the walks are the
             first's.
         gravity: magnitude [m/s^2].
-
-    Raises:
-        InputError: fewer than two samples, shapes that differ, time that does not increase, or a
-            value that is not finite.
     """
-    _check_samples(time, gyro, accel)
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
     each = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
     held = each[0]
@@ -276,16 +269,3 @@ def _set_white_noise(params: Any, noise: ImuNoise) -> None:
 
 # Noise that grows with motion comes in steps (`segments`): the range in use fits.
 _params = lru_cache(maxsize=512)(_new_params)
-
-
-def _check_samples(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-    n = len(time)
-    if n < 2:
-        raise InputError("time", f"{n} samples", "at least 2, the ends of the interval")
-    if gyro.shape != (n, 3) or accel.shape != (n, 3):
-        raise InputError("gyro, accel", f"{gyro.shape}, {accel.shape}", f"({n}, 3) as time")
-    if not (time[1:] > time[:-1]).all():
-        raise InputError("time", "a step that is not positive", "strictly increasing seconds")
-    # One product sees a not-a-number or infinite value in either array.
-    if not math.isfinite(np.vdot(gyro, gyro) + np.vdot(accel, accel)):
-        raise InputError("gyro, accel", "a value that is not finite", "finite samples")

@@ -8,7 +8,6 @@ from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.preintegration import corrected_increments, preintegrate
 from stario.fusion.lie import exp_se23, log_se23
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
-from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 
 GRAVITY = 9.80665
@@ -252,14 +251,3 @@ def test_noise_does_not_depend_on_the_sensor_rate() -> None:
         for rate in (100, 400)
     )
     np.testing.assert_allclose(np.diag(fast), np.diag(slow), rtol=0.02)
-
-
-def test_samples_that_do_not_fit_are_named() -> None:
-    t, gyro, accel = samples(200, 0.1)
-    biases = np.zeros(3), np.zeros(3), NOISE, GRAVITY
-    with pytest.raises(InputError, match="1 samples"):
-        preintegrate(t[:1], gyro[:1], accel[:1], *biases)
-    with pytest.raises(InputError, match="increasing"):
-        preintegrate(t[::-1], gyro, accel, *biases)
-    with pytest.raises(InputError, match="finite"):
-        preintegrate(t, gyro, np.where(accel == accel[3], np.nan, accel), *biases)
