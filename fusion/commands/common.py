@@ -153,6 +153,7 @@ def track_table(
     """
     columns = {
         "ate_m": "ATE [m]",
+        "ate_fit_m": "fitted [m]",
         "rte_m": "RTE [m]",
         "pde": "PDE",
         "aye_rad": "AYE [rad]",
@@ -165,7 +166,7 @@ def track_table(
     lines = aligned([["", *columns.values()], *rows])
     if truth is None:
         return "\n".join(lines)
-    lines += [f"{key}: {words[key]}." for key in ("ate_m", "rte_m", "alignment")]
+    lines += [f"{key}: {words[key]}." for key in ("ate_m", "alignment", "ate_fit_m", "rte_m")]
     covered = float(truth.covers(time).mean())
     if covered < _WHOLE:
         lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")

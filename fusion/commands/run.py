@@ -89,7 +89,7 @@ def _run(
         track = navigator.run(sequence, progress, fixes)
     truth, backend = sequence.truth, navigator.backend
     alignment = alignment_with(fixes)
-    metrics = measure(track, truth, alignment)
+    metrics = measure(track, sequence, alignment)
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, alignment)
     words = metric_words(alignment)
     written = write_run(

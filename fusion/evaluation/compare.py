@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.known_positions import LEAST, position_error
 from stario.fusion.evaluation.pedestrian import pedestrian_track
 from stario.fusion.evaluation.tracks import (
     inertial_track,
@@ -37,9 +38,11 @@ Metrics = dict[str, float | None]
 
 METRICS = (
     "ate_m",
+    "ate_fit_m",
     "rte_m",
     "pde",
     "aye_rad",
+    "known_positions_m",
     "nees",
     "nis",
     "seconds_network",
@@ -49,6 +52,10 @@ METRICS = (
 
 METRIC_WORDS = {
     **CONVENTIONS,
+    "ate_fit_m": "the same after a fit of yaw and position over all poses, which asks for the "
+    "track's shape and length alone [m]",
+    "known_positions_m": "root mean square of the horizontal distance to positions or waypoints "
+    "known without attitude, after a fit of yaw and position [m]",
     "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 3)",
     "nis": "mean NIS of the network's measurements (expected: 3)",
     "seconds_network": "computing time of the network [s]",
@@ -143,24 +150,29 @@ def compare(
     tracks["ekf"] = navigator.track(preprocessed, progress, fixes)
     tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed, fixes=fixes)
     alignment = alignment_with(fixes)
-    metrics = {name: measure(track, sequence.truth, alignment) for name, track in tracks.items()}
+    metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics, alignment)
 
 
-def measure(track: Track, truth: Trajectory | None, alignment: Alignment = "first") -> Metrics:
+def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:
     """Figures of one track; null where there is no truth, or no covariance.
 
     Args:
         track: to measure.
-        truth: None where there is none.
+        sequence: its recording.
         alignment: of position errors and of the NEES, as of `align`.
     """
     figures: Metrics = dict.fromkeys(METRICS)
+    truth = sequence.truth
     if truth is not None:
         result = evaluate_track(track.trajectory, truth, alignment=alignment)
         figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
+        figures["ate_fit_m"] = evaluate_track(track.trajectory, truth, alignment="yaw").ate_m
         if track.trajectory.position_covariance_W is not None:
             figures["nees"] = position_nees(track.trajectory, truth, alignment).median
+    elif sequence.positions is not None:
+        error, count = position_error(track, sequence.positions)
+        figures["known_positions_m"] = error if count >= LEAST else None
     figures["nis"] = track.nis
     figures["seconds_network"] = track.seconds_network
     figures["seconds_filter"] = track.seconds_filter

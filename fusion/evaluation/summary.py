@@ -50,7 +50,7 @@ def scores_of(comparison: Comparison) -> Scores:
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """Figures of every recording with medians and means over them, as plain values."""
     records = {scores.name: scores.record for scores in recordings}
-    metrics = ("ate_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+    metrics = ("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m", "nees", "nis")
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}

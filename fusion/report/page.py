@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
 _COLUMNS = {
     "ate_m": ("ATE [m]", 2),
+    "ate_fit_m": ("fitted [m]", 2),
     "rte_m": ("RTE [m]", 2),
     "aye_rad": ("AYE [rad]", 3),
     "nees": ("NEES", 1),

@@ -23,10 +23,13 @@ from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import ImuSequence, PositionTrack
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
-KEYS = {"ate_m", "rte_m", "pde", "aye_rad", "nees", "nis", "seconds_network", "seconds_filter"}
+KEYS = {
+    *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m"),
+    *("nees", "nis", "seconds_network", "seconds_filter"),
+}
 
 Make = Callable[..., Any]
 
@@ -57,7 +60,10 @@ def compared(walk: ImuSequence, model: Anything) -> Comparison:
 
 @pytest.fixture(scope="module")
 def blind(walk: ImuSequence, model: Anything) -> Comparison:
-    return compare(model, replace(walk.without_truth(), name="blind"), CONFIG)
+    assert walk.truth is not None
+    time, position = walk.truth.time[::10], walk.truth.position_W[::10, :2]
+    waypoints = PositionTrack(time, position + np.array([5.0, -3.0]), "waypoints")
+    return compare(model, replace(walk.without_truth(), name="blind", positions=waypoints), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +74,24 @@ def folder(
     written = write_comparison(path, [compared, blind], CONFIG)
     assert sorted(written) == sorted(p for p in path.rglob("*") if p.is_file())
     return path
+
+
+def test_a_fit_takes_out_what_the_first_pose_turned(compared: Comparison) -> None:
+    for name, figures in compared.metrics.items():
+        first, fitted = figures["ate_m"], figures["ate_fit_m"]
+        assert first is not None
+        assert fitted is not None
+        assert fitted <= first, name
+        assert figures["known_positions_m"] is None
+
+
+def test_waypoints_measure_a_track_without_poses(compared: Comparison, blind: Comparison) -> None:
+    track, truth = compared.tracks["ekf"].trajectory, compared.sequence.truth
+    assert truth is not None
+    fitted = evaluate_track(track, truth, alignment="yaw", horizontal=True).ate_m
+    error = blind.metrics["ekf"]["known_positions_m"]
+    assert error == pytest.approx(fitted, rel=0.2)
+    assert blind.metrics["ekf"]["ate_m"] is None
 
 
 def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> None:
@@ -97,14 +121,15 @@ def test_figures_are_null_where_nobody_can_know_them(folder: Path, walk: ImuSequ
     blind = content["blind"]
     assert blind["path_m"] is None
     for figures in blind["tracks"].values():
-        assert all(figures[k] is None for k in KEYS - {"nis", "seconds_network", "seconds_filter"})
+        known = {"known_positions_m", "nis", "seconds_network", "seconds_filter"}
+        assert all(figures[k] is None for k in KEYS - known)
     assert all(v is None for v in blind["tracks"]["network_true_attitude"].values())
     assert blind["tracks"]["ekf"]["nis"] == content[walk.name]["tracks"]["ekf"]["nis"]
     seen = content[walk.name]["tracks"]
-    assert all(v is not None for v in seen["ekf"].values())
+    assert all(v is not None for k, v in seen["ekf"].items() if k != "known_positions_m")
     for name in ("inertial", "pdr", "network", "network_true_attitude"):
         unknown = {k for k, v in seen[name].items() if v is None}
-        assert unknown == {"nees", "nis"}
+        assert unknown == {"known_positions_m", "nees", "nis"}
 
 
 def test_truth_changes_no_track(compared: Comparison, blind: Comparison) -> None:
