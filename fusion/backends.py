@@ -158,7 +158,7 @@ def track_recording(
 ) -> Track:
     """The track of a recording: filtered, then solved by the back end."""
     began = perf_counter()
-    queue = FixQueue(fixes)
+    queue = FixQueue(fixes, most=math.inf)  # a recording's are all there at once
     filtered = _filtered(recording, config, prior, queue, progress)
     solution = backend.solve(filtered, config)
     counts, estimator = recording.front_end.counts, filtered.estimator

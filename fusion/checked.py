@@ -10,6 +10,23 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 
+def check_type(name: str, value: object, kind: type, otherwise: str | None = "") -> None:
+    """Refuse an argument of another type.
+
+    Args:
+        name: of the argument.
+        value: given.
+        kind: it must be of.
+        otherwise: what gives one; None where the argument may be None as well.
+
+    Raises:
+        InputError: naming the argument.
+    """
+    if not (isinstance(value, kind) or (otherwise is None and value is None)):
+        expected = f"of type {kind.__name__}" + (" or None" if otherwise is None else "")
+        raise InputError(name, f"{value!r:.60}", expected, otherwise or "")
+
+
 def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     """A copy of `value` as float64 of a given shape.
 

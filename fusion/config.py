@@ -10,6 +10,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass, field, fields
+from numbers import Integral
 from pathlib import Path
 
 from stario.sequences.errors import ConfigError
@@ -79,12 +80,16 @@ class FilterConfig:
     declination: float | None = None
 
     def __post_init__(self) -> None:
-        if self.update_rate not in UPDATE_RATES:
+        if not (isinstance(self.update_rate, Integral) and self.update_rate in UPDATE_RATES):
             raise ConfigError("update_rate", repr(self.update_rate), f"one of {UPDATE_RATES}")
-        if not 0.5 <= self.gate < 1.0:
-            raise ConfigError("gate", repr(self.gate), "a probability from 0.5 to below 1")
+        check_number(self, "gate", 0.5, 1.0)
+        if self.gate == 1.0:
+            raise ConfigError("gate", "1", "a probability from 0.5 to below 1")
+        for name in ("adaptive", "magnetometer"):
+            if not isinstance(getattr(self, name), bool):
+                raise ConfigError(name, repr(getattr(self, name)), "True or False")
         for item in fields(self):
-            if item.name not in ("update_rate", "magnetometer", "declination"):
+            if item.name not in ("update_rate", "gate", "adaptive", "magnetometer", "declination"):
                 check_number(self, item.name)
         if self.declination is not None:
             check_number(self, "declination", -math.pi, math.pi)
@@ -149,6 +154,10 @@ class NavigatorConfig:
     gravity: float = STANDARD_GRAVITY
 
     def __post_init__(self) -> None:
+        for name, kind in (("noise", ImuNoise), ("filter", FilterConfig), ("graph", GraphConfig)):
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise ConfigError(name, f"{value!r:.60}", f"of type {kind.__name__}")
         check_number(self, "gravity", 9.5, 10.1)
 
 

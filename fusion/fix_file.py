@@ -19,6 +19,7 @@ import numpy as np
 from stario.fusion.fixes import KINDS, Fix, make_fix
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.time_order import advancing
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 
@@ -48,7 +49,9 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
     Raises:
         InputError: they are of another clock.
     """
-    times, start, stop = [fix.time for fix in fixes], sequence.time[0], sequence.time[-1]
+    counted = sequence.time[np.isfinite(sequence.time)]
+    counted = counted[advancing(counted)]
+    times, start, stop = [fix.time for fix in fixes], counted[0], counted[-1]
     if times and not any(start <= t <= stop for t in times):
         found = f"times from {min(times):.6g} to {max(times):.6g} s"
         expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from stario.fusion.checked import floored, shaped
+from stario.fusion.checked import check_type, floored, shaped
 from stario.fusion.state import Health
 from stario.sequences.sequence import FloatArray
 
@@ -25,7 +25,7 @@ KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 """Kinds of fixes and how many numbers each measures."""
 
 MOST_WAITING = 10_000
-"""So many fixes may wait for their time; more are refused, since memory must not grow."""
+"""So many fixes of a stream may wait for their time, since memory must not grow."""
 
 _SMALLEST_SIGMA = 1e-4
 """Nothing is measured better than this [m], [m/s], [rad]."""
@@ -113,12 +113,17 @@ def by_time(fix: Fix) -> tuple[float, str]:
 class FixQueue:
     """Fixes that wait for their time, in its order.
 
+    Args:
+        fixes: to begin with.
+        most: so many may wait; beyond, those that lie furthest ahead are refused.
+
     Attributes:
         waiting: the fixes.
         refused: how many others were left out, by reason.
     """
 
-    def __init__(self, fixes: Iterable[Fix] = ()) -> None:
+    def __init__(self, fixes: Iterable[Fix] = (), most: float = MOST_WAITING) -> None:
+        self._most = most
         self.waiting: list[Fix] = []
         self.refused: dict[str, int] = {}
         for fix in fixes:
@@ -126,13 +131,14 @@ class FixQueue:
 
     def add(self, fix: Fix) -> None:
         """Keep a fix until `due`; one without meaning is refused and counted."""
-        reason = fix.fault()
-        if not reason and len(self.waiting) >= MOST_WAITING:
-            reason = "too many waiting"
-        if reason:
+        check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix make one")
+        if reason := fix.fault():
             self.refuse(reason)
-        else:
-            bisect.insort(self.waiting, fix, key=by_time)
+            return
+        bisect.insort(self.waiting, fix, key=by_time)
+        if len(self.waiting) > self._most:
+            self.waiting.pop()
+            self.refuse("too many waiting")
 
     def due(self, time: float) -> list[Fix]:
         """Give out the fixes up to a time [s], in their order."""

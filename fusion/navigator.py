@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
+from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.continuous import ContinuousPose, advanced
 from stario.fusion.filter.initial import PriorPose
@@ -51,7 +52,7 @@ class Navigator:
         backend: "ekf", or "graph" for the factor graph, which is more accurate and takes more time.
 
     Raises:
-        InputError: there is no such back end.
+        InputError: there is no such back end, or an argument is of another type.
     """
 
     def __init__(
@@ -61,8 +62,13 @@ class Navigator:
         prior: PriorPose | None = None,
         backend: BackendName = "ekf",
     ) -> None:
-        if backend not in BACKENDS:
+        if not (isinstance(backend, str) and backend in BACKENDS):
             raise InputError("backend", repr(backend), f"one of {', '.join(BACKENDS)}")
+        if not hasattr(model, "predict"):
+            remedy = "load_model(name) gives one"
+            raise InputError("model", repr(model), "a model with `predict`", remedy)
+        check_type("config", config, NavigatorConfig, None)
+        check_type("prior", prior, PriorPose, None)
         self.backend = backend
         self.model = model
         self.prior = prior
@@ -243,6 +249,7 @@ class Navigator:
         Raises:
             InputError: as for `run`.
         """
+        check_type("sequence", sequence, ImuSequence, "read_recording(path) gives one")
         return preprocess(sequence, self.model, self.config, progress)
 
     def track(
@@ -251,7 +258,21 @@ class Navigator:
         progress: Progress = _silent,
         fixes: Iterable[Fix] = (),
     ) -> Track:
-        """The back end's track of a prepared recording; fixes as for `run`."""
+        """The back end's track of a prepared recording; fixes as for `run`.
+
+        Raises:
+            InputError: it was prepared for another update rate.
+        """
+        check_type(
+            "preprocessed", preprocessed, PreprocessedRecording, "observe(sequence) gives one"
+        )
+        if preprocessed.update_rate != self.config.filter.update_rate:
+            raise InputError(
+                "preprocessed: update_rate",
+                str(preprocessed.update_rate),
+                f"this navigator's {self.config.filter.update_rate}",
+                "observe with the same update rate",
+            )
         backend = BACKENDS[self.backend]
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 

@@ -33,6 +33,7 @@ class PreprocessedRecording:
 
     Attributes:
         intervals: in order.
+        update_rate: of the network [Hz], as it was cut for.
         measurements: the network's displacement of the window that ends with each interval, None
             where there is no window.
         front_end: with its counts and the start.
@@ -41,6 +42,7 @@ class PreprocessedRecording:
     """
 
     intervals: list[ImuInterval]
+    update_rate: int
     measurements: list[Displacement | None]
     front_end: FrontEnd
     seconds_front_end: float
@@ -71,7 +73,9 @@ def preprocess(
     measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
-        intervals, measurements, front_end, seconds_front_end, seconds_network
+        *(intervals, config.filter.update_rate, measurements, front_end),
+        seconds_front_end=seconds_front_end,
+        seconds_network=seconds_network,
     )
 
 

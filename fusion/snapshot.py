@@ -144,6 +144,8 @@ def unpack(data: bytes) -> dict[str, Any]:
     Raises:
         InputError: the bytes are no snapshot, or one of another version.
     """
+    if not isinstance(data, bytes | bytearray | memoryview):
+        raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise InputError("snapshot", "bytes of something else", f"bytes of a {FORMAT}, whole")
     try:
@@ -157,7 +159,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         return {key: _whole(value, arrays) for key, value in tree.items()}
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # flipped bytes meet any line of zip, NumPy or JSON
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("snapshot", found, f"bytes of a {FORMAT}, whole") from error
 

@@ -123,6 +123,14 @@ def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
     return np.asarray((speed > _FASTEST_STEP) | (step > _LONGEST_STEP))
 
 
+def _ticks(time: FloatArray) -> NDArray[np.int64]:
+    """Which of the times (n,) [s] make steps of `_TRACK_STEP`, or of more across a gap."""
+    if not len(time):
+        return np.zeros(0, dtype=np.int64)
+    whole = np.floor((time - time[0]) / _TRACK_STEP)
+    return np.flatnonzero(np.diff(whole, prepend=-1.0) > 0.0)
+
+
 def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Start and stop (M,) [s], displacement (M, 3) [m] and the ends' deviations (M, 2) [m]."""
     time, position = known.time[known.valid], known.position_W[known.valid]
@@ -132,8 +140,7 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         ends = np.arange(len(time))
         whole = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
     else:
-        ends = np.searchsorted(time, np.arange(time[0], time[-1], _TRACK_STEP))
-        ends = np.unique(ends)
+        ends = _ticks(time)
         breaks = np.concatenate([[0], np.cumsum(broken_steps(time, position))])
         whole = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]

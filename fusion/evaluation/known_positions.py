@@ -30,7 +30,7 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
 
 
 def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
-    """Those of the known positions that lie within a track, seen from above.
+    """Those of the known positions that lie within a track and in none of its gaps, from above.
 
     They are turned about the vertical and shifted to where they fit the track best, in its frame.
 
@@ -42,7 +42,7 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
         The positions (n, 2) [m], of which a single one lies on the track; None where none does
         in time.
     """
-    inside = known.valid & (known.time >= track.time[0]) & (known.time <= track.time[-1])
+    inside = known.valid & track.trajectory.covers(known.time)
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
         return None

@@ -6,6 +6,7 @@ right-invariant error (Barrau and Bonnabel 2017).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,6 +52,11 @@ _ROUNDING = 1e-6
 """Of times [s]."""
 
 
+def turned_in_gap(seconds: float) -> float:
+    """Variance of a walker's turn since a gap began [rad^2]: as of one rate all through it."""
+    return min(GAP_TURN * seconds, UNKNOWN_YAW) ** 2
+
+
 class Estimator:
     """The state-cloning EKF driven by IMU intervals.
 
@@ -78,7 +84,9 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
-        self._map_frame = MapFrame(prior is not None, oriented, f.gate, f.network_turn_sigma)
+        self._map_frame = MapFrame(
+            None if prior is None else prior.p_W, oriented, f.gate, f.network_turn_sigma
+        )
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
@@ -175,19 +183,22 @@ class Estimator:
             self._map_frame.lose_yaw(self.ekf)
             return None, []
         if not fixes:
-            return self._propagate_piece(interval), []
+            return self._propagate_piece(interval, interval.start), []
         accepted = []
         for piece, due in parts(interval, fixes):
             if piece is not None:
-                self._propagate_piece(piece)
+                self._propagate_piece(piece, interval.start)
             accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
         return None, accepted
 
-    def _propagate_piece(self, interval: ImuInterval) -> Segment:
+    def _propagate_piece(self, interval: ImuInterval, began: float) -> Segment:
+        """A piece of the interval that began at a time [s]."""
         before = self.ekf.state.p_W
         segment = self._opinion.both(lambda: self._propagate_samples(interval))
         if interval.gap:
-            sigma = min(GAP_TURN * segment.duration, UNKNOWN_YAW)
+            sigma = math.sqrt(
+                turned_in_gap(interval.stop - began) - turned_in_gap(interval.start - began)
+            )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
         return segment

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.checked import checked
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.map_frame import UNKNOWN_YAW
@@ -14,13 +15,18 @@ from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
+from stario.sequences.settings import check_number
 
 STILL_TILT_SIGMA = 0.01
 """Of the first attitude when the device was at rest [rad]."""
 
 WALKING_SPEED = 1.5
 """How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
+
+_ORTHOGONAL = 1e-4
+"""By so much a rotation's rows may be off unit length and right angles: rounded input."""
 
 FARTHEST = 1e4
 """No gap is taken to have led farther than this [m]: the covariance must keep its digits."""
@@ -38,6 +44,10 @@ class PriorPose:
         yaw_sigma: [rad].
         velocity_sigma: per axis [m/s].
         position_sigma: per axis [m].
+
+    Raises:
+        InputError: a value has another shape or is not finite, `R_WB` is no rotation, or a sigma is
+            negative.
     """
 
     R_WB: FloatArray
@@ -47,6 +57,16 @@ class PriorPose:
     yaw_sigma: float = 0.02
     velocity_sigma: float = 0.1
     position_sigma: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("v_W", "p_W"):
+            object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
+        R_WB = checked("R_WB", self.R_WB, (3, 3))
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R_WB) < 0.0:
+            raise InputError("R_WB", "a matrix that is no rotation", "a rotation from B to W")
+        object.__setattr__(self, "R_WB", R_WB)
+        for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
+            check_number(self, name)
 
 
 def initialise(

@@ -48,7 +48,14 @@ linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 
 
 _CONVINCING, _ALIKE = 3, 0.8
 """Positions in a row taken for outliers whose residuals point the same way (cosine above this) are
-right, and the track is not."""
+right, and the track is not; so are those in a row that are not as far from the pivot as the track
+has led from it: then the pivot was wrong."""
+
+_BETTER = 2.0
+"""A position that is so many times surer than the track's places the track anew."""
+
+_AWRY = 0.5
+"""Share of the shorter one by which a network's way and the true one may differ in length."""
 
 _MUCH_LARGER, _LARGEST = 1e3, 1e5
 """An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
@@ -66,6 +73,7 @@ class MapFrameState:
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
         seen: positions since it was placed, from the pivot, while its yaw is not known.
+        apart: how many of the last positions lay at another distance from the pivot than the track.
         off: (3,) residuals of the last positions, if they were outliers [m].
     """
 
@@ -75,6 +83,7 @@ class MapFrameState:
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
     seen: SeenPositions = field(default_factory=SeenPositions)
+    apart: int = 0
     off: tuple[FloatArray, ...] = ()
 
 
@@ -82,7 +91,7 @@ class MapFrame:
     """Applies fixes to a filter, and transforms the filter's frame where it must.
 
     Args:
-        placed: whether the first position was given.
+        pivot: (3,) the first position [m], None where it was not given.
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
         turn_sigma: of the network's turn, `FilterConfig.network_turn_sigma` [rad].
@@ -91,18 +100,22 @@ class MapFrame:
         state: what is known of the frame.
     """
 
-    def __init__(self, placed: bool, oriented: bool, gate: float, turn_sigma: float) -> None:
-        self.state = MapFrameState(placed, oriented)
+    def __init__(
+        self, pivot: FloatArray | None, oriented: bool, gate: float, turn_sigma: float
+    ) -> None:
+        self.state = MapFrameState(pivot is not None, oriented)
+        if pivot is not None:
+            self.state = changed(self.state, pivot=pivot)
         self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         """Take in a fix at the filter's time."""
-        if fix.kind == "position" and not self.state.placed:
+        if fix.kind == "position" and self._asks_for_place(ekf, fix):
             transform: FrameTransform | None = self._place(ekf, fix)
         elif self.state.oriented:
             return self._update(ekf, fix)
         else:
-            transform = self._orient(ekf, fix)
+            transform = None if self.state.apart else self._orient(ekf, fix)
         if transform is None:
             return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known")
         result = self._update(ekf, fix)
@@ -118,6 +131,25 @@ class MapFrame:
                 self.state, placed=False, oriented=False, pivot=now.p_W, since=now.time
             )
 
+    def _asks_for_place(self, ekf: StateCloningEkf, fix: Fix) -> bool:
+        """Whether a position is to place the track: the first, and later a much better one.
+
+        While the yaw is not known a position further on says little of where the track is; but the
+        first may have been bad, which those behind it show.
+        """
+        if not self.state.placed or self.state.oriented:
+            return not self.state.placed
+        now, pivot = _nav_state(ekf), self.state.pivot
+        P = _without_yaw(now.covariance, 6)
+        known = float(np.trace(P)) + now.covariance[8, 8]
+        if _BETTER**2 * float(np.trace(fix.covariance)) < known:
+            return True
+        seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
+        sigma = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
+        apart = abs(seen - ours) > 3.0 * sigma + _AWRY * min(seen, ours)
+        self.state = changed(self.state, apart=self.state.apart + 1 if apart else 0)
+        return self.state.apart >= _CONVINCING
+
     def _place(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform:
         now, since = _nav_state(ekf), self.state.since
         transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
@@ -125,7 +157,9 @@ class MapFrame:
         left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
         sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
         ekf.state = ekf.state.with_position_inflated(sigma)
-        self.state = changed(self.state, placed=True, pivot=fix.value, seen=SeenPositions())
+        self.state = changed(
+            self.state, placed=True, pivot=fix.value, seen=SeenPositions(), apart=0
+        )
         self._remember(ekf, fix)
         return transform
 
@@ -134,7 +168,7 @@ class MapFrame:
         pivot, since = self.state.pivot, self.state.since
         turn, sigma = _turn(_nav_state(ekf), pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
-        if not (math.isfinite(turn) and (sigma < FAR_ENOUGH or fix.kind == "yaw")):
+        if not (math.isfinite(turn) and sigma <= (KNOWN_YAW if fix.kind == "yaw" else FAR_ENOUGH)):
             if fix.kind != "position":
                 return None
             turn, inflation = self.state.seen.turn

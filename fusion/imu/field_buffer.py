@@ -13,6 +13,9 @@ from stario.sequences.sequence import FloatArray
 _FIELDS = 64
 """Fields that are kept: more than come between two intervals."""
 
+_AHEAD = 1.0
+"""A field that is this much ahead of the newest sample [s] is refuted by the next field."""
+
 _FIELD_SECONDS = 0.11
 """How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
 
@@ -23,8 +26,17 @@ class FieldBuffer:
     def __init__(self) -> None:
         self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
 
-    def add(self, time: float, field_B: FloatArray) -> bool:
-        """Take in a field (3,) [uT] in B; False where its value or its time cannot be right."""
+    def add(self, time: float, field_B: FloatArray, now: float) -> bool:
+        """Take in a field (3,) [uT] in B; False where its value or its time cannot be right.
+
+        Args:
+            time: its own [s].
+            field_B: (3,) [uT].
+            now: time of the newest sample [s]. One wild time must not make all that follow look
+                late, so a field far ahead of it counts only until another one comes.
+        """
+        while self._fields and -math.inf < now < self._fields[-1][0] - _AHEAD:
+            self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD
         if right:

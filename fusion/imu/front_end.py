@@ -95,8 +95,13 @@ class FrontEnd:
 
     def push_field(self, time: float, field_B: FloatArray) -> None:
         """Take in a magnetic field (3,) [uT] in B, before the samples that follow it."""
-        if self._config.filter.magnetometer and not self._fields.add(time, field_B):
+        if self._config.filter.magnetometer and not self._fields.add(time, field_B, self._newest):
             self.counts.field_dropped += 1
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest sample that counts [s]; minus infinity before the first."""
+        return self._newest
 
     def finish(self) -> None:
         """Nothing follows: what still waits for others to confirm its time is dropped."""
@@ -260,7 +265,8 @@ def cut_recording(
         )
     )
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        while fields and fields[0][0] <= sample[0]:
+        # A wild time must not bring all fields of the future at once.
+        while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
             front_end.push_field(*fields.popleft())
         intervals += front_end.push(tuple(sample))
     front_end.finish()

@@ -32,6 +32,7 @@ from stario.sequences.sequence import FloatArray
 # gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
 # the graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
+_LEAST_WALK = 1e-7
 
 _GAP_STEPS = 10
 
@@ -257,8 +258,9 @@ def _new_params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     _set_white_noise(params, noise)
     params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
-    params.setBiasOmegaCovariance(_EYE * noise.gyro_walk**2)
-    params.setBiasAccCovariance(_EYE * noise.accel_walk**2)
+    # gtsam's graph factors invert them: none may be zero.
+    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _LEAST_WALK) ** 2)
+    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _LEAST_WALK) ** 2)
     return params
 
 

@@ -128,6 +128,9 @@ class TrainingConfig:
                 raise ConfigError(name, repr(value), f"a count of at least {least}")
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
+        for name, share in self.shares.items():
+            if not (isinstance(share, int | float) and 0.0 <= share <= 1.0):
+                raise ConfigError(f"shares, {name}", repr(share), "a share from 0 to 1")
         if self.architecture not in ARCHITECTURES:
             known = f"one of {', '.join(ARCHITECTURES)}"
             raise ConfigError("architecture", repr(self.architecture), known)

@@ -46,3 +46,11 @@ def test_positions_are_drawn_where_they_fit_the_track_in_its_own_frame():
     shown = placed(track(turned), waypoints(PATH, later=0.0))
     np.testing.assert_allclose(shown.position_W, turned[::40, :2], atol=1e-9)
     assert placed(track(PATH), waypoints(PATH, later=100.0)) is None
+
+
+def test_positions_in_a_gap_of_the_track_are_left_out():
+    known = np.r_[0:50, 150:201]
+    broken = Trajectory(TIME[known], PATH[known], Rotation.identity(len(known)))
+    gapped = SimpleNamespace(time=TIME[known], trajectory=broken)
+    around = PositionTrack(TIME[::20], PATH[::20, :2], "waypoints")
+    assert position_error(gapped, around) == (pytest.approx(0.0, abs=1e-9), 6)

@@ -10,9 +10,10 @@ import pytest
 from support import GRAPH as CONFIG
 from support import stream
 
-from stario.fusion import Navigator, NavState
+from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.fixes import Fix, position_fix, yaw_fix
-from stario.sequences.attitude.rotations import about_z
+from stario.fusion.lie import yaw_twist
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
@@ -144,3 +145,84 @@ def test_neither_gaps_nor_fixes_let_a_streams_graph_grow(
         navigator = Navigator(oracle, CONFIG, backend="graph")
         given(navigator, recording, fixes)
         assert len(navigator._estimator._builder.graph.keyframes) < 16
+
+
+def yaw_off(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np.ndarray]:
+    """Error of the yaw after the fixes' frame was found [rad], and its sigma."""
+    attitude = walk.truth.at(np.array([s.time for s in states])).attitude_WB
+    yaw = np.array([yaw_twist(s.R_WB) for s in states]) - yaw_of(attitude) - 2.0
+    sigma = np.array([np.sqrt(s.covariance[2, 2]) for s in states])
+    return np.angle(np.exp(1j * yaw)), sigma
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("off", [[200.0, 0.0, 0.0], [0.0, -60.0, 0.0]])
+def test_a_first_position_that_was_bad_turns_nothing(
+    make_walk: Make, make_oracle: Make, backend: Any, off: list[float]
+) -> None:
+    walk = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
+    bad = position_fix(fixes[0].time, fixes[0].value + off, fixes[0].covariance)
+    states = given(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
+    error, sigma = yaw_off(walk, states[-20:])
+    assert (np.abs(error) < 4.0 * sigma).all()
+    assert sigma[-1] < 0.2
+    end = fixes[-1]
+    at_end = min(states, key=lambda s: abs(s.time - end.time))
+    assert np.linalg.norm(at_end.p_W - end.value) < 1.5
+
+
+def test_a_better_position_places_who_stands_still(still_model: Any) -> None:
+    time = np.arange(0.0, 20.0, 0.01)
+    still = ImuSequence(
+        "still", time, np.zeros((len(time), 3)), np.tile([0.0, 0.0, 9.81], (len(time), 1))
+    )
+    fixes = [position_fix(3.0, [40.0, -30.0, 8.0], 2500.0 * np.eye(3))]
+    fixes += [position_fix(t, np.zeros(3), np.eye(3)) for t in (5.0, 8.0, 11.0)]
+    track = Navigator(still_model).run(still, fixes=fixes)
+    assert np.linalg.norm(track.trajectory.position_W[-1]) < 1.0
+    sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
+    assert ((sigma > 0.5) & (sigma < 1.5)).all()
+
+
+def test_a_yaw_that_says_nothing_tells_no_direction(make_walk: Make, make_oracle: Make) -> None:
+    walk = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
+    wrong = yaw_fix(3.0, 0.0, 2.0)
+    with_it, without = (
+        Navigator(oracle, CONFIG).run(walk, fixes=f) for f in ([*fixes, wrong], fixes)
+    )
+    refused = without.health.fixes["yaw not known"] + 1
+    assert with_it.health.fixes == without.health.fixes | {"yaw not known": refused}
+    np.testing.assert_array_equal(with_it.trajectory.position_W, without.trajectory.position_W)
+
+
+def test_a_prior_position_is_what_the_track_turns_about(make_walk: Make, make_oracle: Make) -> None:
+    walk = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
+    fixes = fixes_of(walk, np.arange(3.0, 38.0, 3.0), far)
+    first = walk.truth.attitude_WB[0].as_matrix()
+    p_W = turn.apply(walk.truth.position_W[0]) + far
+    prior = PriorPose(first, np.zeros(3), p_W, yaw_sigma=3.0, position_sigma=1.0)
+    navigator = Navigator(oracle, CONFIG, prior)
+    error, sigma = yaw_off(walk, given(navigator, walk, fixes))
+    assert (np.abs(error) < 4.0 * sigma).all()
+    assert sigma[-1] < 0.1
+
+
+def test_what_is_measured_in_a_gap_makes_its_turn_no_surer(
+    make_walk: Make, without: Any, still_model: Any
+) -> None:
+    walk = make_walk(3, 20.0)
+    broken = without(walk, (walk.time > 8.0) & (walk.time < 11.0))
+    prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), np.zeros(3), walk.truth.position_W[0])
+    useless = [position_fix(t, np.zeros(3), 1e6 * np.eye(3)) for t in np.arange(8.2, 11.0, 0.2)]
+    plain, cut = (Navigator(still_model, prior=prior).run(broken, fixes=f) for f in ([], useless))
+    behind = np.searchsorted(plain.time, 11.05)
+    assert plain.covariance[behind, 2, 2] > 1.0
+    np.testing.assert_allclose(
+        cut.covariance[behind, 2, 2], plain.covariance[behind, 2, 2], rtol=1e-3
+    )

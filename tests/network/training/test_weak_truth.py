@@ -249,3 +249,20 @@ def test_a_network_that_remembers_learns_from_stretches_in_rows(tmp_path: Path) 
     assert (48, 10, 6, 200) in shown
     with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
         train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])
+
+
+def test_positions_nobody_knows_or_of_another_clock_make_no_legs() -> None:
+    recording = known("positions", 0.1)
+    assert recording.positions is not None
+    time, position = recording.positions.time, recording.positions.position_W
+    nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
+    assert leg_streams(replace(recording, positions=nothing)) == []
+    stray = PositionTrack(np.append(time, 1.7e10), np.vstack([position, position[-1]]), "positions")
+    [stream], [usual] = leg_streams(replace(recording, positions=stray)), leg_streams(recording)
+    assert abs(len(stream.start) - len(usual.start)) <= 1
+
+
+def test_a_share_is_a_share() -> None:
+    for share in (-0.1, 1.5, "half"):
+        with pytest.raises(ConfigError, match="shares, simulated"):
+            TrainingConfig(shares={"simulated": share})  # type: ignore[dict-item]

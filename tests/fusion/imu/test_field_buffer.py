@@ -1,0 +1,53 @@
+"""A wild time among fields or samples costs one of them, not all that follow."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.field_buffer import FieldBuffer
+from stario.fusion.imu.front_end import cut_recording
+from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
+from stario.sequences.sequence import ImuSequence, Magnetometer
+
+FIELD_B = np.array([20.0, 0.0, -40.0])
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    sequence = simulate_imu(generate_walk(3, 20.0), 100.0, PHONE_IMU, 3)
+    time = sequence.time[::4]
+    return replace(sequence, magnetometer=Magnetometer(time, np.tile(FIELD_B, (len(time), 1))))
+
+
+def with_field(sequence: ImuSequence) -> int:
+    intervals, _ = cut_recording(sequence, NavigatorConfig())
+    return sum(interval.field_B is not None for interval in intervals)
+
+
+def test_a_wild_sample_time_leaves_the_fields_where_they_belong(walk: ImuSequence) -> None:
+    time = walk.time.copy()
+    time[1000] += 1e4
+    assert with_field(replace(walk, time=time)) >= with_field(walk) - 1 > 150
+
+
+@pytest.mark.parametrize("wild", [1e4, -1e4, math.nan])
+def test_a_wild_field_time_costs_one_field(wild: float) -> None:
+    buffer = FieldBuffer()
+    for k in range(200):
+        time = 0.02 * k
+        buffer.add(time + wild if k == 100 else time, FIELD_B, now=time)
+        if k != 100:
+            assert buffer.at(time) is not None
+
+
+def test_late_and_repeated_fields_are_refused() -> None:
+    buffer = FieldBuffer()
+    assert buffer.add(1.0, FIELD_B, now=1.0)
+    assert not buffer.add(1.0, FIELD_B, now=1.0)
+    assert not buffer.add(0.5, FIELD_B, now=1.0)
+    assert not buffer.add(1.5, np.full(3, math.inf), now=1.5)
+    assert buffer.at(1.05) is FIELD_B
+    assert buffer.at(1.2) is None

@@ -1,0 +1,101 @@
+"""What is no navigator's business is refused at once, by name."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import GRAPH
+
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, PriorPose, position_fix
+from stario.sequences import StarioError
+from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda model: Navigator(model, config={}), "config"),
+        (lambda model: Navigator(model, prior=(1, 2)), "prior"),
+        (lambda model: Navigator(model, backend=["ekf"]), "backend"),
+        (lambda model: Navigator("default"), "model"),
+        (lambda model: Navigator(model).run("walk.csv"), "sequence"),
+        (lambda model: Navigator(model).restore("text"), "snapshot"),
+        (lambda model: FilterConfig(gate="0.9"), "gate"),
+        (lambda model: FilterConfig(gate=1.0), "gate"),
+        (lambda model: FilterConfig(magnetometer="no"), "magnetometer"),
+        (lambda model: FilterConfig(update_rate=np.ones(3)), "update_rate"),
+        (lambda model: NavigatorConfig(filter={"update_rate": 2}), "filter"),
+        (lambda model: NavigatorConfig(noise=(1e-3, 1e-2)), "noise"),
+        (lambda model: PriorPose(*LEVEL, yaw_sigma=-0.5), "yaw_sigma"),
+        (lambda model: PriorPose(*LEVEL, tilt_sigma="a"), "tilt_sigma"),
+        (lambda model: PriorPose(2.0 * np.eye(3), *LEVEL[1:]), "R_WB"),
+        (lambda model: PriorPose(np.diag([1.0, 1.0, -1.0]), *LEVEL[1:]), "R_WB"),
+        (lambda model: PriorPose(LEVEL[0], [0.0, 0.0], LEVEL[2]), "v_W"),
+    ],
+)
+def test_a_wrong_argument_is_named(still_model: Any, make: Any, named: str) -> None:
+    with pytest.raises(StarioError, match=named):
+        make(still_model)
+
+
+def test_a_fix_that_is_none_is_named(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="position_fix"):
+        Navigator(still_model).run(walk, fixes=[(1.0, "position")])
+
+
+def test_a_recording_prepared_for_another_rate_is_refused(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    fast = Navigator(still_model, NavigatorConfig(filter=FilterConfig(update_rate=10)))
+    with pytest.raises(InputError, match="update_rate"):
+        Navigator(still_model).track(fast.observe(walk))
+
+
+def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    times = np.linspace(1.0, walk.duration - 0.01, 10_500)
+    fixes = [position_fix(t, np.zeros(3), 1e4 * np.eye(3)) for t in times]
+    told = Navigator(still_model).run(walk, fixes=fixes).health.fixes
+    assert sum(told.values()) == len(fixes)
+    assert "too many waiting" not in told
+
+
+def test_fixes_of_a_clock_ahead_keep_no_right_one_out(still_model: Any) -> None:
+    navigator = Navigator(still_model)
+    for k in range(10_001):
+        navigator.update_position(1e6 + k, np.zeros(3), np.eye(3))
+    navigator.update_position(5.0, np.zeros(3), np.eye(3))
+    assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
+
+
+def test_biases_that_do_not_walk_are_fine_for_the_graph(make_walk: Make, make_oracle: Make) -> None:
+    walk = make_walk(3, 15.0)
+    oracle = make_oracle(walk, walk.truth, GRAPH, noise=0.03, sigma=0.03)
+    steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
+    track = Navigator(oracle, steady, backend="graph").run(walk)
+    assert not any("fell back" in note for note in track.health.notes)
+
+
+def test_a_snapshot_with_any_byte_changed_is_refused_or_read(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    navigator = Navigator(still_model)
+    for row in zip(walk.time[:150], walk.gyro[:150], walk.accel[:150], strict=True):
+        navigator.push(*row)
+    data = navigator.snapshot()
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(data), 60).tolist():
+        spoiled = bytearray(data)
+        spoiled[place] ^= 0xFF
+        try:
+            Navigator(still_model).restore(bytes(spoiled))
+        except InputError as error:
+            assert "snapshot" in str(error)
