@@ -1,17 +1,20 @@
 """A file of fixes: a CSV with the header `t,kind,x,y,z,sx,sy,sz` and one fix per line.
 
-t     time [s] since the recording's first sample
+t     time since the recording's first sample [s]
 kind  position, velocity or yaw
 x y z position [m] or velocity [m/s] in W; a yaw gives its yaw [rad] in x and leaves y, z
 sx    standard deviation [m], [m/s] or [rad]
-sy sz standard deviations of the other axes; empty where they equal sx
+sy sz standard deviations of the other axes; empty, or no column, where they equal sx
+
+Columns come in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
+A position without z is one in the plane: of its height nothing is known.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,13 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import advancing
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
+_NEEDED = (*_COLUMNS[:3], "sx")
+
+_LARGEST_YAW = 2.0 * math.pi
+"""A yaw, or a deviation of one, beyond this was not meant in radians."""
+
+_UNKNOWN_HEIGHT = 1e3
+"""Deviation of a height that is not given [m]."""
 
 
 def read_fixes(path: Path | str) -> list[Fix]:
@@ -32,15 +42,22 @@ def read_fixes(path: Path | str) -> list[Fix]:
     """
     path = Path(path)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.reader(file))
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        separator = max(",;\t", key=lines[0].count) if lines else ","
+        rows = list(csv.reader(lines, delimiter=separator))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
-    expected = ",".join(_COLUMNS)
-    header = [word.strip() for word in rows[0]] if rows else []
-    if header != list(_COLUMNS):
-        raise ReadError(path, "line 1", ",".join(header) or "nothing", f"the header {expected}")
-    return [_read_row(path, k, row) for k, row in enumerate(rows[1:], start=2) if any(row)]
+    header = [word.split("[")[0].strip().lower() for word in rows[0]] if rows else []
+    unknown = [word for word in header if word not in _COLUMNS]
+    missing = [word for word in _NEEDED if word not in header]
+    if unknown or missing or len(set(header)) < len(header):
+        found = ",".join(header) or "nothing"
+        raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
+    fixes = []
+    for number, row in enumerate(rows[1:], start=2):
+        if any(word.strip() for word in row):
+            fixes.append(_read_row(path, f"line {number}", header, row))
+    return fixes
 
 
 def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
@@ -58,28 +75,40 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
         raise InputError("fixes", found, expected, "count them from the recording's first sample")
 
 
-def _read_row(path: Path, number: int, row: list[str]) -> Fix:
-    where = f"line {number}"
-    if len(row) > len(_COLUMNS):
-        raise ReadError(path, where, f"{len(row)} values", f"at most {len(_COLUMNS)}")
-    cells = dict(zip(_COLUMNS, [*(word.strip() for word in row), *[""] * 8], strict=False))
-    kind = cells["kind"]
-    if kind not in KINDS:
-        raise ReadError(path, f"{where}, kind", repr(kind), f"one of {', '.join(KINDS)}")
+def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str]) -> Fix:
+    if len(row) > len(header):
+        raise ReadError(path, where, f"{len(row)} values", f"at most {len(header)}")
+    words = [word.strip() for word in row] + [""] * len(header)
+    cells = dict.fromkeys(_COLUMNS, "") | dict(zip(header, words, strict=False))
+    kind, _, unit = cells["kind"].lower().partition(" ")
+    if kind not in KINDS or unit not in ("", "[deg]", "[rad]") or (unit and kind != "yaw"):
+        raise ReadError(path, f"{where}, kind", repr(cells["kind"]), f"one of {', '.join(KINDS)}")
     axes = "xyz"[: KINDS[kind]]
+    if kind == "position" and not cells["z"] and not cells["sz"]:
+        cells |= {"z": "0", "sz": str(_UNKNOWN_HEIGHT)}
     cells |= {f"s{a}": cells[f"s{a}"] or cells["sx"] for a in axes}
+    value, sigma = (_numbers(path, where, cells, [p + a for a in axes]) for p in ("", "s"))
+    if sigma.min() <= 0.0:
+        raise ReadError(path, f"{where}, sigma", repr(sigma.min()), "a standard deviation > 0")
+    if unit == "[deg]":
+        value, sigma = np.radians(value), np.radians(sigma)
+    if kind == "yaw" and max(abs(value[0]), sigma[0]) > _LARGEST_YAW:
+        found, fix = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
+        raise ReadError(path, f"{where}, yaw", found, "radians", fix)
+    (time,) = _numbers(path, where, cells, ["t"])
+    return make_fix(time, kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]
 
-    def number_in(name: str) -> float:
+
+def _numbers(
+    path: Path, where: str, cells: Mapping[str, str], names: Sequence[str]
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    values = []
+    for name in names:
         try:
             value = float(cells[name])
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
             raise ReadError(path, f"{where}, {name}", repr(cells[name]), "a finite number")
-        return value
-
-    sigma = [number_in(f"s{a}") for a in axes]
-    if min(sigma) <= 0.0:
-        raise ReadError(path, f"{where}, sigma", repr(min(sigma)), "a standard deviation > 0")
-    value = np.array([number_in(a) for a in axes])
-    return make_fix(number_in("t"), kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]
+        values.append(value)
+    return np.array(values)

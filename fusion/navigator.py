@@ -22,6 +22,7 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.imu.set_back import ClockSetBackError
 from stario.fusion.imu.stateful import Predictor as Predictor
 from stario.fusion.imu.stateful import StatefulInference, displacements_of
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
@@ -96,12 +97,18 @@ class Navigator:
         Raises:
             InputError: time is no number, or every sample is far from the one before, as where it
                 is not in seconds; gyro or accel does not hold three; the first second's average
-                force cannot be gravity in m/s^2, or gyro cannot be in rad/s, which shows once the
-                device turns. In the last two cases the stream then begins anew.
+                force cannot be gravity in m/s^2, gyro cannot be in rad/s, which shows once the
+                device turns, or the clock was set back for a second. In the last three cases the
+                stream then begins anew.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
-        for interval in self._front_end.push(sample):
+        try:
+            intervals = self._front_end.push(sample)
+        except ClockSetBackError:
+            self._begin_stream()
+            raise
+        for interval in intervals:
             self._check_gyro(interval)
             state = self._advance(interval)
         return state

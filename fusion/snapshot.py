@@ -71,6 +71,7 @@ def _classes() -> dict[str, type]:
         intervals,
         outliers,
         preintegration,
+        set_back,
         window_buffer,
     )
     from stario.sequences import noise
@@ -79,6 +80,7 @@ def _classes() -> dict[str, type]:
     classes: tuple[type, ...] = (
         *(config.FilterConfig, config.GraphConfig, config.NavigatorConfig, noise.ImuNoise),
         *(window_buffer.WindowBuffer, window_buffer.Block, field_buffer.FieldBuffer),
+        set_back.SetBackWatch,
         *(front_end.FrontEnd, gyro_unit.GyroUnitWatch, intervals.ImuInterval),
         *(intervals.SampleCounts, intervals.Start, outliers.Flags, outliers.OutlierDetector),
         *(levelling.LevelledAttitude, preintegration.Segment),

@@ -163,6 +163,14 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
     return card
 
 
+def packaged_names() -> str:
+    """Weights in the package, as words."""
+    folder = importlib.resources.files("stario.network.weights")
+    found = (Path(str(file)) for file in folder.iterdir())
+    *names, last = sorted(file.stem for file in found if file.suffix == ".safetensors")
+    return f"{', '.join(names)} or {last}"
+
+
 def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
@@ -184,6 +192,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
     if path.parent == Path() and not path.suffix and packaged.is_file():
         path = packaged
+    if path.parent == Path() and not path.suffix and not path.exists():
+        raise WeightsError(path, "weights", "nothing there", f"a file, or {packaged_names()}")
     card = read_card(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"

@@ -30,6 +30,9 @@ STANDARD_GRAVITY = 9.80665
 MAX_TRUTH_GAP = 0.1
 """Longest distance [s] between two valid truth samples that is interpolated across."""
 
+ABSURD = 1e5
+"""No sensor reads this much in any unit used here; also catches infinities."""
+
 MAX_IMU_GAP = 0.1
 """Longest distance [s] between IMU samples that is bridged by interpolation."""
 

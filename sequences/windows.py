@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
+from stario.sequences.sequence import ABSURD, BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.sequence import MAX_IMU_GAP as MAX_IMU_GAP
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import advancing
 
 log = logging.getLogger(__name__)
@@ -244,8 +244,8 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     Raises:
         InputError: what is left has fewer than two samples or a rate that is not accepted.
     """
-    finite = np.isfinite(sequence.time) & np.isfinite(sequence.gyro).all(axis=1)
-    finite &= np.isfinite(sequence.accel).all(axis=1)
+    finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < ABSURD).all(axis=1)
+    finite &= (np.abs(sequence.accel) < ABSURD).all(axis=1)
     index = np.flatnonzero(finite)
     counts = advancing(sequence.time[index])
     ahead = _ahead(sequence.time[index], counts)

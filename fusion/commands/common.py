@@ -137,6 +137,9 @@ _WHOLE = 0.98
 """A track of which the truth covers less is said to be compared in part."""
 
 
+_EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+
+
 def track_table(
     metrics: dict[str, dict[str, float | None]],
     time: FloatArray,
@@ -166,7 +169,10 @@ def track_table(
     lines = aligned([["", *columns.values()], *rows])
     if truth is None:
         return "\n".join(lines)
-    lines += [f"{key}: {words[key]}." for key in ("ate_m", "alignment", "ate_fit_m", "rte_m")]
+    lines += [
+        f"{key}: {words[key]}."
+        for key in ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+    ]
     covered = float(truth.covers(time).mean())
     if covered < _WHOLE:
         lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")

@@ -32,6 +32,9 @@ def convert(
         str | None,
         typer.Option(help="csv, euroc or archive; by default by OUT's end, .csv, none or .h5."),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a file that is there already.")
+    ] = False,
 ) -> None:
     """Convert recordings to a CSV, to the EuRoC layout or to an archive, without loss."""
     from stario.sequences.datasets.convert import convert as convert_sequence
@@ -40,6 +43,7 @@ def convert(
     if len(paths) < 2:
         raise InputError("convert", str(paths[0]), "IN... OUT", "name what to write as well")
     *sources, target = paths
+    _check_target(target, sources, overwrite)
     if layout_of(target, to) != "archive":
         sequence = reading.read(_only(reading, sources))
         written = convert_sequence(sequence, target, to)
@@ -50,6 +54,14 @@ def convert(
     names = convert_all(_read(reading, files, skipped), target)
     typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
     leave_with_skipped(skipped)
+
+
+def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
+    """Refuse to write over what is there, and over what is read in any case."""
+    if any(target.exists() and source.exists() and target.samefile(source) for source in sources):
+        raise InputError("OUT", f"{target}, which is read as well", "another file")
+    if target.is_file() and not overwrite:
+        raise InputError("OUT", f"{target}, which is there already", "a new file", "--overwrite")
 
 
 def _only(reading: Reading, sources: list[Path]) -> Path:

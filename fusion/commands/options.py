@@ -30,7 +30,8 @@ FixesOption = Annotated[
     Path | None,
     typer.Option(
         "--fixes",
-        help="CSV of absolute fixes: t,kind,x,y,z,sx,sy,sz; kind position, velocity or yaw.",
+        help="CSV of absolute fixes with columns t, kind, x, y, z, sx, sy, sz: position [m], "
+        "velocity [m/s] or yaw [rad] (in x), and their sigmas.",
     ),
 ]
 BackendOption = Annotated[str, typer.Option(help="What fuses: ekf, or graph.")]

@@ -107,6 +107,7 @@ def train(
     from stario.sequences.datasets.stream_cache import cache_folder
 
     recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
+    first = load_model(start_from) if start_from else None  # before anything takes time
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     recorded, held_out, skipped = _recorded(
@@ -152,7 +153,7 @@ def train(
                 err=True,
             ),
             trained_on=material.words,
-            start_from=load_model(start_from) if start_from else None,
+            start_from=first,
             calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
             legs=material.legs,
             validation_legs=kept.legs,

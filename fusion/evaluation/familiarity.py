@@ -79,6 +79,8 @@ class Familiarity:
         return []
 
     def _motion_lines(self) -> list[str]:
+        if not self.medians:
+            return ["motion: too short an unbroken stretch to tell"]
         told = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
                          self.medians.items())  # fmt: skip
         lines = [f"motion: {told}"]

@@ -84,9 +84,8 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
-        self._map_frame = MapFrame(
-            None if prior is None else prior.p_W, oriented, f.gate, f.network_turn_sigma
-        )
+        first = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
+        self._map_frame = MapFrame(*first, oriented, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
@@ -360,4 +359,7 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """The report so far, with the sigmas of another estimator's state where one is given."""
         health = self._counts.health(counts, state or self.nav_state())
+        if self._config.filter.declination is not None and not self._map_frame.state.oriented:
+            note = "nothing told where north is: the track begins with yaw zero"
+            health = changed(health, notes=[*health.notes, note])
         return changed(health, accel_noise_factor=self._displacements.accelerometer.factor)

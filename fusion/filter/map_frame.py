@@ -52,7 +52,7 @@ right, and the track is not; so are those in a row that are not as far from the 
 has led from it: then the pivot was wrong."""
 
 _BETTER = 2.0
-"""A position that is so many times surer than the track's places the track anew."""
+"""A position that is so many times surer than the one that placed the track places it anew."""
 
 _AWRY = 0.5
 """Share of the shorter one by which a network's way and the true one may differ in length."""
@@ -72,6 +72,7 @@ class MapFrameState:
         transforms: of the states given out.
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
+        pivot_variance: of the position that placed it, over three axes [m^2].
         seen: positions since it was placed, from the pivot, while its yaw is not known.
         apart: how many of the last positions lay at another distance from the pivot than the track.
         off: (3,) residuals of the last positions, if they were outliers [m].
@@ -82,6 +83,7 @@ class MapFrameState:
     transforms: tuple[FrameTransform, ...] = ()
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
+    pivot_variance: float = math.inf
     seen: SeenPositions = field(default_factory=SeenPositions)
     apart: int = 0
     off: tuple[FloatArray, ...] = ()
@@ -92,6 +94,7 @@ class MapFrame:
 
     Args:
         pivot: (3,) the first position [m], None where it was not given.
+        pivot_sigma: of it, per axis [m].
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
         turn_sigma: of the network's turn, `FilterConfig.network_turn_sigma` [rad].
@@ -101,11 +104,18 @@ class MapFrame:
     """
 
     def __init__(
-        self, pivot: FloatArray | None, oriented: bool, gate: float, turn_sigma: float
+        self,
+        pivot: FloatArray | None,
+        pivot_sigma: float,
+        oriented: bool,
+        gate: float,
+        turn_sigma: float,
     ) -> None:
-        self.state = MapFrameState(pivot is not None, oriented)
+        self.state = MapFrameState(False, oriented)
         if pivot is not None:
-            self.state = changed(self.state, pivot=pivot)
+            self.state = MapFrameState(
+                True, oriented, pivot=pivot, pivot_variance=3.0 * pivot_sigma**2
+            )
         self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
@@ -139,11 +149,10 @@ class MapFrame:
         """
         if not self.state.placed or self.state.oriented:
             return not self.state.placed
+        if _BETTER**2 * float(np.trace(fix.covariance)) < self.state.pivot_variance:
+            return True
         now, pivot = _nav_state(ekf), self.state.pivot
         P = _without_yaw(now.covariance, 6)
-        known = float(np.trace(P)) + now.covariance[8, 8]
-        if _BETTER**2 * float(np.trace(fix.covariance)) < known:
-            return True
         seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
         sigma = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
         apart = abs(seen - ours) > 3.0 * sigma + _AWRY * min(seen, ours)
@@ -158,7 +167,12 @@ class MapFrame:
         sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
         ekf.state = ekf.state.with_position_inflated(sigma)
         self.state = changed(
-            self.state, placed=True, pivot=fix.value, seen=SeenPositions(), apart=0
+            self.state,
+            placed=True,
+            pivot=fix.value,
+            pivot_variance=float(np.trace(fix.covariance)),
+            seen=SeenPositions(),
+            apart=0,
         )
         self._remember(ekf, fix)
         return transform

@@ -7,8 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from stario.fusion.imu.outliers import ABSURD
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import ABSURD, FloatArray
 
 _FIELDS = 64
 """Fields that are kept: more than come between two intervals."""

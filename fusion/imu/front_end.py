@@ -26,11 +26,12 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.field_buffer import FieldBuffer
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.outliers import ABSURD, Flags, OutlierDetector
+from stario.fusion.imu.outliers import Flags, OutlierDetector
+from stario.fusion.imu.set_back import ClockSetBackError, SetBackWatch
 from stario.fusion.imu.window_buffer import WindowBuffer
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.sequence import ABSURD, FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import MAX_IMU_GAP
 
@@ -69,13 +70,19 @@ class FrontEnd:
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
         self._fields = FieldBuffer()
+        self._late = SetBackWatch()
         self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
         self.counts = SampleCounts()
         self.start: Start | None = None
 
     def push(self, sample: Sample) -> list[ImuInterval]:
-        """Take one sample in; returns the intervals it completes (mostly none, seldom several)."""
+        """Take one sample in; returns the intervals it completes (mostly none, seldom several).
+
+        Raises:
+            InputError: every sample stands alone.
+            ClockSetBackError: this one and those before it are of a clock that was set back.
+        """
         time = sample[0]
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < ABSURD):
             self.counts.not_finite += 1
@@ -87,6 +94,7 @@ class FrontEnd:
             self.counts.duplicate += 1
         elif time < newest:
             self.counts.out_of_order += 1
+            self._late.late(time, newest)
         elif self._ahead or time - newest > MAX_IMU_GAP:
             return self._confirm(sample)
         else:
@@ -130,6 +138,7 @@ class FrontEnd:
 
     def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
+        self._late.on_time()
         before, self._newest = self._newest, time
         self.counts.used += 1
         if self._samples and time - before > _HOLE:
@@ -254,7 +263,10 @@ class FrontEnd:
 def cut_recording(
     sequence: ImuSequence, config: NavigatorConfig
 ) -> tuple[list[ImuInterval], FrontEnd]:
-    """Every interval of a recording, and the front end with its counts and start."""
+    """Every interval of a recording, and the front end with its counts and start.
+
+    What follows where the clock was set back is left out, and the counts say so.
+    """
     front_end = FrontEnd(config)
     intervals: list[ImuInterval] = []
     fields = (
@@ -268,7 +280,11 @@ def cut_recording(
         # A wild time must not bring all fields of the future at once.
         while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
             front_end.push_field(*fields.popleft())
-        intervals += front_end.push(tuple(sample))
+        try:
+            intervals += front_end.push(tuple(sample))
+        except ClockSetBackError as error:
+            front_end.counts.set_back = error.by
+            break
     front_end.finish()
     return intervals, front_end
 

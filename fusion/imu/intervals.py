@@ -108,6 +108,7 @@ class SampleCounts:
         gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
         windows: that the network was asked about.
         unfamiliar: of these outside what its weights were trained on.
+        set_back: by how much a recording's clock was set back where its track ends [s].
     """
 
     used: int = 0
@@ -123,6 +124,7 @@ class SampleCounts:
     gaps: list[tuple[float, float]] = field(default_factory=list)
     windows: int = 0
     unfamiliar: int = 0
+    set_back: float = 0.0
 
     def add_gap(self, start: float, length: float) -> None:
         """Count a stretch without samples [s]."""
@@ -143,10 +145,15 @@ class SampleCounts:
         )
 
     def _notes(self) -> list[str]:
-        if self.unfamiliar <= UNFAMILIAR_SHARE * self.windows:
-            return []
-        share = self.unfamiliar / self.windows
-        return [
-            f"{share:.0%} of the windows move unlike all that the weights were trained on: "
-            "the network's sigma is widened there"
-        ]
+        notes = []
+        if self.set_back:
+            notes.append(
+                f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
+            )
+        if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
+            share = self.unfamiliar / self.windows
+            notes.append(
+                f"{share:.0%} of the windows move unlike all that the weights were trained on: "
+                "the network's sigma is widened there"
+            )
+        return notes

@@ -17,9 +17,6 @@ SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
 """Off both neighbours by more than this, a sample is a spike [rad/s], [m/s^2]: heel strikes stay
 below half of it at 50 Hz."""
 
-ABSURD = 1e5
-"""No sensor reads this much in any unit used here; also catches infinities."""
-
 _MOVES = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
 _LARGE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
 """An axis that varies, or reads, no more than this may repeat itself: coarse digits at rest."""

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.sequences.attitude.levelling import STILL_ACCEL
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -81,9 +82,12 @@ class StatefulInference:
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
-        """How many windows (B, 6, 200) lie outside what the model's weights were trained on."""
+        """How many windows (B, 6, 200) move as nothing that the model's weights were trained on."""
         known = getattr(getattr(self._model, "card", None), "known_motion", None)
-        return 0 if known is None else int((known.strangeness(windows) > 1.0).sum())
+        if known is None:
+            return 0
+        moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
+        return int((moves & (known.strangeness(windows) > 1.0)).sum())
 
     @property
     def memory(self) -> Any:

@@ -139,6 +139,9 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+    except socket.gaierror as error:
+        listener.close()
+        raise InputError("--host", host, "an address of this computer, as 0.0.0.0") from error
     except OSError as error:
         listener.close()
         found = f"{host} {port}: {error.strerror or error}"

@@ -96,6 +96,8 @@ def _is_unfamiliar(note: str) -> bool:
 
 def _noted(note: str) -> Finding:
     text = f"{note[:1].upper()}{note[1:]}."
+    if "set back" in note:
+        return Finding("warning", text, "Split the recording there, and run each part.")
     if not _is_unfamiliar(note):
         return Finding("note", text)
     advice = "Fine-tune the weights on recordings of this kind: `stario train --start-from`."
@@ -162,7 +164,14 @@ def _updates(health: Health) -> list[Finding]:
         found.append(Finding("warning", text, f"{advice} Ratio: {ratio:.1f}."))
     elif ratio < 1.0 / NIS_RATIO:
         text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
-        found.append(Finding("note", f"{text} The sigmas are on the safe side."))
+        advice = "Single ones say little of a track's sigmas: errors that last make small ones."
+        found.append(Finding("note", text, advice))
+    bearings = sum(n for name, n in health.bearings.items() if name != "gated")
+    useless = bearings - health.bearings.get("applied", 0)
+    if useless > 0.5 * bearings:
+        text = f"The magnetic field was of little use ({_counted(health.bearings)})."
+        advice = "`stario inspect` tells its size, unit and what is wrong with it."
+        found.append(Finding("note", text, advice))
     left_out = _counted(health.refused)
     if left_out:
         found.append(Finding("note", f"Displacements left out: {left_out}."))
@@ -174,13 +183,14 @@ def _fixes(health: Health) -> list[Finding]:
         return []
     applied = health.fixes.get("applied", 0)
     other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
-    text = f"{applied} fixes applied"
+    text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
     if not other:
         return [Finding("note", f"{text}.")]
     reasons = _counted(other)
     refused = sum(n for name, n in other.items() if name not in ("gated", "waiting"))
-    advice = "Check the fixes' clock, frame and sigmas." if refused else ""
-    return [Finding("warning" if refused else "note", f"{text}; {reasons}.", advice)]
+    wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
+    advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
+    return [Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)]
 
 
 def _direction(health: Health) -> list[Finding]:

@@ -76,11 +76,14 @@ def layout_of(path: Path, layout: str | None = None) -> str:
     """The layout that is named, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
 
     Raises:
-        InputError: the layout is unknown.
+        InputError: the layout, or the path's end, is unknown.
     """
     if layout is None:
-        by_suffix = {".csv": "csv", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
-        return by_suffix.get(path.suffix.lower(), "euroc")
+        by_suffix = {".csv": "csv", "": "euroc", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
+        if path.suffix.lower() in by_suffix:
+            return by_suffix[path.suffix.lower()]
+        known = ".csv, .h5, or a folder's name without a dot"
+        raise InputError(str(path), path.suffix, known, "name the layout: --to")
     if layout not in LAYOUTS:
         raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
     return layout

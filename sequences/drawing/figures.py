@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
-RED, SKY, GREY, INK = "#D55E00", "#56B4E9", "#999999", "#333333"
+RED, SKY, GREY, INK, BROWN = "#D55E00", "#56B4E9", "#999999", "#333333", "#7F5539"
 TRACK_STYLES = {
     "inertial": ("inertial", GREY),
+    "pdr": ("steps (PDR)", BROWN),
     "network": ("network", ORANGE),
     "network_true_attitude": ("network, true attitude", GREEN),
     "ekf": ("EKF", BLUE),
     "graph": ("factor graph", PINK),
 }
-_SPARE_COLOURS = (RED, SKY, "#7F5539", "#6A4C93")
+_SPARE_COLOURS = (RED, SKY, "#6A4C93")
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
 ABOVE_LEFT = {**LEGEND, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "ncols": 3}
 ABOVE_RIGHT = {**LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4}

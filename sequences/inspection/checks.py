@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.errors import InputError
+from stario.sequences.inspection.samples import disorder
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS
@@ -109,6 +110,10 @@ def _check_content(sequence: ImuSequence) -> None:
 
 
 def _check_time(sequence: ImuSequence) -> None:
+    if found := disorder(sequence.time):
+        raise InputError(
+            f"{sequence.name}: time", found, "times that go on", "sort the rows by time"
+        )
     rate = sequence.rate
     if MIN_RATE <= rate <= MAX_RATE:
         return
@@ -214,7 +219,9 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
         f"{sequence.name}: truth's attitude",
         f"an average force {math.degrees(tilt):.0f} degrees off the vertical",
         "quaternion x y z w, body to a world with z up",
-        f"the IMU's axes are not the truth's: pass `--axes={axes}`" if axes else "",
+        f"the IMU's axes are not the truth's: pass `--axes={axes}`"
+        if axes
+        else "leave the truth out if it is wrong: nothing but the figures needs it",
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.magnetic import MagneticFindings, judge_magnetometer
+from stario.sequences.inspection.samples import sample_problems, usable
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
     GAP_STEPS,
@@ -211,7 +212,8 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "none that is finite", "numbers")
-    problems = []
+    given = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
+    problems = sample_problems(sequence)
     try:
         check_units(sequence)
     except InputError as error:
@@ -234,8 +236,8 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, int((~finite).sum())),
-        accel_norm=float(np.linalg.norm(sequence.accel[finite], axis=1).mean()),
-        gyro_norm=float(np.linalg.norm(sequence.gyro[finite], axis=1).mean()),
+        accel_norm=float(np.linalg.norm(sequence.accel[given], axis=1).mean()),
+        gyro_norm=float(np.linalg.norm(sequence.gyro[given], axis=1).mean()),
         rest=_rest(sequence),
         coverage=coverage,
         fit=fit,

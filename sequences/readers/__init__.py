@@ -121,7 +121,7 @@ _SUFFIXES = (
 
 _CONTAINERS = (
     (b"SQLite format 3", "an SQLite database"),
-    (b"PK\x03\x04", "a zip without text files, as a spreadsheet is"),
+    (b"PK\x03\x04", "a zip without text files, as a spreadsheet is, or one that is cut short"),
     (b"\xd0\xcf\x11\xe0", "a spreadsheet"),
     (b"\x1f\x8b", "a file compressed with gzip"),
     (b"7z\xbc\xaf", "a file compressed with 7-Zip"),

@@ -127,7 +127,8 @@ def _none_chosen(
     )
     values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
     seen = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
-    return ReadError(path, f"recordings with {asked}", "none", f"{key} of {seen or 'nothing'}")
+    expected = f"{key} of {seen}" if seen else f"an attribute that they have: none has {key}"
+    return ReadError(path, f"recordings with {asked}", "none", expected)
 
 
 def _any(known: Mapping[str, Mapping[str, str | float]], where: Where) -> bool:

@@ -124,6 +124,7 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
     if missing:
         fix = "or leave truth out" if truth and not set(missing) & {"t", *IMU} else ""
         expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER
+        expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
         _log.info("%s: columns ignored: %s", path, ", ".join(ignored))

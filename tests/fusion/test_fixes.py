@@ -391,7 +391,10 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         ("time,kind\n", "line 1.*header"),
         (HEADER + "1,altitude,1,2,3,1,,\n", "line 2, kind.*altitude"),
         (HEADER + "1,position,1,2,3,1,,\nx,position,1,2,3,1,,\n", "line 3, t"),
-        (HEADER + "1,position,1,2,,1,,\n", "line 2, z"),
+        (HEADER + "1,position,1,2,,1,,0.5\n", "line 2, z"),
+        (HEADER + "1,yaw,170,,,5,,\n", r"yaw.*radians.*\[deg\]"),
+        (HEADER + "1,position [deg],1,2,3,1,,\n", "line 2, kind"),
+        ("t,kind,x,x,sx\n", "line 1.*header"),
         (HEADER + "1,position,1,2,3,,,\n", "line 2, sx"),
         (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
         (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
@@ -407,6 +410,17 @@ def test_a_file_that_does_not_fit_names_line_and_field(
         read_fixes(path)
     assert "fixes.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_columns_in_any_order_and_degrees_and_the_plane(tmp_path: Path) -> None:
+    path = tmp_path / "fixes.csv"
+    path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw [deg];2;170;;;5\n")
+    position, yaw = read_fixes(path)
+    np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
+    assert position.covariance[0, 0] == pytest.approx(0.25)
+    assert position.covariance[2, 2] == pytest.approx(1e6)
+    np.testing.assert_allclose(yaw.value, [np.radians(170.0)])
+    np.testing.assert_allclose(yaw.covariance, [[np.radians(5.0) ** 2]])
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

@@ -446,3 +446,36 @@ def test_a_setting_that_does_not_fit_is_named_in_one_line(
 ) -> None:
     (tmp_path / "settings.json").write_text(content)
     stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
+
+
+def test_nothing_is_written_over_unasked(stario, recording: Path, tmp_path: Path) -> None:
+    before = recording.read_bytes()
+    stario("convert", recording, recording).assert_one_line_error("read as well", "another file")
+    stario("convert", recording, recording, "--overwrite").assert_one_line_error("read as well")
+    assert recording.read_bytes() == before
+    there = tmp_path / "there.csv"
+    there.write_text("mine")
+    stario("convert", recording, there).assert_one_line_error("there already", "--overwrite")
+    assert there.read_text() == "mine"
+    assert stario("convert", recording, there, "--overwrite").code == 0
+    assert there.read_text() != "mine"
+
+
+def test_an_end_that_names_no_layout_is_refused(stario, recording: Path) -> None:
+    stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
+    assert not Path("walk.txt").exists()
+
+
+def test_weights_that_are_not_there_are_answered_with_those_that_are(
+    stario, recording: Path
+) -> None:
+    stario("run", recording, "--model", "nothere").assert_one_line_error(
+        "nothere", "default, first-stage, open or walks-36min"
+    )
+
+
+def test_a_north_that_nothing_tells_is_said(stario, recording: Path) -> None:
+    done = stario("run", recording, "--declination", "-6", "--out", "north")
+    assert done.code == 0
+    assert "north" in done.out
+    assert "nothing to do" not in done.out

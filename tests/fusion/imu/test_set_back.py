@@ -1,0 +1,81 @@
+"""A clock that is set back begins another recording, and nothing pretends otherwise."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator
+from stario.fusion.imu.set_back import ClockSetBackError, SetBackWatch
+from stario.fusion.report.health import told
+from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+
+
+def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
+    late = walk.time >= at
+    return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
+
+
+def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> None:
+    walk = set_back(make_walk(3, 16.0), 100.0)
+    navigator, states, errors = Navigator(still_model), [], []
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        try:
+            states.append(navigator.push(*row))
+        except ClockSetBackError as error:
+            errors.append(error)
+    assert len(errors) == 1
+    assert errors[0].by == pytest.approx(100.0, abs=0.1)
+    times = [state.time for state in states if state is not None]
+    assert times[-1] == pytest.approx(walk.time[-1], abs=0.11)
+
+
+@pytest.mark.parametrize("by", [5.0, 100.0])
+def test_a_recordings_track_ends_there_and_its_health_says_why(
+    make_walk: Make, still_model: Any, by: float
+) -> None:
+    walk = set_back(make_walk(3, 16.0), by)
+    track = Navigator(still_model).run(walk)
+    assert track.time[-1] == pytest.approx(8.0, abs=0.11)
+    (line,) = [line for line in told(track.health) if "clock" in line]
+    assert line.startswith("! ")
+    assert "Split" in line
+    (problem,) = [p for p in inspect_recording(walk).problems if "clock" in p]
+    assert f"{by - 0.01:.3g} s at 8.0 s" in problem
+
+
+def test_late_samples_and_bursts_are_no_other_clock() -> None:
+    watch = SetBackWatch()
+    for k in range(300):  # two sensors in turn, one half a second behind
+        watch.on_time()
+        watch.late(0.01 * k - 0.5, 0.01 * k)
+    for k in range(90):
+        watch.late(0.01 * k, 10.0)
+    watch.on_time()
+    for k in range(300):  # falling
+        watch.late(9.0 - 0.01 * k, 10.0)
+
+
+def test_rows_in_disorder_are_to_be_sorted(make_walk: Make) -> None:
+    walk = make_walk(3, 16.0)
+    order = np.random.default_rng(0).permutation(len(walk))
+    shuffled = replace(
+        walk.without_truth(), time=walk.time[order], gyro=walk.gyro[order], accel=walk.accel[order]
+    )
+    problems = " ".join(inspect_recording(shuffled).problems)
+    assert "sort the rows" in problems
+    assert "ms" not in problems
+
+
+def test_values_that_no_sensor_gives_are_named_and_leave_the_means_alone(make_walk: Make) -> None:
+    walk = make_walk(3, 16.0)
+    gyro = walk.gyro.copy()
+    gyro[::300] = 1e6
+    found = inspect_recording(replace(walk, gyro=gyro))
+    assert any("no sensor" in problem for problem in found.problems)
+    assert found.gyro_norm < 10.0
