@@ -42,6 +42,9 @@ UNKNOWN_YAW = math.pi / math.sqrt(3.0)
 KNOWN_YAW = 0.5
 """A first yaw given to better than this [rad] is kept; a coarser one is left to the fixes."""
 
+COARSEST_YAW = 1.0
+"""A yaw coarser than this [rad] tells no direction: believed, it made filters sure of wrong ones."""
+
 FAR_ENOUGH = 0.3
 """Two positions tell the yaw when it is then known to this [rad]; half its square, what the
 linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
@@ -182,7 +185,9 @@ class MapFrame:
         pivot, since = self.state.pivot, self.state.since
         turn, sigma = _turn(_nav_state(ekf), pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
-        if not (math.isfinite(turn) and sigma <= (KNOWN_YAW if fix.kind == "yaw" else FAR_ENOUGH)):
+        if not (
+            math.isfinite(turn) and sigma <= (COARSEST_YAW if fix.kind == "yaw" else FAR_ENOUGH)
+        ):
             if fix.kind != "position":
                 return None
             turn, inflation = self.state.seen.turn
