@@ -31,6 +31,7 @@ from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Vector = Sequence[float] | FloatArray
 """Three numbers."""
@@ -97,8 +98,9 @@ class Navigator:
         Raises:
             InputError: time is no number, or every sample is far from the one before, as where it
                 is not in seconds; gyro or accel does not hold three; the first second's average
-                force cannot be gravity in m/s^2, gyro cannot be in rad/s, which shows once the
-                device turns, or the clock was set back for a second. In the last three cases the
+                force cannot be gravity in m/s^2, or its rate is not from 50 Hz to 1 kHz; gyro
+                cannot be in rad/s, which shows once the device turns; or the clock was set back
+                for a second. In the last four cases the
                 stream then begins anew.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
@@ -324,6 +326,9 @@ class Navigator:
         """A stream cannot be checked as a whole before it runs: its first second is."""
         start = self._front_end.start
         assert start is not None  # set before the first interval
+        if not MIN_RATE <= start.rate <= MAX_RATE:
+            self._begin_stream()
+            raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
         if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
             self._begin_stream()
             raise InputError(

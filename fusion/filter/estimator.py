@@ -84,8 +84,8 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
-        first = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
-        self._map_frame = MapFrame(*first, oriented, f.gate, f.network_turn_sigma)
+        pivot, sigma = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
+        self._map_frame = MapFrame(pivot, sigma, oriented, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )

@@ -43,7 +43,8 @@ KNOWN_YAW = 0.5
 """A first yaw given to better than this [rad] is kept; a coarser one is left to the fixes."""
 
 COARSEST_YAW = 1.0
-"""A yaw coarser than this [rad] tells no direction: believed, it made filters sure of wrong ones."""
+"""A yaw coarser than this [rad] tells no direction: believed, it makes a filter sure of a wrong
+one."""
 
 FAR_ENOUGH = 0.3
 """Two positions tell the yaw when it is then known to this [rad]; half its square, what the

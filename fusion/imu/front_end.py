@@ -161,7 +161,8 @@ class FrontEnd:
             return []
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
-        start = Start(first, gravity.R_WB, gravity.still, gravity.force)
+        rate = 1.0 / float(np.median(np.diff(table[:, 0])))
+        start = Start(first, gravity.R_WB, gravity.still, gravity.force, rate)
         self._attitude = LevelledAttitude(gravity.R_WB)
         self._restart_grid(first)
         intervals = []

@@ -15,12 +15,21 @@ from stario.sequences.sequence import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the filter begins: the first sample's time, and what `GravityStart` knows of it."""
+    """Where the filter begins.
+
+    Attributes:
+        time: of the first sample [s].
+        R_WB: (3, 3) as of `GravityStart`, so the next two.
+        still: whether the device was at rest.
+        force: mean size of the specific force [m/s^2].
+        rate: of the samples, by their median step [Hz].
+    """
 
     time: float
     R_WB: FloatArray
     still: bool
     force: float
+    rate: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 A spike is one sample that stands off both its neighbours by more than a carried device can; it is
 replaced by their mean. Saturation shows in values that repeat exactly at the largest size the axis
-ever had, while it moves; what the sensor missed nobody knows, so such samples are only flagged.
+ever had, while it moves, again and again: two alike by chance, at a size that is soon surpassed,
+are none. What the sensor missed nobody knows, so such samples are only flagged.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class OutlierDetector:
 
     def __init__(self) -> None:
         self.largest = np.zeros(6)
+        self._repeats = np.zeros(6)  # of each axis at the size that is its largest now
 
     def look(self, table: FloatArray) -> Flags:
         """Mend spikes in place and say what is wrong.
@@ -56,7 +58,9 @@ class OutlierDetector:
         steps = values[1:] - values[:-1]
         spiky = np.abs(steps).max(axis=0) > SPIKE
         spikes = self._mend(values) if spiky.any() else _NO_AXES
-        self.largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+        largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+        self._repeats = np.where(largest > self.largest, 0.0, self._repeats)
+        self.largest = largest
         stuck = _NO_AXES
         if not steps.all():
             stuck = self._stuck(values)
@@ -88,8 +92,13 @@ class OutlierDetector:
         size = np.abs(values)
         moving = (np.ptp(values, axis=0) > _MOVES) | (self.largest > _LARGE)
         repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
-        return np.asarray(repeated.sum(axis=0), dtype=np.float64)
+        count = repeated.sum(axis=0)
+        self._repeats = self._repeats + count
+        return np.asarray(np.where(self._repeats >= _NO_CHANCE, count, 0.0))
 
+
+_NO_CHANCE = 2.0
+"""Repetitions at one and the same limit from which on they are none by chance."""
 
 NO_FLAGS = Flags()
 """Nothing is wrong."""

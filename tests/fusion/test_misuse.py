@@ -98,3 +98,21 @@ def test_a_snapshot_with_any_byte_changed_is_refused_or_read(
         spoiled[place] ^= 0xFF
         with suppress(InputError):  # what is no snapshot any more is refused by name alone
             Navigator(still_model).restore(bytes(spoiled))
+
+
+@pytest.mark.parametrize("rate", [20.0, 2000.0])
+def test_a_stream_too_slow_or_too_fast_is_refused_as_a_recording_is(
+    still_model: Any, rate: float
+) -> None:
+    navigator, told = Navigator(still_model), None
+    for k in range(round(1.2 * rate)):
+        with suppress(InputError):
+            navigator.push(k / rate, np.zeros(3), [0.0, 0.0, 9.81])
+            continue
+        told = k
+        break
+    assert told is not None
+    assert navigator.state is None
+    for k in range(300):
+        navigator.push(100.0 + k / 100.0, np.zeros(3), [0.0, 0.0, 9.81])
+    assert navigator.state is not None
