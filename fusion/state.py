@@ -135,7 +135,8 @@ class Health:
         nis_expected: degrees of freedom of a measurement.
         fixes: absolute fixes applied (of these gated), and left out by reason.
         zero_velocity: updates at rest (one per state there) applied, and left out by reason.
-        bearings: of the magnetic field applied (of these gated), and left out by reason.
+        bearings: of the magnetic field applied (of these gated), left out by reason, and whether
+            they told north.
         accel_noise_factor: of the accelerometer's noise to the configured density at the end, as
             the innovations tell.
         final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
@@ -167,11 +168,14 @@ class Health:
         if any(self.flagged.values()):
             text.append(f"samples flagged: {_counted(self.flagged)}")
         text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
-        share = self.gated / self.updates if self.updates else 0.0
-        text.append(
-            f"updates {self.updates}, gated {share:.1%}, refused {_counted(self.refused)}, "
-            f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
-        )
+        if self.updates:
+            text.append(
+                f"updates {self.updates}, gated {self.gated / self.updates:.1%}, "
+                f"refused {_counted(self.refused)}, "
+                f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+            )
+        else:
+            text.append("updates none: the network was never asked, or the device lay still")
         if self.fixes:
             text.append(f"fixes {_counted(self.fixes)}")
         if self.zero_velocity:

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @grouped
 def inspect(
-    path: Annotated[Path, typer.Argument(help="A recording, or a folder or list of some.")],
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or lists of some.")
+    ],
     reading: Reading,
     model: Annotated[
         str, typer.Option("--model", help="Weights whose training the motion is compared with.")
@@ -31,7 +33,7 @@ def inspect(
     from stario.network.model import load_model
 
     work = partial(_inspect, network=load_model(model), told=not as_json)
-    one_by_one(reading, [path], out, work, as_json)
+    one_by_one(reading, paths, out, work, as_json)
 
 
 def _inspect(

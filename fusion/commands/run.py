@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 @grouped
 def run(
-    path: Annotated[Path, typer.Argument(help="A recording, or a folder or list of some.")],
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or lists of some.")
+    ],
     reading: Reading,
     estimating: Estimating,
     fixes: FixesOption = None,
@@ -55,7 +57,7 @@ def run(
     known = [] if fixes is None else read_fixes(fixes)
     shown = Shown(report, view, figures=not as_json)
     work = partial(_run, navigator=navigator, fixes=known, shown=shown)
-    one_by_one(reading, [path], out, work, as_json, single="--fixes" if fixes else "")
+    one_by_one(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
 
 
 @dataclass(frozen=True)

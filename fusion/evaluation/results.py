@@ -13,7 +13,8 @@ from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.fusion.state import Innovations, Track
 from stario.sequences.drawing.figures import save_figure
-from stario.sequences.drawing.plots import error_over_time, innovations, plan_view
+from stario.sequences.drawing.plan import plan_view
+from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
 from stario.sequences.sequence import PositionTrack, Trajectory

@@ -247,11 +247,14 @@ class Estimator:
         if declination is None or self._map_frame.state.oriented:
             return []
         fix = north_fix(self.ekf.state, self._magnetic, declination)
-        taken = None if fix is None else self._update_fix(fix)
-        if taken is None:
+        if fix is None:
             return []
+        result = self._map_frame.update(self.ekf, fix)
+        if not result.accepted:
+            return []
+        self._counts = self._counts.add_north()
         self._opinion.sceptic = None  # its frame is no more
-        return [taken]
+        return [Accepted(fix, result.scale)]
 
     def _update_bearing(self, interval: ImuInterval) -> tuple[EkfState, EkfState] | None:
         """Returns the filter before and after, of a stream."""

@@ -24,7 +24,7 @@ class UpdateCounts:
         refused: network measurements left out, by reason.
         fixes: applied (of these gated), and left out by reason.
         zero_velocity: likewise, of measurements at rest.
-        bearings: likewise, of the magnetic field's.
+        bearings: likewise, of the magnetic field's, and whether it told north.
         nis_sum: of the network measurements that could be judged.
         nis_count: how many these are.
     """
@@ -69,6 +69,10 @@ class UpdateCounts:
         if result.accepted and result.scale > 1.0:
             bearings = counted(bearings, "gated")
         return changed(self, bearings=bearings)
+
+    def add_north(self) -> UpdateCounts:
+        """The magnetic field told where north is."""
+        return changed(self, bearings=counted(self.bearings, "north"))
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
         """The report: what became of the samples, of the updates, and the state's sigmas."""

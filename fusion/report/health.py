@@ -107,6 +107,8 @@ def _noted(note: str) -> Finding:
 def _samples(health: Health) -> list[Finding]:
     used = health.samples.get("used", 0)
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
+    if any("set back" in note for note in health.notes):
+        dropped.pop("out_of_order", None)  # that is why
     gone = sum(dropped.values())
     share = gone / max(1, used + gone)
     found = []

@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.drawing.figures import save_figure
+from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import (
     error_over_time,
     imu_overview,
     innovations,
-    plan_view,
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -174,6 +174,7 @@ def test_matplotlib_is_imported_late_and_pyplot_never():
 import sys
 import numpy as np
 from stario.sequences import ImuSequence
+from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import imu_overview
 assert "matplotlib" not in sys.modules
 ones = np.ones((9, 3))
@@ -182,3 +183,14 @@ assert "matplotlib.figure" in sys.modules
 assert "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_a_track_is_marked_where_it_goes_on_behind_a_gap(tracks):
+    whole = tracks["ekf"]
+    keep = np.ones(len(whole.time), dtype=bool)
+    keep[len(keep) // 2 : len(keep) // 2 + round(2.5 / np.median(np.diff(whole.time)))] = False
+    broken = Trajectory(whole.time[keep], whole.position_W[keep], whole.attitude_WB[keep])
+    for track, marks in ((whole, 0), (broken, 1)):
+        (axes,) = plan_view({"ekf": track}, None, "").axes
+        found = [line for line in axes.lines if line.get_label() == "behind a gap"]
+        assert len(found) == marks
