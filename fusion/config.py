@@ -10,8 +10,10 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass, field, fields
-from numbers import Integral
+from numbers import Real
 from pathlib import Path
+
+import numpy as np
 
 from stario.sequences.errors import ConfigError
 from stario.sequences.noise import ImuNoise
@@ -80,13 +82,14 @@ class FilterConfig:
     declination: float | None = None
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.update_rate, Integral) and self.update_rate in UPDATE_RATES):
+        if not (isinstance(self.update_rate, Real) and self.update_rate in UPDATE_RATES):
             raise ConfigError("update_rate", repr(self.update_rate), f"one of {UPDATE_RATES}")
+        object.__setattr__(self, "update_rate", int(self.update_rate))
         check_number(self, "gate", 0.5, 1.0)
         if self.gate == 1.0:
             raise ConfigError("gate", "1", "a probability from 0.5 to below 1")
         for name in ("adaptive", "magnetometer"):
-            if not isinstance(getattr(self, name), bool):
+            if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigError(name, repr(getattr(self, name)), "True or False")
         for item in fields(self):
             if item.name not in ("update_rate", "gate", "adaptive", "magnetometer", "declination"):

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.fixes import KINDS, Fix, make_fix
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
@@ -27,8 +28,12 @@ from stario.sequences.time_order import advancing
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _NEEDED = (*_COLUMNS[:3], "sx")
 
-_LARGEST_YAW = 2.0 * math.pi
-"""A yaw, or a deviation of one, beyond this was not meant in radians."""
+_LARGEST_YAW = 20.0 * math.pi
+"""A yaw of more than ten turns was not meant in radians; nor was a deviation beyond that of a yaw
+of which nothing is known."""
+
+_UNITS = {"t": ("s",), "kind": ()}
+"""That a header may name; of the others metres, metres a second, radians."""
 
 _UNKNOWN_HEIGHT = 1e3
 """Deviation of a height that is not given [m]."""
@@ -47,7 +52,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
         rows = list(csv.reader(lines, delimiter=separator))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
-    header = [word.split("[")[0].strip().lower() for word in rows[0]] if rows else []
+    header = [_without_unit(word).lower() for word in rows[0]] if rows else []
     unknown = [word for word in header if word not in _COLUMNS]
     missing = [word for word in _NEEDED if word not in header]
     if unknown or missing or len(set(header)) < len(header):
@@ -58,6 +63,13 @@ def read_fixes(path: Path | str) -> list[Fix]:
         if any(word.strip() for word in row):
             fixes.append(_read_row(path, f"line {number}", header, row))
     return fixes
+
+
+def _without_unit(title: str) -> str:
+    """A column's name where its unit, if one is named, is the one it has; else the whole title."""
+    name, _, unit = title.strip().partition("[")
+    known = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
+    return name.strip() if not unit or unit.rstrip("] ") in known else title.strip()
 
 
 def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
@@ -80,19 +92,20 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
         raise ReadError(path, where, f"{len(row)} values", f"at most {len(header)}")
     words = [word.strip() for word in row] + [""] * len(header)
     cells = dict.fromkeys(_COLUMNS, "") | dict(zip(header, words, strict=False))
-    kind, _, unit = cells["kind"].lower().partition(" ")
-    if kind not in KINDS or unit not in ("", "[deg]", "[rad]") or (unit and kind != "yaw"):
-        raise ReadError(path, f"{where}, kind", repr(cells["kind"]), f"one of {', '.join(KINDS)}")
+    kind, _, unit = cells["kind"].lower().replace(" ", "").partition("[")
+    if kind not in KINDS or unit not in ("", "deg]", "rad]") or (unit and kind != "yaw"):
+        expected = f"one of {', '.join(KINDS)}, yaw [deg]"
+        raise ReadError(path, f"{where}, kind", repr(cells["kind"]), expected)
     axes = "xyz"[: KINDS[kind]]
     if kind == "position" and not cells["z"] and not cells["sz"]:
         cells |= {"z": "0", "sz": str(_UNKNOWN_HEIGHT)}
     cells |= {f"s{a}": cells[f"s{a}"] or cells["sx"] for a in axes}
     value, sigma = (_numbers(path, where, cells, [p + a for a in axes]) for p in ("", "s"))
     if sigma.min() <= 0.0:
-        raise ReadError(path, f"{where}, sigma", repr(sigma.min()), "a standard deviation > 0")
-    if unit == "[deg]":
+        raise ReadError(path, f"{where}, sigma", f"{sigma.min():g}", "a standard deviation > 0")
+    if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
-    if kind == "yaw" and max(abs(value[0]), sigma[0]) > _LARGEST_YAW:
+    if kind == "yaw" and (abs(value[0]) > _LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
         found, fix = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
         raise ReadError(path, f"{where}, yaw", found, "radians", fix)
     (time,) = _numbers(path, where, cells, ["t"])

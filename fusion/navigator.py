@@ -66,7 +66,7 @@ class Navigator:
     ) -> None:
         if not (isinstance(backend, str) and backend in BACKENDS):
             raise InputError("backend", repr(backend), f"one of {', '.join(BACKENDS)}")
-        if not hasattr(model, "predict"):
+        if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) gives one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
         check_type("config", config, NavigatorConfig, None)
@@ -98,16 +98,18 @@ class Navigator:
         Raises:
             InputError: time is no number, or every sample is far from the one before, as where it
                 is not in seconds; gyro or accel does not hold three; the first second's average
-                force cannot be gravity in m/s^2, or its rate is not from 50 Hz to 1 kHz; gyro
+                force cannot be gravity in m/s^2, or its rate is not about 50 Hz to 1 kHz; gyro
                 cannot be in rad/s, which shows once the device turns; or the clock was set back
-                for a second. In the last four cases the
-                stream then begins anew.
+                for seconds. From the first second's force on the stream then begins anew, behind
+                a clock that was set back without prior and fixes.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
         try:
             intervals = self._front_end.push(sample)
         except ClockSetBackError:
+            # What was known of the first pose, or waits for its time, is of the other clock.
+            self.prior, self._fixes = None, FixQueue()
             self._begin_stream()
             raise
         for interval in intervals:
@@ -282,6 +284,7 @@ class Navigator:
                 f"this navigator's {self.config.filter.update_rate}",
                 "observe with the same update rate",
             )
+        check_type("fixes", fixes, Iterable, "a list of them")
         backend = BACKENDS[self.backend]
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 

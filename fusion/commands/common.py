@@ -138,6 +138,7 @@ _WHOLE = 0.98
 
 
 _EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+"""Figures whose meaning stands below a table."""
 
 
 def track_table(
@@ -169,10 +170,7 @@ def track_table(
     lines = aligned([["", *columns.values()], *rows])
     if truth is None:
         return "\n".join(lines)
-    lines += [
-        f"{key}: {words[key]}."
-        for key in ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
-    ]
+    lines += [f"{key}: {words[key]}." for key in _EXPLAINED]
     covered = float(truth.covers(time).mean())
     if covered < _WHOLE:
         lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")

@@ -43,14 +43,15 @@ def convert(
     if len(paths) < 2:
         raise InputError("convert", str(paths[0]), "IN... OUT", "name what to write as well")
     *sources, target = paths
-    _check_target(target, sources, overwrite)
-    if layout_of(target, to) != "archive":
+    layout = layout_of(target, to)
+    files, skipped = reading.recordings(sources)
+    _check_target(target, [*sources, *files], overwrite)
+    if layout != "archive":
         sequence = reading.read(_only(reading, sources))
         written = convert_sequence(sequence, target, to)
         typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
         typer.echo("\n".join(str(path) for path in written))
         return
-    files, skipped = reading.recordings(sources)
     names = convert_all(_read(reading, files, skipped), target)
     typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
     leave_with_skipped(skipped)
@@ -58,10 +59,15 @@ def convert(
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
     """Refuse to write over what is there, and over what is read in any case."""
-    if any(target.exists() and source.exists() and target.samefile(source) for source in sources):
+    from stario.sequences.readers.archive import split_name
+
+    read = {split_name(source)[0] for source in sources}
+    if target.exists() and any(file.exists() and target.samefile(file) for file in read):
         raise InputError("OUT", f"{target}, which is read as well", "another file")
     if target.is_file() and not overwrite:
-        raise InputError("OUT", f"{target}, which is there already", "a new file", "--overwrite")
+        raise InputError(
+            "OUT", f"{target}, which is there already", "a new file", "or pass --overwrite"
+        )
 
 
 def _only(reading: Reading, sources: list[Path]) -> Path:

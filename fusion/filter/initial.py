@@ -66,6 +66,7 @@ class PriorPose:
             raise InputError("R_WB", "a matrix that is no rotation", "a rotation from B to W")
         object.__setattr__(self, "R_WB", R_WB)
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
+            object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))
             check_number(self, name)
 
 

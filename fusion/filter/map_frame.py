@@ -76,7 +76,7 @@ class MapFrameState:
         transforms: of the states given out.
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
-        pivot_variance: of the position that placed it, over three axes [m^2].
+        pivot_variance: of the position that placed it, over the plane's axes [m^2].
         seen: positions since it was placed, from the pivot, while its yaw is not known.
         apart: how many of the last positions lay at another distance from the pivot than the track.
         off: (3,) residuals of the last positions, if they were outliers [m].
@@ -118,7 +118,7 @@ class MapFrame:
         self.state = MapFrameState(False, oriented)
         if pivot is not None:
             self.state = MapFrameState(
-                True, oriented, pivot=pivot, pivot_variance=3.0 * pivot_sigma**2
+                True, oriented, pivot=pivot, pivot_variance=2.0 * pivot_sigma**2
             )
         self._gate, self._turn_sigma = gate, turn_sigma
 
@@ -129,9 +129,11 @@ class MapFrame:
         elif self.state.oriented:
             return self._update(ekf, fix)
         else:
-            transform = None if self.state.apart else self._orient(ekf, fix)
+            apart = fix.kind == "position" and self.state.apart
+            transform = None if apart else self._orient(ekf, fix)
         if transform is None:
-            return UpdateResult(math.nan, len(fix.value), False, reason="yaw not known")
+            reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
+            return UpdateResult(math.nan, len(fix.value), False, reason=reason)
         result = self._update(ekf, fix)
         done = self._with_uncertainty(transform, _nav_state(ekf))
         self.state = changed(self.state, transforms=(*self.state.transforms, done))
@@ -153,7 +155,7 @@ class MapFrame:
         """
         if not self.state.placed or self.state.oriented:
             return not self.state.placed
-        if _BETTER**2 * float(np.trace(fix.covariance)) < self.state.pivot_variance:
+        if _BETTER**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
         P = _without_yaw(now.covariance, 6)
@@ -174,7 +176,7 @@ class MapFrame:
             self.state,
             placed=True,
             pivot=fix.value,
-            pivot_variance=float(np.trace(fix.covariance)),
+            pivot_variance=float(np.trace(fix.covariance[:2, :2])),
             seen=SeenPositions(),
             apart=0,
         )

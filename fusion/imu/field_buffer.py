@@ -13,7 +13,7 @@ _FIELDS = 64
 """Fields that are kept: more than come between two intervals."""
 
 _AHEAD = 1.0
-"""A field that is this much ahead of the newest sample [s] is refuted by the next field."""
+"""A field that is this much ahead of the newest sample [s] is refuted by one that is not."""
 
 _FIELD_SECONDS = 0.11
 """How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
@@ -32,9 +32,13 @@ class FieldBuffer:
             time: its own [s].
             field_B: (3,) [uT].
             now: time of the newest sample [s]. One wild time must not make all that follow look
-                late, so a field far ahead of it counts only until another one comes.
+                late, so a field far ahead of it counts only until an earlier one comes.
         """
-        while self._fields and -math.inf < now < self._fields[-1][0] - _AHEAD:
+        while (
+            self._fields
+            and time <= (last := self._fields[-1][0])
+            and -math.inf < now < last - _AHEAD
+        ):
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD

@@ -1,7 +1,7 @@
 """A clock that was set back: samples that go on, but in the past.
 
 Single late samples are dropped, and so is a burst that came in the wrong order. Late ones that
-advance among themselves for a second are another clock: nobody knows how much time has passed
+advance among themselves for seconds are of another clock: nobody knows how much time has passed
 between it and the one before.
 """
 
@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from stario.sequences.errors import InputError
 
-SET_BACK_SECONDS = 1.0
-"""Late samples that advance for so long in a row [s] are of a clock that was set back."""
+SET_BACK_SECONDS = 5.0
+"""Late samples that advance for so long in a row [s] are of a clock that was set back; batches that
+come twice or in the wrong order are shorter."""
 
 
 class ClockSetBackError(InputError):

@@ -189,9 +189,12 @@ def _fixes(health: Health) -> list[Finding]:
     if not other:
         return [Finding("note", f"{text}.")]
     reasons = _counted(other)
-    refused = sum(n for name, n in other.items() if name not in ("gated", "waiting"))
+    early = ("gated", "waiting", "yaw not known")
+    refused = sum(n for name, n in other.items() if name not in early)
     wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
+    if not wrong and other.get("yaw not known", 0) > applied:
+        advice = "Positions tell the direction once one has walked some metres; a yaw tells it too."
     return [Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)]
 
 

@@ -9,7 +9,7 @@ from stario.sequences.sequence import ABSURD, BoolArray, FloatArray, ImuSequence
 _OUT_OF_ORDER = 0.05
 """Beyond this share of steps that go back the rows are in disorder."""
 
-_SET_BACK = 1.0
+_SET_BACK = 5.0
 """A step back by more than this [s] is of a clock that was set."""
 
 

@@ -395,6 +395,8 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         (HEADER + "1,yaw,170,,,5,,\n", r"yaw.*radians.*\[deg\]"),
         (HEADER + "1,position [deg],1,2,3,1,,\n", "line 2, kind"),
         ("t,kind,x,x,sx\n", "line 1.*header"),
+        ("t,kind,x [cm],y [cm],sx\n", r"line 1.*\[cm\]"),
+        ("t [ms],kind,x [m],y,sx\n", r"line 1.*\[ms\]"),
         (HEADER + "1,position,1,2,3,,,\n", "line 2, sx"),
         (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
         (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
@@ -414,7 +416,7 @@ def test_a_file_that_does_not_fit_names_line_and_field(
 
 def test_columns_in_any_order_and_degrees_and_the_plane(tmp_path: Path) -> None:
     path = tmp_path / "fixes.csv"
-    path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw [deg];2;170;;;5\n")
+    path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw[deg];2;170;;;5\n")
     position, yaw = read_fixes(path)
     np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
     assert position.covariance[0, 0] == pytest.approx(0.25)

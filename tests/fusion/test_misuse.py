@@ -26,6 +26,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model, prior=(1, 2)), "prior"),
         (lambda model: Navigator(model, backend=["ekf"]), "backend"),
         (lambda model: Navigator("default"), "model"),
+        (lambda model: Navigator(type(model)), "model"),
         (lambda model: Navigator(model).run("walk.csv"), "sequence"),
         (lambda model: Navigator(model).restore("text"), "snapshot"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
@@ -49,6 +50,18 @@ def test_a_wrong_argument_is_named(still_model: Any, make: Any, named: str) -> N
 def test_a_fix_that_is_none_is_named(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="position_fix"):
         Navigator(still_model).run(walk, fixes=[(1.0, "position")])
+
+
+def test_a_fix_alone_is_no_list(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="fixes"):
+        Navigator(still_model).run(walk, fixes=position_fix(1.0, np.zeros(3), np.eye(3)))
+
+
+def test_numbers_of_any_type_are_numbers() -> None:
+    config = FilterConfig(update_rate=np.float64(10.0), adaptive=np.True_)
+    assert config.update_rate == 10
+    assert isinstance(config.update_rate, int)
+    assert PriorPose(*LEVEL, yaw_sigma=np.array(0.1)).yaw_sigma == 0.1
 
 
 def test_a_recording_prepared_for_another_rate_is_refused(

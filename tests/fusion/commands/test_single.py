@@ -459,6 +459,11 @@ def test_nothing_is_written_over_unasked(stario, recording: Path, tmp_path: Path
     assert there.read_text() == "mine"
     assert stario("convert", recording, there, "--overwrite").code == 0
     assert there.read_text() != "mine"
+    assert stario("convert", recording, there, "two.h5").code == 0
+    before = Path("two.h5").read_bytes()
+    for source in ("two.h5:walk", "."):
+        stario("convert", source, "two.h5", "--overwrite").assert_one_line_error("read as well")
+    assert Path("two.h5").read_bytes() == before
 
 
 def test_an_end_that_names_no_layout_is_refused(stario, recording: Path) -> None:

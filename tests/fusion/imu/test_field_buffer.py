@@ -51,3 +51,11 @@ def test_late_and_repeated_fields_are_refused() -> None:
     assert not buffer.add(1.5, np.full(3, math.inf), now=1.5)
     assert buffer.at(1.05) is FIELD_B
     assert buffer.at(1.2) is None
+
+
+def test_fields_may_come_some_seconds_before_their_samples() -> None:
+    buffer = FieldBuffer()
+    for batch in range(5):
+        for k in range(60):
+            assert buffer.add(3.0 * batch + 0.05 * k, FIELD_B, now=3.0 * batch - 0.01)
+        assert buffer.at(3.0 * batch + 0.12) is not None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stario.fusion import Navigator
+from stario.fusion import Navigator, PriorPose
 from stario.fusion.imu.set_back import ClockSetBackError, SetBackWatch
 from stario.fusion.report.health import told
 from stario.sequences.inspection.report import inspect_recording
@@ -23,7 +23,9 @@ def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
 
 def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> None:
     walk = set_back(make_walk(3, 16.0), 100.0)
-    navigator, states, errors = Navigator(still_model), [], []
+    first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
+    navigator, states, errors = Navigator(still_model, prior=first), [], []
+    navigator.update_position(500.0, np.zeros(3), np.eye(3))
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         try:
             states.append(navigator.push(*row))
@@ -33,9 +35,12 @@ def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> 
     assert errors[0].by == pytest.approx(100.0, abs=0.1)
     times = [state.time for state in states if state is not None]
     assert times[-1] == pytest.approx(walk.time[-1], abs=0.11)
+    # What was known of the first pose, or waited, is of the other clock.
+    assert np.linalg.norm(navigator.state.p_W) < 10.0
+    assert navigator.health.fixes == {}
 
 
-@pytest.mark.parametrize("by", [5.0, 100.0])
+@pytest.mark.parametrize("by", [7.0, 100.0])
 def test_a_recordings_track_ends_there_and_its_health_says_why(
     make_walk: Make, still_model: Any, by: float
 ) -> None:
@@ -54,11 +59,19 @@ def test_late_samples_and_bursts_are_no_other_clock() -> None:
     for k in range(300):  # two sensors in turn, one half a second behind
         watch.on_time()
         watch.late(0.01 * k - 0.5, 0.01 * k)
-    for k in range(90):
+    for k in range(490):
         watch.late(0.01 * k, 10.0)
     watch.on_time()
     for k in range(300):  # falling
         watch.late(9.0 - 0.01 * k, 10.0)
+
+
+def test_a_block_that_is_logged_twice_costs_nothing(make_walk: Make, still_model: Any) -> None:
+    walk = make_walk(3, 16.0).without_truth()
+    rows = np.r_[0:800, 600 : len(walk)]
+    twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
+    track, plain = Navigator(still_model).run(twice), Navigator(still_model).run(walk)
+    np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
 def test_rows_in_disorder_are_to_be_sorted(make_walk: Make) -> None:

@@ -24,3 +24,9 @@ def test_a_field_of_no_use_is_told() -> None:
     assert any("magnetic field" in line for line in told(useless))
     good = Health(bearings={"applied": 100, "gated": 90, "no horizontal field": 2})
     assert not any("magnetic field" in line for line in told(good))
+
+
+def test_who_stands_with_a_receiver_is_not_told_to_check_it() -> None:
+    standing = Health(fixes={"applied": 2, "yaw not known": 580})
+    assert not warned(standing)
+    assert any("walked" in line for line in told(standing))
