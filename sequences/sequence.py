@@ -256,6 +256,12 @@ class ImuSequence:
             return f"{count} waypoints, no poses"
         return f"{count} positions without attitude, no poses"
 
+    def _truth_within(self, start: float, stop: float) -> Trajectory | None:
+        truth = self.truth
+        if truth is None or not ((truth.time >= start) & (truth.time <= stop)).any():
+            return None
+        return truth.slice(start, stop)
+
     def without_truth(self) -> ImuSequence:
         """The same recording with its truth removed."""
         return replace(self, truth=None, positions=None)
@@ -269,7 +275,7 @@ class ImuSequence:
             time=self.time[keep],
             gyro=self.gyro[keep],
             accel=self.accel[keep],
-            truth=None if self.truth is None else self.truth.slice(start, stop),
+            truth=self._truth_within(start, stop),
             magnetometer=None if field is None else field.slice(start, stop),
             positions=None if positions is None else positions.slice(start, stop),
             device_attitude=None if own is None else own.slice(start, stop),

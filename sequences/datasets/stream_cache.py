@@ -14,11 +14,13 @@ besides is a file that was replaced by one of the same size and the same time.
 from __future__ import annotations
 
 import hashlib
+import importlib.resources
 import json
 import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -192,9 +194,14 @@ def _digest(key: Mapping[str, object]) -> str:
 def _code() -> str:
     """Digest of this package: streams that other code has made are not found again."""
     digest = hashlib.blake2b(digest_size=20)
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
+    for file in code_files():
         digest.update(file.read_bytes())
     return digest.hexdigest()
+
+
+def code_files() -> list[Path]:
+    """All that streams are made by: readers, levelling, windows, simulation."""
+    return sorted(Path(str(importlib.resources.files("stario.sequences"))).rglob("*.py"))
 
 
 def _written(file: Path, streams: Sequence[Stream]) -> bool:
@@ -224,8 +231,9 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
 def _sweep(file: Path) -> None:
     """Remove what killed writers of this file have left."""
     for left in file.parent.glob(f".{file.name}.*.tmp"):
-        if time.time() - left.stat().st_mtime > _ABANDONED_S:
-            left.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # its writer has just finished
+            if time.time() - left.stat().st_mtime > _ABANDONED_S:
+                left.unlink()
 
 
 def _tables(stream: Stream) -> dict[str, NDArray[Any]]:

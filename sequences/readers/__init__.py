@@ -227,14 +227,11 @@ def _below(path: Path) -> list[Path]:
     found: list[Path] = []
     for folder, subfolders, files in os.walk(path):
         here = Path(folder)
+        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
         whole = [name for name in subfolders if _is_recording(here / name)]
         found += [here / name for name in whole]
         doubles = {"raw"} if "syn" in subfolders else set()
-        subfolders[:] = [
-            name
-            for name in subfolders
-            if name not in {*whole, *doubles} and not name.startswith(".")
-        ]
+        subfolders[:] = [name for name in subfolders if name not in {*whole, *doubles}]
         for name in files:
             if not name.lower().endswith(_SUFFIXES):
                 continue

@@ -8,14 +8,15 @@ carried which device where. Poses may come with `truth/{velocity,position_covari
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from stario.sequences.errors import ReadError
+from stario.sequences.errors import ReadError, StarioError
 from stario.sequences.readers.checked import checked, optional_package, rotations
 from stario.sequences.readers.text import magic
 from stario.sequences.sequence import (
@@ -42,13 +43,17 @@ _OPTIONAL = {
 }
 
 
+_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
+"""What h5py and NumPy raise of a damaged file, or of one that holds something else."""
+
+
 def split_name(path: Path) -> tuple[Path, str | None]:
     """The archive's file and the recording's name in it: `file.h5:name`, or None without one."""
     text = str(path)
     for suffix in SUFFIXES:
-        file, found, name = text.partition(f"{suffix}:")
-        if found and name:
-            return Path(file + suffix), name
+        stop = text.lower().find(f"{suffix}:") + len(suffix)
+        if stop >= len(suffix) and text[stop + 1 :]:
+            return Path(text[:stop]), text[stop + 1 :]
     return path, None
 
 
@@ -70,7 +75,7 @@ def is_archive(path: Path) -> bool:
         with h5py.File(path) as file:
             first = next(iter(file.values()), None)
             return isinstance(first, h5py.Group) and ("imu/t" in first or "truth/t" in first)
-    except OSError:
+    except _DAMAGED:
         return path.name != _RONIN
 
 
@@ -85,9 +90,8 @@ def archive_members(path: Path, where: Where | None = None) -> list[Path]:
     Raises:
         ReadError: the file cannot be read, or none has the attributes; it names the values seen.
     """
-    h5py = optional_package("h5py", "readers")
     wanted = where or {}
-    with _opened(h5py, path) as file:
+    with _opened(path) as file:
         known = {
             name: {key: _plain(value) for key, value in group.attrs.items()} if wanted else {}
             for name, group in file.items()
@@ -104,8 +108,7 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
     file_path, name = split_name(path)
     if name is None:
         return {}
-    h5py = optional_package("h5py", "readers")
-    with _opened(h5py, file_path) as file:
+    with _opened(file_path) as file:
         return {key: _plain(value) for key, value in file[name].attrs.items()}
 
 
@@ -148,9 +151,8 @@ def read_archive(path: Path) -> ImuSequence:
     Raises:
         ReadError: the file or the recording is not there, or its content is malformed.
     """
-    h5py = optional_package("h5py", "readers")
     file_path, name = split_name(path)
-    with _opened(h5py, file_path) as file:
+    with _opened(file_path) as file:
         names = list(file)
         if name is None and len(names) == 1:
             name = names[0]
@@ -253,12 +255,21 @@ def _column(path: Path, group: Any, field: str, finite: bool = True) -> FloatArr
 def _plain(value: Any) -> str | float:
     if isinstance(value, bytes):
         return value.decode(errors="replace")
-    return value if isinstance(value, str) else float(value)
-
-
-def _opened(h5py: Any, path: Path) -> Any:
     try:
-        return h5py.File(path)
-    except OSError as error:
-        fix = "is the download complete?"
-        raise ReadError(path, "content", str(error), "a whole HDF5 archive", fix) from None
+        return value if isinstance(value, str) else float(value)
+    except (TypeError, ValueError):
+        return str(value)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The open file; whatever of it is damaged or of another form shows as it is read."""
+    h5py = optional_package("h5py", "readers")
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except StarioError:
+        raise
+    except _DAMAGED as error:
+        found = " ".join(f"{type(error).__name__} {error}".split())[:120]
+        raise ReadError(path, "file", found, "a whole archive in HDF5") from error

@@ -63,14 +63,18 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     messages = _messages(path, imu_topic, truth_topic)
     imu = messages[_IMU]
     stamps = imu.stamps_ns
-    values = checked(path, f"{imu.topic}, values", imu.values, first_row=0)
+    # Orientation and covariances, which a driver may leave NaN, are not used.
+    gyro, accel = (
+        checked(path, f"{imu.topic}, values", imu.values[:, part], first_row=0)
+        for part in (_GYRO, _ACCEL)
+    )
     truth = next((m for kind, m in messages.items() if kind not in (_IMU, _MAGNETIC)), None)
     field = messages.get(_MAGNETIC)
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
-        gyro=values[:, _GYRO],
-        accel=values[:, _ACCEL],
+        gyro=gyro,
+        accel=accel,
         truth=None if truth is None else _truth(path, truth, stamps[0]),
         magnetometer=None if field is None else _magnetometer(field, stamps[0]),
     )

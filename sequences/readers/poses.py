@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.attitude.levelling import LEAST_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
@@ -108,6 +109,9 @@ def with_pose(
         if ways:
             names = ", ".join(dict.fromkeys(way.file.name for way in ways))
             _log.warning("%s: no pose of %s agrees with the gyroscope", sequence.name, names)
+        elif files:
+            names = ", ".join(file.name for file in files)
+            _log.warning("%s: no row of %s holds a pose", sequence.name, names)
         return sequence
     best = max(fit.aligned.correlation for _, fit in fits)
     near = [(way, fit) for way, fit in fits if fit.aligned.correlation > best - _ALIKE]
@@ -131,12 +135,13 @@ def pose_rows(file: Path) -> list[PoseRows]:
     if width < 8:
         return []
     columns = 13 if width >= 13 else 8
-    table = read_table(file, columns, lines[first][0], delimiter, None, decimal)
+    table = read_table(file, columns, lines[first][0], delimiter, None, decimal, killed=True)
     stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
     numbers = table.values[:, 1:]
     if columns == 13:
         matrices = numbers.reshape(-1, 3, 4)
         good = np.abs(np.linalg.det(matrices[:, :, :3]) - 1.0) < NORM_TOLERANCE
+        good &= np.isfinite(numbers[:, :12]).all(axis=1)
         return [
             PoseRows(
                 file, stamps[good], matrices[good, :, 3],
@@ -145,6 +150,7 @@ def pose_rows(file: Path) -> list[PoseRows]:
         ]  # fmt: skip
     quaternion = numbers[:, 3:7]
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
+    good &= np.isfinite(numbers[:, :7]).all(axis=1)
     orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
     return [
         PoseRows(
@@ -229,6 +235,9 @@ def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
         [np.interp(pose.time, sequence.time, sequence.accel[:, k]) for k in range(3)], axis=1
     )
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
+    if np.linalg.norm(up) < LEAST_FORCE:
+        _log.warning("%s: no gravity to level %s by", sequence.name, way.file.name)
+        return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
         _log.warning("%s: the accelerometer has Apple's sign, turned over", sequence.name)
         converted = sequence.converted | {"accel"}

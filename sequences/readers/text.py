@@ -256,9 +256,12 @@ def _read_carefully(
     numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
-    if killed and len(numbered) > 1 and len(numbered[-1][1].split(delimiter)) < columns:
-        _log.warning("%s: the last row is cut short and left out", path)
-        numbered.pop()
+    if killed and len(numbered) > 1:
+        try:
+            _row(path, *numbered[-1], columns, delimiter, wanted)
+        except ReadError:
+            _log.warning("%s: the last row is cut short and left out", path)
+            numbered.pop()
     rows = [line for _, line in numbered]
     try:
         with warnings.catch_warnings():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -40,13 +41,17 @@ def unpacked(path: Path) -> Iterator[Path]:
             for inner in sorted(Path(folder).rglob("*.zip")):
                 size += _extract(inner, inner.with_suffix(""), _LARGEST - size)
                 inner.unlink()
-        except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
+        except _BROKEN as error:
             found = " ".join(str(error).split())
             raise ReadError(path, "zip", found, "a whole zip", "is it complete?") from None
         except _TooLargeError:
             found = f"more than {_LARGEST / 2**30:.0f} GiB of text"
             raise ReadError(path, "zip", found, "a recording") from None
         yield Path(folder)
+
+
+_BROKEN = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError)
+"""What a damaged zip raises, and one that is encrypted or packed in a rare way."""
 
 
 class _TooLargeError(Exception):

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation
+from stario.sequences.attitude.levelling import LEAST_FORCE
 from stario.sequences.attitude.rotations import cumulative_rotations, tilt_aligning
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -141,7 +142,11 @@ def _level(
     attitude_WB: Rotation, force_B: FloatArray, kept: BoolArray
 ) -> tuple[Rotation, Rotation]:
     """The attitude in a world whose mean force points up, and the rotation that made it so."""
-    leveling = tilt_aligning(attitude_WB[kept].apply(force_B[kept]).mean(axis=0))
+    up = attitude_WB[kept].apply(force_B[kept]).mean(axis=0)
+    if not np.linalg.norm(up) > LEAST_FORCE:
+        found = f"a mean force of {np.linalg.norm(up):.3g} m/s^2"
+        raise InputError("accelerometer", found, "gravity, to level the truth by")
+    leveling = tilt_aligning(up)
     return leveling * attitude_WB, leveling
 
 

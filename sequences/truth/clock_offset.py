@@ -55,9 +55,15 @@ def clock_offset(
     return float(lags[int(np.argmax(scores))]) / _GRID_HZ + apart
 
 
+_LONGEST_S = 2.0 * 86_400.0
+"""Nobody records for longer [s]: a single time that is off by decades must not cost memory."""
+
+
 def _on_grid(time: FloatArray, speed: FloatArray) -> FloatArray:
     """Angular speed at 50 Hz, averaged over each step; nan where there is none."""
     use = np.isfinite(speed) & (speed < _FASTEST_RAD_S)
+    if not use.any() or float(time[use].max()) > _LONGEST_S:
+        raise InputError("truth's clock", "times that jump by days", "a recording's")
     cells = np.rint(time[use] * _GRID_HZ).astype(np.int64)
     count = np.bincount(cells)
     with np.errstate(invalid="ignore"):

@@ -118,8 +118,15 @@ def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
     return PositionTrack(time[keep], points[1][order][keep], "waypoints") if keep.any() else None
 
 
+def _whole_lines(path: Path) -> list[str]:
+    """All but a last one without an end: the app was killed while it wrote."""
+    lines = read_lines(path)
+    ended = path.read_bytes()[-1:] in (b"\n", b"\r")
+    return lines if ended or len(lines) < 2 else lines[:-1]
+
+
 def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
-    text = _GLUED.sub(r"\n\1", "\n".join(read_lines(path)))
+    text = _GLUED.sub(r"\n\1", "\n".join(_whole_lines(path)))
     events: dict[str, list[list[str]]] = {}
     for line in text.splitlines():
         cells = line.split("\t")
@@ -140,7 +147,7 @@ def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
 
 def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
     events: dict[str, list[list[str]]] = {}
-    for line in read_lines(path):
+    for line in _whole_lines(path):
         cells = line.strip().split(";")
         if cells[0] in (*_CODES.values(), _POINT, _AHRS):
             events.setdefault(cells[0], []).append(cells[1:])

@@ -166,7 +166,7 @@ def assembled(
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
         return sequence
-    return replace(sequence, positions=reference_points(folder, files.key, stamps[0]))
+    return replace(sequence, positions=reference_points(folder, files.key, stamps[0], stamps[-1]))
 
 
 def is_phone(path: Path) -> bool:

@@ -16,17 +16,20 @@ from stario.sequences.units import TIME_UNITS
 
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
 
-_NEAR_S = 3600.0
-"""Reference points of a recording lie within an hour of its start."""
+_BESIDE_S = 60.0
+"""Reference points lie within a recording, or so little before or behind it."""
 
 
-def reference_points(folder: Path, key: str, start_ns: np.int64) -> PositionTrack | None:
+def reference_points(
+    folder: Path, key: str, start_ns: np.int64, stop_ns: np.int64
+) -> PositionTrack | None:
     """Waypoints of `*_ref.csv` and the like: rows of time, x and y [m]; None without such a file.
 
     Args:
         folder: where to look.
         key: the words that all files of the recording share.
         start_ns: the recording's first sample on the sensors' clock [ns].
+        stop_ns: its last one.
 
     Raises:
         ReadError: a row is malformed.
@@ -40,13 +43,18 @@ def reference_points(folder: Path, key: str, start_ns: np.int64) -> PositionTrac
         if found is None or not set(key.split()) <= words:
             continue
         first, delimiter, decimal = found
-        table = read_table(file, 3, lines[first][0], delimiter, None, decimal)
-        start = float(start_ns) * 1e-9
+        table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
+        start, stop = float(start_ns) * 1e-9 - _BESIDE_S, float(stop_ns) * 1e-9 + _BESIDE_S
         stamps = table.values[:, 0]
-        near = [n for n in TIME_UNITS.values() if np.abs(stamps / n - start).min() < _NEAR_S]
-        if not near:
+        # Of stamps from zero on finer units fit as well, with all points at the start.
+        fitting = {
+            unit: int(((stamps / unit > start) & (stamps / unit < stop)).sum())
+            for unit in sorted(TIME_UNITS.values())
+        }
+        unit = max(fitting, key=lambda unit: fitting[unit])
+        if not fitting[unit]:
             raise ReadError(file, "time", "other times", "those of the sensors' files")
-        time = seconds(table.stamps_ns(0, near[0]), start_ns)
+        time = seconds(table.stamps_ns(0, unit), start_ns)
         kept = advancing(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
     return None

@@ -1,0 +1,14 @@
+"""Streams are kept by all the code that makes them."""
+
+from stario.sequences.datasets.stream_cache import code_files
+
+
+def test_readers_levelling_windows_and_simulation_count() -> None:
+    names = {"/".join(file.parts[-2:]) for file in code_files()}
+    assert {
+        "sequences/windows.py",
+        "readers/own_csv.py",
+        "attitude/levelling.py",
+        "simulation/imu.py",
+        "datasets/stream_cache.py",
+    } <= names

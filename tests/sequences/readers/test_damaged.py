@@ -1,0 +1,105 @@
+"""Damaged files end in one line that names them, whatever is wrong in them."""
+
+import shutil
+import zipfile
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from stario.sequences import generate_walk, read_recording, simulate_imu, write_csv
+from stario.sequences.attitude.levelling import LEAST_FORCE
+from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers import find_recordings
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.clock_offset import clock_offset
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(3, 12.0), 100.0, seed=1, name="walk")
+
+
+@pytest.fixture
+def archive(walk: ImuSequence, tmp_path: Path) -> Path:
+    write_archive(tmp_path / "two.h5", [walk, replace(walk, name="other")])
+    return tmp_path / "two.h5"
+
+
+def test_flipped_bytes_of_an_archive_are_a_read_error(archive: Path, tmp_path: Path) -> None:
+    data, rng = archive.read_bytes(), np.random.default_rng(0)
+    spoiled = tmp_path / "spoiled.h5"
+    for _ in range(40):
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), 20):
+            changed[place] ^= 0xFF
+        spoiled.write_bytes(changed)
+        with suppress(InputError):
+            for path in find_recordings(spoiled):
+                with suppress(InputError):
+                    read_recording(path)
+
+
+def test_arrays_of_other_shapes_are_a_read_error(archive: Path) -> None:
+    with h5py.File(archive, "r+") as file:
+        del file["walk/truth/p"]
+        file["walk/truth/p"] = np.zeros((3, 3))
+        del file["other/imu/gyro"]
+        file["other/imu/gyro"] = 1.0
+        file["other"].attrs["tags"] = ["a", "b"]
+    assert len(find_recordings(archive, where={"name": ["*"]})) == 2
+    for name in ("walk", "other"):
+        with pytest.raises(ReadError, match="two"):
+            read_recording(f"{archive}:{name}")
+
+
+def test_an_archive_with_its_end_in_capitals_is_read(archive: Path, tmp_path: Path) -> None:
+    shutil.copy(archive, tmp_path / "TWO.H5")
+    paths = find_recordings(tmp_path / "TWO.H5")
+    assert [read_recording(path).name for path in paths] == ["other", "walk"]
+
+
+def test_a_damaged_zip_is_a_read_error(walk: ImuSequence, tmp_path: Path) -> None:
+    write_csv(tmp_path / "walk.csv", walk)
+    with zipfile.ZipFile(tmp_path / "walk.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.write(tmp_path / "walk.csv", "walk.csv")
+    data, rng = (tmp_path / "walk.zip").read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(40, len(data) - 200, 12).tolist():
+        changed = bytearray(data)
+        changed[place : place + 8] = bytes(8)
+        (tmp_path / "walk.zip").write_bytes(changed)
+        with pytest.raises(ReadError, match="zip"):
+            read_recording(tmp_path / "walk.zip")
+
+
+def test_what_a_killed_writer_left_is_no_recording(walk: ImuSequence, tmp_path: Path) -> None:
+    from stario.sequences.datasets.convert import convert
+
+    convert(walk, tmp_path / ".rec.abcd.tmp", "euroc")
+    convert(walk, tmp_path / "rec", "euroc")
+    assert find_recordings(tmp_path) == [tmp_path / "rec"]
+
+
+def test_a_truth_is_not_levelled_by_a_dead_accelerometer(walk: ImuSequence) -> None:
+    truth, dead = walk.truth, np.zeros_like(walk.accel)
+    with pytest.raises(InputError, match="gravity"):
+        align_tracked_body(walk.time, walk.gyro, dead, truth.time, truth.attitude_WB, truth.valid)
+    assert LEAST_FORCE > 0.0
+
+
+def test_a_pose_of_another_clock_costs_no_memory(walk: ImuSequence) -> None:
+    truth = walk.truth
+    time = truth.time + 1.7e9
+    time[0] = 0.0
+    with pytest.raises(InputError, match="clock"):
+        clock_offset(walk.time, walk.gyro, time, truth.attitude_WB, truth.valid)
+
+
+def test_a_part_without_truth_has_none(walk: ImuSequence) -> None:
+    short = replace(walk, truth=walk.truth.slice(0.0, 1.0))
+    assert short.slice(5.0, 6.0).truth is None
