@@ -152,7 +152,7 @@ def parse_card(text: str, path: Path) -> Card:
         for name in ("architecture", "sha256"):
             if not isinstance(getattr(card, name), str):
                 raise ValueError(f"{name} {getattr(card, name)!r}")
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
     _check(card, path)
     return card

@@ -10,6 +10,7 @@ twice the mean NIS, but only 2 to 22 % by the ranges.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -85,7 +86,8 @@ def known_from(content: dict[str, Any]) -> KnownMotion:
     centres = tuple(tuple(float(x) for x in line.split()) for line in content["centres"])
     limit = float(content["limit"])
     ranges = {str(k): (float(low), float(high)) for k, (low, high) in content["ranges"].items()}
-    if not centres or any(len(row) != len(FEATURES) for row in centres) or not limit > 0.0:
+    whole = centres and all(len(row) == len(FEATURES) for row in centres)
+    if not (whole and np.isfinite(centres).all() and 0.0 < limit < math.inf):
         raise ValueError(f"known_motion: {len(centres)} centres, limit {limit}")
     return KnownMotion(centres, limit, ranges)
 

@@ -44,7 +44,7 @@ def live(
         out,
         host,
         port,
-        port + 1 if lines_port is None and port else lines_port or 0,
+        port + 1 if lines_port is None and 0 < port < 65535 else lines_port or 0,
         phyphox or [],
     )
     server.run(started=lambda: typer.echo("\n".join(server.addresses()), err=True))

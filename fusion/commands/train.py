@@ -157,6 +157,7 @@ def train(
             calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
             legs=material.legs,
             validation_legs=kept.legs,
+            chosen_by_legs=not kept.streams,
         )
     if leads():
         typer.echo(str(path))

@@ -116,12 +116,18 @@ class LineServer:
     async def _work_off_packets(self) -> None:
         while True:
             data, sender = await self._packets.get()
-            lines = data.split(b"\n")
-            if self._token and not self._is_token(lines.pop(0)):
+            try:
+                await self._work_off(data.split(b"\n"), sender)
+            except Exception:  # anybody may send anything: no packet ends the others' listening
+                _log.exception("%s: a packet is left out", sender)
                 self._hub.refuse("udp")
-                continue
-            for _ in await self._take(lines, sender):
-                self._hub.refuse("udp")
+
+    async def _work_off(self, lines: list[bytes], sender: str) -> None:
+        if self._token and not self._is_token(lines.pop(0)):
+            self._hub.refuse("udp")
+            return
+        for _ in await self._take(lines, sender):
+            self._hub.refuse("udp")
 
     async def _take(self, lines: Sequence[bytes], sender: str) -> list[str]:
         """Take lines in, those of a device at once; returns what is wrong with the others."""

@@ -207,7 +207,8 @@ def _name(where: str, value: Any, needed: bool = True) -> str:
         value = str(value)
     if not isinstance(value, str) or (needed and not value.strip()):
         raise InputError(where, _kind(value), "a name")
-    return value.strip()[:_LONGEST_NAME]
+    # What is no character (a lone surrogate) could be put neither on the page nor in an answer.
+    return value.strip()[:_LONGEST_NAME].encode("utf-8", "replace").decode()
 
 
 def _nanoseconds(where: str, value: Any) -> int:

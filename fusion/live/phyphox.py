@@ -92,6 +92,8 @@ class Phyphox:
     def _readings(self, sensor: str, buffers: Mapping[str, Any]) -> list[Reading]:
         columns = [_column(buffers, name) for name in self._buffers[sensor]]
         readings = []
+        if columns[0] and columns[0][-1] < self._newest.get(sensor, -1.0):
+            self._newest = {}  # the experiment was cleared: its time begins anew
         for t, *value in zip(*columns, strict=False):  # one may be ahead by a sample
             if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _LARGEST_VALUE:
                 continue
@@ -144,10 +146,11 @@ async def follow(hub: Hub, phone: Phyphox) -> None:
             batch = await asyncio.to_thread(phone.fetch)
             await hub.take(batch)
             told = ""
-        except (OSError, InputError, ValueError) as error:
-            if str(error) != told:
-                _log.warning("%s: %s", phone.device, error)
-                told = str(error)
+        except Exception as error:  # whatever a phone in a bad network answers, it is asked again
+            words = str(error) or type(error).__name__
+            if words != told:
+                _log.warning("%s: %s", phone.device, words)
+                told = words
             await asyncio.sleep(_PATIENCE)
         await asyncio.sleep(PERIOD)
 

@@ -121,7 +121,7 @@ class TokenMiddleware:
 
 def same(shown: str, token: str) -> bool:
     """Whether a token is the right one, in a time that does not tell how nearly."""
-    return hmac.compare_digest(shown.encode(), token.encode())
+    return hmac.compare_digest(*(one.encode("utf-8", "surrogatepass") for one in (shown, token)))
 
 
 def accel_factor(unit: str) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stario.fusion.fixes import position_fix
 from stario.fusion.live.drawn import Drawn
-from stario.fusion.live.merging import Merger
+from stario.fusion.live.merging import Field, Merger, Sample
 from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.navigator import Navigator
@@ -58,6 +58,7 @@ class Session:
         self._words_at = -math.inf
         self.drawn = Drawn(revision=self.drawn.revision + 1)
         self.problem, self.words = "", []
+        self._unwritten: tuple[list[Sample], list[Field]] = [], []
         self.samples = self.fixes = 0
         self.rate = 0.0
 
@@ -89,13 +90,17 @@ class Session:
             (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
             for time, gyro, a in self._merger.add(batch.readings)
         ]
+        # Until they are on disk they wait: a push that failed is sent again, without them.
+        samples = [*self._unwritten[0], *samples]
         if not samples:
             return 0
-        fields = self._merger.fields()
+        fields = [*self._unwritten[1], *self._merger.fields()]
+        self._unwritten = samples, fields
         if self._file is None:
             self._file = LiveFile(self._folder, self.device, self._merger.magnetic)
             self._first_ns = samples[0][0]
         self._file.append(samples, received, fields)
+        self._unwritten = [], []
         coming = deque(fields)
         for time_ns, gyro, accel in samples:
             while coming and coming[0][0] <= time_ns:

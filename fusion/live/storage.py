@@ -8,6 +8,8 @@ is told from a whole one.
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -57,14 +59,18 @@ class LiveFile:
     def append(
         self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
     ) -> None:
-        """Add samples and magnetic fields, received at a time [s since 1970]."""
+        """Add samples and magnetic fields, received at a time [s since 1970].
+
+        Raises:
+            OSError: not all of them could be written; none is then.
+        """
         end = f"{received:.3f}\n"
         rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
         rows += [
             f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r}{self._between}{end}"
             for time, g, a in samples
         ]
-        self._file.write("".join(rows).encode())
+        _write_whole(self._file, "".join(rows).encode())
 
     def append_fix(self, fix: Fix) -> None:
         """Add a position fix as `stario run --fixes` reads it, its time since the first sample."""
@@ -73,11 +79,23 @@ class LiveFile:
         new = not self.fixes_path.exists()
         with self.fixes_path.open("ab", buffering=0) as file:
             line = f"{fix.time!r},position,{x!r},{y!r},{z!r},{sx!r},{sy!r},{sz!r}\n"
-            file.write(((FIXES_HEADER if new else "") + line).encode())
+            _write_whole(file, ((FIXES_HEADER if new else "") + line).encode())
 
     def close(self) -> None:
         """No more follows."""
         self._file.close()
+
+
+def _write_whole(file: BinaryIO, data: bytes) -> None:
+    """Append all of it or nothing: a nearly full disk takes a part."""
+    before = file.tell()
+    try:
+        if file.write(data) < len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError:
+        file.truncate(before)
+        file.seek(before)
+        raise
 
 
 def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:

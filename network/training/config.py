@@ -34,6 +34,9 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
 SIGMA_WEIGHT = 0.05
 """Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
 
+LEAST_SECONDS = 4
+"""Windows in a row of weak truth: two changes of velocity over two seconds."""
+
 _COUNTS = {
     "epochs": 1,
     "epoch_windows": 1,
@@ -41,9 +44,9 @@ _COUNTS = {
     "patience": 1,
     "successive": 1,
     "waypoint_stretches": 1,
-    "waypoint_seconds": 4,  # two changes of velocity over two seconds
+    "waypoint_seconds": LEAST_SECONDS,
     "track_stretches": 1,
-    "track_seconds": 4,
+    "track_seconds": LEAST_SECONDS,
 }
 
 _RANGES = (

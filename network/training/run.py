@@ -194,11 +194,20 @@ class TrainingRun:
         Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
         with it count.
         """
-        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
+        first = self._first_with_sigma
         errors = [_or_infinite(r.validation_error) for r in self.history]
         if len(errors) >= first:
             errors = errors[first - 1 :]
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
+
+    def has_settled(self) -> bool:
+        """Whether nothing is gained any more, once sigma is being learned: without it no model."""
+        learned = len(self.history) >= self._first_with_sigma
+        return learned and self.epochs_since_best() >= self.config.patience
+
+    @property
+    def _first_with_sigma(self) -> int:
+        return math.ceil(self.config.likelihood_from * self.config.epochs) + 1
 
     def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch: the leading process alone, the others are told."""
@@ -206,7 +215,7 @@ class TrainingRun:
         return EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
             training_error=training_error,
-            validation_error=self.workers.agreed(float(np.mean(list(errors.values()) or [0.0]))),
+            validation_error=self.workers.agreed(held_out.deciding(errors)),
             validation_by_recording=errors,
             windows_per_second=self._windows / (self._drawing_s + self._learning_s),
             drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
@@ -241,6 +250,9 @@ class TrainingRun:
             ConfigError: it was written by another recipe, or learned from other recordings.
             ReadError: it cannot be read.
         """
+        if self.workers.leads:
+            for left in self.folder.glob(".*.tmp"):  # of a writer that was killed
+                left.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)

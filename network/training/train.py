@@ -37,6 +37,7 @@ def train(
     calibration: Calibration | None = None,
     legs: Sequence[LegStream] = (),
     validation_legs: Sequence[LegStream] = (),
+    chosen_by_legs: bool = False,
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
@@ -54,6 +55,7 @@ def train(
             a last stage learns from it as well, and weak truth alone has no windows to tell by.
         legs: stretches of weak truth, positions or waypoints, to learn from besides.
         validation_legs: some that choose the weights besides.
+        chosen_by_legs: whether they alone do, as where `validation` is but simulated.
 
     Returns:
         Path of the model's weights.
@@ -65,7 +67,8 @@ def train(
             cannot be shared out to the processes that the launcher started.
     """
     if not streams or not validation:
-        raise InputError("streams", "none", "stretches of at least 2 s with truth")
+        fix = "positions and waypoints are learned beside them" if legs else ""
+        raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
@@ -77,8 +80,8 @@ def train(
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
-        held_out = ValidationSet(validation, run.device, validation_legs, config)
-        while run.step < config.steps and run.epochs_since_best() < config.patience:
+        held_out = ValidationSet(validation, run.device, validation_legs, config, chosen_by_legs)
+        while run.step < config.steps and not run.has_settled():
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)
             if these.leads:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
-from stario.network.training.config import TrainingConfig
+from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.weak_truth import LegBatch, LegSampler, by_kind, leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -42,6 +42,7 @@ class ValidationSet:
         device: of the networks that are asked.
         legs: of recordings kept from training, with weak truth.
         config: says how stretches of them are drawn.
+        chosen_by_legs: whether weights are chosen by the legs alone, where there are some.
 
     Raises:
         InputError: no stream is longer than a second.
@@ -53,8 +54,9 @@ class ValidationSet:
         device: torch.device,
         legs: Sequence[LegStream] = (),
         config: TrainingConfig | None = None,
+        chosen_by_legs: bool = False,
     ) -> None:
-        self.streams, self.device = streams, device
+        self.streams, self.device, self._chosen_by_legs = streams, device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
         # Hours of them are cut sparsely: what matters is the kinds of motion.
         length = sum(len(stream) for stream in streams)
@@ -96,6 +98,12 @@ class ValidationSet:
         means = {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
         return means | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
 
+    def deciding(self, errors: Mapping[str, float]) -> float:
+        """The one number of `errors` by which weights are chosen; 0 where there are none."""
+        by_legs = [errors[kind] for kind in self.legs if kind in errors]
+        chosen = by_legs if self._chosen_by_legs and by_legs else list(errors.values())
+        return float(np.mean(chosen or [0.0]))
+
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
         batch = batch.to(self.device)
@@ -112,8 +120,11 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
         config.augmentation, mirrored=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
         accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
     )  # fmt: skip
-    for kind, members, seconds, _ in by_kind(legs, config):
-        if any(len(stream) > seconds * WINDOW_SAMPLES for stream in members):
+    for kind, members, usual, _ in by_kind(legs, config):
+        # What is kept of a short walk is shorter than what is learned from.
+        longest = (max(len(stream) for stream in members) - 1) // WINDOW_SAMPLES
+        seconds = min(usual, longest - longest % config.successive)
+        if seconds >= LEAST_SECONDS:
             generator = torch.Generator().manual_seed(0)
             found[kind] = LegSampler(members, seconds, plain, generator).batch(_STRETCHES)
     return found

@@ -271,5 +271,6 @@ def _opened(path: Path) -> Iterator[Any]:
     except StarioError:
         raise
     except _DAMAGED as error:
-        found = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        raise ReadError(path, "file", found, "a whole archive in HDF5") from error
+        found = " ".join(str(error).split())[:200] or type(error).__name__
+        fix = "is the download complete?"
+        raise ReadError(path, "content", found, "a whole HDF5 archive", fix) from error

@@ -82,6 +82,10 @@ def judgement_text(found: Judgement) -> str:
     return "\n".join([*lines, *names, *(f"{key}: {text}." for key, text in WORDS.items())])
 
 
+_LEAST_GROUPS = 3
+"""Of fewer the intervals, which draw groups, say nothing of others."""
+
+
 def verdict(rows: Sequence[Row]) -> str:
     """Whether ours should replace theirs; empty without a comparison over several groups.
 
@@ -93,6 +97,10 @@ def verdict(rows: Sequence[Row]) -> str:
         return ""
     worst = max(ratios, key=lambda name: ratios[name].ratio)
     taken = pooled.high < 1.0 and ratios[worst].ratio <= _WORST
+    if len(ratios) < _LEAST_GROUPS:
+        return (
+            f"not decided, {len(ratios)} groups are too few: over all {_interval(pooled)} in 10 s"
+        )
     told = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
     return f"{'taken' if taken else 'not taken'}: {told}"
 

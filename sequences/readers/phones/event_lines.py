@@ -13,8 +13,9 @@ y and z of a quaternion whose w is not negative.
 from __future__ import annotations
 
 import logging
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -118,15 +119,35 @@ def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
     return PositionTrack(time[keep], points[1][order][keep], "waypoints") if keep.any() else None
 
 
-def _whole_lines(path: Path) -> list[str]:
-    """All but a last one without an end: the app was killed while it wrote."""
+def _whole_lines(path: Path, separator: str) -> list[str]:
+    """All lines but a last one that is cut short: the app was killed while it wrote."""
     lines = read_lines(path)
-    ended = path.read_bytes()[-1:] in (b"\n", b"\r")
-    return lines if ended or len(lines) < 2 else lines[:-1]
+    if len(lines) < 2 or path.read_bytes()[-1:] in (b"\n", b"\r"):
+        return lines
+    last = lines[-1].split(separator)
+    alike = next((c for c in _cells(lines[-2::-1], separator) if _kind(c) == _kind(last)), None)
+    whole = alike is not None and len(last) >= len(alike) and _is_number(last[-1])
+    return lines if whole else lines[:-1]
+
+
+def _cells(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
+    return (line.split(separator) for line in lines)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _kind(cells: Sequence[str]) -> str:
+    """What an event is of: the first cell that is a word."""
+    return next((cell for cell in cells if cell[:1].isalpha()), "")
 
 
 def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
-    text = _GLUED.sub(r"\n\1", "\n".join(_whole_lines(path)))
+    text = _GLUED.sub(r"\n\1", "\n".join(_whole_lines(path, "\t")))
     events: dict[str, list[list[str]]] = {}
     for line in text.splitlines():
         cells = line.split("\t")
@@ -147,7 +168,7 @@ def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
 
 def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
     events: dict[str, list[list[str]]] = {}
-    for line in _whole_lines(path):
+    for line in _whole_lines(path, ";"):
         cells = line.strip().split(";")
         if cells[0] in (*_CODES.values(), _POINT, _AHRS):
             events.setdefault(cells[0], []).append(cells[1:])

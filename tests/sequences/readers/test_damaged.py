@@ -103,3 +103,36 @@ def test_a_pose_of_another_clock_costs_no_memory(walk: ImuSequence) -> None:
 def test_a_part_without_truth_has_none(walk: ImuSequence) -> None:
     short = replace(walk, truth=walk.truth.slice(0.0, 1.0))
     assert short.slice(5.0, 6.0).truth is None
+
+
+@pytest.mark.parametrize(
+    "cut",
+    [
+        "",
+        "GYRO;12.3",
+        "GYRO;12.345;12.340;0.01;-0.02;0.0",
+        "GY",
+        "GYRO;12.345;12.340;0.01;-0.02;0.03;3",
+    ],
+)
+def test_an_event_that_was_cut_off_costs_itself_alone(tmp_path: Path, cut: str) -> None:
+    rows = []
+    for k in range(200):
+        t = 10.0 + 0.01 * k
+        rows += [f"ACCE;{t:.3f};{t:.3f};0.1;0.2;9.8;3", f"GYRO;{t:.3f};{t:.3f};0.01;-0.02;0.03;3"]
+    path = tmp_path / "logfile.txt"
+    path.write_text("\n".join([*rows, cut]))
+    assert len(read_recording(path)) in (199, 200, 201)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
+def test_reference_points_are_in_the_unit_in_which_they_lie_in_the_recording(
+    tmp_path: Path, unit: float
+) -> None:
+    from stario.sequences.readers.phones.reference_points import reference_points
+
+    rows = [f"{round(t * unit)},{t},1.0" for t in (0.0, 2.0, 10.0, 28.0)]
+    (tmp_path / "walk_ref.csv").write_text("\n".join(["t,x,y", *rows]) + "\n")
+    found = reference_points(tmp_path, "", np.int64(0), np.int64(30 * 10**9))
+    assert found is not None
+    np.testing.assert_allclose(found.time, [0.0, 2.0, 10.0, 28.0])
