@@ -178,3 +178,27 @@ def test_a_port_that_is_taken_is_told(tmp_path, new_navigator):
         port = other.getsockname()[1]
         with pytest.raises(InputError, match="port"):
             LiveServer(new_navigator, tmp_path, port=port)
+
+
+def test_no_packet_ends_the_listening(serve, walk):
+    server = serve(token="sesame")
+    address = ("127.0.0.1", server.lines_port)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
+        phone.sendto(b'{"token": "\\ud800"}', address)
+        phone.sendto(b'{"token": "sesame"}\n' + lines_of(walk, 1, device="d")[0], address)
+        for line in lines_of(walk, 150, device="d")[1:]:
+            phone.sendto(b'{"token": "sesame"}\n' + line, address)
+            time.sleep(0.0005)
+    wait_for(lambda: samples(server, "d") > 50)
+
+
+def test_an_experiment_that_is_cleared_is_followed_from_its_new_start():
+    phone = Phyphox("phone:8080")
+    phone._buffers = {"gyro": ("t", "x", "y", "z")}
+
+    def answer(times):
+        return {name: {"buffer": [float(t) for t in times]} for name in ("t", "x", "y", "z")}
+
+    assert len(phone._readings("gyro", answer([1.0, 2.0, 3.0]))) == 3
+    assert len(phone._readings("gyro", answer([3.0, 4.0]))) == 1
+    assert len(phone._readings("gyro", answer([0.1, 0.2]))) == 2

@@ -13,6 +13,8 @@ import urllib.request
 import numpy as np
 import pytest
 
+from stario.fusion.live.payload import parse_push
+from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
 from stario.sequences import read_recording
 
@@ -91,3 +93,49 @@ def _push_on(url, bodies):
             urllib.request.urlopen(urllib.request.Request(url, body), timeout=5).close()
         except OSError:
             return
+
+
+class NearlyFull:
+    """A disk that takes a part of what is written, then all again."""
+
+    def __init__(self, file):
+        self.file, self.full = file, True
+
+    def write(self, data):
+        return self.file.write(data[:100] if self.full else data)
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+def test_what_a_full_disk_cuts_is_taken_back(tmp_path):
+    file = LiveFile(tmp_path, "phone")
+    file.append(SAMPLES[:10], 1.7e9)
+    file._file = NearlyFull(file._file)
+    with pytest.raises(OSError, match="space"):
+        file.append(SAMPLES[10:], 1.7e9)
+    file._file.full = False
+    file.append(SAMPLES[10:], 1.7e9)
+    recording = read_recording(file.path)
+    np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES])
+    file.close()
+
+
+def test_a_push_that_could_not_be_written_is_not_lost(tmp_path, new_navigator, pushes, monkeypatch):
+    session = Session("phone", tmp_path, new_navigator)
+    *before, second = [parse_push(body) for body in pushes(seconds=2.0)]
+    for batch in before:
+        session.take(batch, 1.7e9)
+    append, failed = LiveFile.append, []
+
+    def full(self, samples, received, fields=()):
+        failed.append(len(samples))
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(LiveFile, "append", full)
+    with pytest.raises(OSError, match="space"):
+        session.take(second, 1.7e9)
+    monkeypatch.setattr(LiveFile, "append", append)
+    assert session.take(second, 1.7e9) == failed[0] > 0
+    assert len(read_recording(session.path)) == session.samples
+    session.close()

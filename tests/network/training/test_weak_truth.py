@@ -15,6 +15,7 @@ from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
+from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import (
     LegBatch,
     LegSampler,
@@ -266,3 +267,16 @@ def test_a_share_is_a_share() -> None:
     for share in (-0.1, 1.5, "half"):
         with pytest.raises(ConfigError, match="shares, simulated"):
             TrainingConfig(shares={"simulated": share})  # type: ignore[dict-item]
+
+
+def test_short_walks_choose_weights_by_themselves() -> None:
+    [legs] = leg_streams(known("positions", 0.1))
+    part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
+    held_out = ValidationSet(
+        world_streams(WALK), torch.device("cpu"), [part], TrainingConfig(), chosen_by_legs=True
+    )
+    assert list(held_out.legs) == ["positions"]  # eight seconds, though twelve are learned from
+    errors = {"walk": 5.0, "positions": 0.25}
+    assert held_out.deciding(errors) == 0.25
+    besides = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
+    assert besides.deciding(errors) == 2.625

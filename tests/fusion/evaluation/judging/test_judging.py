@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 from recorded import DATA
 
-from stario.fusion.evaluation.judging.bootstrap import paired_ratio
+from stario.fusion.evaluation.judging.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
-from stario.fusion.evaluation.judging.judge import Judged, judge, rows_of
+from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row, judge, rows_of
 from stario.fusion.evaluation.judging.network_alone import answers
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
-from stario.fusion.evaluation.judging.table import Judgement, judgement_text, write_judgement
+from stario.fusion.evaluation.judging.table import (
+    Judgement,
+    judgement_text,
+    verdict,
+    write_judgement,
+)
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import InputError
@@ -253,3 +258,10 @@ def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path
     content = json.loads((tmp_path / "groups.json").read_text())
     assert content["recordings"][1]["truth"] == "waypoints"
     assert (tmp_path / "groups.png").stat().st_size > 10_000
+
+
+def test_two_groups_decide_nothing() -> None:
+    better = Interval(0.8, 0.7, 0.9)
+    rows = [Row(name, 5, 1.0, {}, {"rms_10s_m": better}) for name in ("a", "b", POOLED)]
+    assert verdict(rows).startswith("not decided")
+    assert verdict([*rows, Row("c", 5, 1.0, {}, {"rms_10s_m": better})]).startswith("taken")
