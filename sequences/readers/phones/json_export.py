@@ -40,9 +40,10 @@ def laid_out(path: Path) -> Iterator[Path]:
     sensors: dict[str, list[dict[str, Any]]] = {}
     for row in _rows(path):
         name = row.get("sensor")
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise ReadError(path, "sensor", repr(name)[:40], "a sensor's name in each object")
-        sensors.setdefault(name, []).append(row)
+        if isinstance(name, str) and _NAME.fullmatch(name):  # notes and the like have others
+            sensors.setdefault(name, []).append(row)
+    if not sensors:
+        raise ReadError(path, "sensor", "no name", "a sensor's name in each object")
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         for name, rows in sensors.items():
             titles = [title for title in rows[0] if title != "sensor"]

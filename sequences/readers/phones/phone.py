@@ -159,7 +159,7 @@ def assembled(
         gyro=rate,
         accel=force,
         converted=frozenset(converted),
-        magnetometer=_magnetometer(files, stamps[0]),
+        magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
         device_attitude=_device_attitude(attitude, stamps[0]),
         source="" if core_motion else app_of(files),
     )
@@ -265,7 +265,7 @@ def _device_attitude(
     return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
 
 
-def _magnetometer(files: PhoneFiles, start_ns: np.int64) -> Magnetometer | None:
+def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> Magnetometer | None:
     table = files.first("mag")
     if table is None:
         return None
@@ -273,6 +273,10 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64) -> Magnetometer | None:
         samples = _read(table, "mag")
     except ReadError as error:  # a recording does without
         _log.warning("magnetometer left out: %s", error)
+        return None
+    inside = (samples.stamps_ns >= start_ns) & (samples.stamps_ns <= stop_ns)
+    if not inside.any():
+        _log.warning("magnetometer left out: none of its samples is of the recording's time")
         return None
     time: FloatArray = seconds(samples.stamps_ns, start_ns)
     return magnetometer(time, samples.values)

@@ -154,6 +154,10 @@ def read_quaternion(
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
 
 
+_ROWS_SEEN = 5
+"""Rows that tell the decimal mark together."""
+
+
 def first_row(
     numbered: list[tuple[int, str]], least: int = 4
 ) -> tuple[int, str | None, str] | None:
@@ -171,8 +175,20 @@ def first_row(
             cells = _cells(line, delimiter, decimal)
             numbers = sum(np.isfinite(_number(cell)) for cell in cells)
             if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                return k, delimiter, decimal
+                return k, delimiter, _decimal_mark(numbered[k : k + _ROWS_SEEN], delimiter, decimal)
     return None
+
+
+def _decimal_mark(rows: list[tuple[int, str]], delimiter: str | None, first: str) -> str:
+    """The mark of most numbers: a first row of whole ones (0;0;0;0) has either."""
+    if delimiter == ",":
+        return first
+
+    def numbers(decimal: str) -> int:
+        cells = (cell for _, line in rows for cell in _cells(line, delimiter, decimal))
+        return sum(bool(np.isfinite(_number(cell))) for cell in cells)
+
+    return max((first, "." if first == "," else ","), key=numbers)
 
 
 def _cells(line: str, delimiter: str | None, decimal: str) -> list[str]:

@@ -381,7 +381,7 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
     ("text", "told"),
     [
         ('[{"sensor": "Gyroscope", "time"', r"x\.json: file: found .*, expected JSON"),
-        ('[{"sensor": "../up", "time": "1"}]', r"x\.json: sensor: found '\.\./up'"),
+        ('[{"sensor": "../up", "time": "1"}]', r"x\.json: sensor: found no name"),
         ('[{"sensor": "Gyroscope", "time": "1"}, 3]', r"found other JSON, expected an array"),
         ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
     ],
