@@ -99,7 +99,9 @@ def plan_view(
 def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
     """Where each track goes on behind a gap: there its direction is guessed at best."""
     label = "behind a gap"
-    for track in tracks.values():
+    for name, track in tracks.items():
+        if name == "pdr":  # has no pose while nobody steps
+            continue
         behind = np.flatnonzero(np.diff(track.time, prepend=track.time[:1]) >= _MARKED_GAP)
         if len(behind):
             x, y = track.position_W[behind, :2].T

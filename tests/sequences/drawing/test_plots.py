@@ -190,7 +190,7 @@ def test_a_track_is_marked_where_it_goes_on_behind_a_gap(tracks):
     keep = np.ones(len(whole.time), dtype=bool)
     keep[len(keep) // 2 : len(keep) // 2 + round(2.5 / np.median(np.diff(whole.time)))] = False
     broken = Trajectory(whole.time[keep], whole.position_W[keep], whole.attitude_WB[keep])
-    for track, marks in ((whole, 0), (broken, 1)):
-        (axes,) = plan_view({"ekf": track}, None, "").axes
+    for name, track, marks in (("ekf", whole, 0), ("ekf", broken, 1), ("pdr", broken, 0)):
+        (axes,) = plan_view({name: track}, None, "").axes
         found = [line for line in axes.lines if line.get_label() == "behind a gap"]
         assert len(found) == marks
