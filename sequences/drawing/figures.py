@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
@@ -82,18 +83,25 @@ def broken(
 ) -> tuple[FloatArray, FloatArray]:
     """The valid rows of time (N,) and values (N, k), with a row of nan in each gap.
 
-    A gap is longer than `max_gap` [s] and than three usual steps.
+    A gap is as of `behind_gaps`.
     """
     if valid is not None:
         time, values = time[valid], values[valid]
-    steps = np.diff(time)
-    if len(steps) == 0:
-        return time, values
-    gaps = np.flatnonzero(steps > max(max_gap, 3 * float(np.median(steps)))) + 1
+    gaps = behind_gaps(time, max_gap)
     return (
         np.insert(time, gaps, 0.5 * (time[gaps] + time[gaps - 1])),
         np.insert(values, gaps, np.nan, axis=0),
     )
+
+
+def behind_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
+    """Which of the times (N,) [s] follow a gap.
+
+    It is longer than `max_gap` [s] and than three usual steps.
+    """
+    steps = np.diff(time)
+    longest = max(max_gap, 3 * float(np.median(steps))) if len(steps) else max_gap
+    return np.flatnonzero(steps > longest) + 1
 
 
 def distance(metres: float) -> str:

@@ -12,6 +12,7 @@ from stario.sequences.drawing.figures import (
     INK,
     LEGEND,
     RED,
+    behind_gaps,
     broken,
     distance,
     draw_path,
@@ -30,7 +31,7 @@ _CROWDED = 12.0
 """Rounds from which on lines are drawn finer."""
 
 _MARKED_GAP = 1.0
-"""Gaps of a track from which on [s] it is marked where it goes on."""
+"""Behind gaps longer than this [s] it is marked where a track goes on."""
 
 
 def plan_view(
@@ -42,8 +43,8 @@ def plan_view(
     """All tracks from above, on equal axes that fit the truth and the tracks near it.
 
     A track that drifts far beyond these is cut at the frame and the legend says how far it goes.
-    Invalid poses and gaps show as breaks; where a track goes on behind a gap of a second or more
-    it is marked. Tracks are drawn as given: align them before.
+    Invalid poses and gaps show as breaks; where a track goes on behind a gap of more than a
+    second it is marked. Tracks are drawn as given: align them before.
 
     Args:
         tracks: by name; "inertial", "network", "network_true_attitude", "ekf" and "graph" have
@@ -102,7 +103,7 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
     for name, track in tracks.items():
         if name == "pdr":  # has no pose while nobody steps
             continue
-        behind = np.flatnonzero(np.diff(track.time, prepend=track.time[:1]) >= _MARKED_GAP)
+        behind = behind_gaps(track.time, _MARKED_GAP)
         if len(behind):
             x, y = track.position_W[behind, :2].T
             axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
