@@ -1,7 +1,7 @@
 """Which samples count where times repeat, run backward or jump ahead.
 
-The intake of streams (`fusion.intake`) decides by the same rules and numbers as samples come in;
-here all of a recording is there to look at.
+The front end of streams (`fusion.imu.front_end`) decides by the same rules and numbers as samples
+come in; here all of a recording is there to look at.
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ def convert(
     files, skipped = reading.recordings(sources)
     _check_target(target, [*sources, *files], overwrite)
     if layout != "archive":
-        sequence = reading.read(_only(reading, sources))
+        only = sources[0] if len(sources) == 1 and not reading.where else _only(files, skipped)
+        sequence = reading.read(only)
         written = convert_sequence(sequence, target, to)
         typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
         typer.echo("\n".join(str(path) for path in written))
@@ -70,11 +71,8 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
         )
 
 
-def _only(reading: Reading, sources: list[Path]) -> Path:
-    """The one recording at the paths."""
-    if len(sources) == 1 and not reading.where:
-        return sources[0]
-    files, skipped = reading.recordings(sources)
+def _only(files: list[Path], skipped: list[Skipped]) -> Path:
+    """The one recording that was found."""
     leave_with_skipped(skipped)
     if len(files) != 1:
         expected = "one recording, or an archive (.h5) to write"

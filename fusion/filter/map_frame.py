@@ -115,11 +115,11 @@ class MapFrame:
         gate: float,
         turn_sigma: float,
     ) -> None:
-        self.state = MapFrameState(False, oriented)
-        if pivot is not None:
-            self.state = MapFrameState(
-                True, oriented, pivot=pivot, pivot_variance=2.0 * pivot_sigma**2
-            )
+        self.state = (
+            MapFrameState(False, oriented)
+            if pivot is None
+            else MapFrameState(True, oriented, pivot=pivot, pivot_variance=2.0 * pivot_sigma**2)
+        )
         self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
@@ -158,10 +158,8 @@ class MapFrame:
         if _BETTER**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
-        P = _without_yaw(now.covariance, 6)
         seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-        sigma = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
-        apart = abs(seen - ours) > 3.0 * sigma + _AWRY * min(seen, ours)
+        apart = abs(seen - ours) > 3.0 * _across(now, 6, fix) + _AWRY * min(seen, ours)
         self.state = changed(self.state, apart=self.state.apart + 1 if apart else 0)
         return self.state.apart >= _CONVINCING
 
@@ -260,11 +258,15 @@ def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
     first, seen, ours = 3, fix.value, state.v_W
     if fix.kind == "position":
         first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
-    P = _without_yaw(state.covariance, first)
     arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
-    across = math.sqrt(float(np.linalg.eigvalsh(P + fix.covariance[:2, :2])[-1]))
     turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
-    return turn, across / arm if arm > 0.0 else math.inf
+    return turn, _across(state, first, fix) / arm if arm > 0.0 else math.inf
+
+
+def _across(state: NavState, first: int, fix: Fix) -> float:
+    """Largest deviation in the plane between a fix and two rows of the state, yaw's part apart."""
+    P = _without_yaw(state.covariance, first) + fix.covariance[:2, :2]
+    return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
 
 
 def _without_yaw(P: FloatArray, first: int) -> FloatArray:

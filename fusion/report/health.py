@@ -94,9 +94,13 @@ def _is_unfamiliar(note: str) -> bool:
     return "weights were trained on" in note
 
 
+def _is_set_back(note: str) -> bool:
+    return "clock was set back" in note
+
+
 def _noted(note: str) -> Finding:
     text = f"{note[:1].upper()}{note[1:]}."
-    if "set back" in note:
+    if _is_set_back(note):
         return Finding("warning", text, "Split the recording there, and run each part.")
     if not _is_unfamiliar(note):
         return Finding("note", text)
@@ -107,7 +111,7 @@ def _noted(note: str) -> Finding:
 def _samples(health: Health) -> list[Finding]:
     used = health.samples.get("used", 0)
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
-    if any("set back" in note for note in health.notes):
+    if any(map(_is_set_back, health.notes)):
         dropped.pop("out_of_order", None)  # that is why
     gone = sum(dropped.values())
     share = gone / max(1, used + gone)
