@@ -40,21 +40,8 @@ def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
     return X + first + (b * _EYE + c * K) @ second
 
 
-def exp_se23(xi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Exponential of SE_2(3).
-
-    Args:
-        xi: (..., 9) theta [rad], rho_v [m/s], rho_p [m].
-
-    Returns:
-        R (..., 3, 3), v (..., 3), p (..., 3).
-    """
-    R, J = exp_and_left_jacobian(xi[..., :3])
-    return R, (J @ xi[..., 3:6, None])[..., 0], (J @ xi[..., 6:9, None])[..., 0]
-
-
 def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
-    """Logarithm (..., 9) of SE_2(3), the inverse of `exp_se23` for angles below pi."""
+    """Logarithm (..., 9) of SE_2(3) for angles below pi."""
     theta = log_so3(R)
     _, J = exp_and_left_jacobian(theta)
     rho = np.linalg.solve(J, np.stack([v, p], axis=-1))

@@ -24,6 +24,7 @@ Arrays and numbers are kept to the last bit, so the continued stream gives the s
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import zipfile
@@ -38,72 +39,29 @@ from stario.sequences.errors import InputError
 FORMAT, VERSION = "stario snapshot", 13
 
 
+_HOLDS = """
+fusion.config fusion.continuous fusion.fixes
+fusion.filter.displacements fusion.filter.ekf_state fusion.filter.estimator_state
+fusion.filter.frame_transform fusion.filter.gyro_bias fusion.filter.initial
+fusion.filter.innovations fusion.filter.magnetic fusion.filter.map_frame fusion.filter.sceptic
+fusion.filter.seen_positions fusion.filter.zero_velocity
+fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
+fusion.graph.keyframes fusion.graph.whitening
+fusion.imu.buffers fusion.imu.front_end fusion.imu.intervals fusion.imu.outliers
+fusion.imu.preintegration fusion.imu.watches sequences.noise sequences.attitude.levelling
+"""
+
+
 @cache
 def _classes() -> dict[str, type]:
     """Every class that a snapshot may hold: plain data, made anew from its attributes."""
-    from stario.fusion import config, continuous, fixes
-    from stario.fusion.filter import (
-        accelerometer,
-        ekf_state,
-        estimator_state,
-        frame_transform,
-        gyro_bias,
-        initial,
-        innovations,
-        magnetic,
-        map_frame,
-        sceptic,
-        seen_positions,
-        zero_velocity,
-    )
-    from stario.fusion.graph import (
-        builder,
-        factors,
-        fixed_lag,
-        keyframe_state,
-        keyframes,
-        whitening,
-    )
-    from stario.fusion.imu import (
-        field_buffer,
-        front_end,
-        gyro_unit,
-        intervals,
-        outliers,
-        preintegration,
-        set_back,
-        window_buffer,
-    )
-    from stario.sequences import noise
-    from stario.sequences.attitude import levelling
-
-    classes: tuple[type, ...] = (
-        *(config.FilterConfig, config.GraphConfig, config.NavigatorConfig, noise.ImuNoise),
-        *(window_buffer.WindowBuffer, window_buffer.Block, field_buffer.FieldBuffer),
-        set_back.SetBackWatch,
-        *(front_end.FrontEnd, gyro_unit.GyroUnitWatch, intervals.ImuInterval),
-        *(intervals.SampleCounts, intervals.Start, outliers.Flags, outliers.OutlierDetector),
-        *(levelling.LevelledAttitude, preintegration.Segment),
-        *(fixes.Fix, fixes.Accepted, fixes.FixQueue, initial.PriorPose),
-        *(
-            ekf_state.EkfState,
-            ekf_state.FieldState,
-            magnetic.MagneticReference,
-            gyro_bias.GyroBiasPrior,
-            accelerometer.AccelerometerWorth,
-            sceptic.Sceptic,
-            ekf_state.Estimate,
-            estimator_state.EstimatorState,
-            estimator_state.Step,
-        ),
-        continuous.ContinuousPose,
-        *(frame_transform.FrameTransform, innovations.UpdateCounts, map_frame.MapFrameState),
-        seen_positions.SeenPositions,
-        *(zero_velocity.ZeroVelocity, fixed_lag.FixedLagState, builder.GraphBuilder),
-        *(keyframes.KeyframeGraph, whitening.Whitened, keyframe_state.KeyframeState),
-        *factors.KINDS,
-    )
-    return {each.__name__: each for each in classes}
+    modules = [importlib.import_module(f"stario.{name}") for name in _HOLDS.split()]
+    return {
+        name: each
+        for module in modules
+        for name, each in vars(module).items()
+        if isinstance(each, type) and each.__module__ == module.__name__
+    }
 
 
 def pack(tree: dict[str, Any]) -> bytes:

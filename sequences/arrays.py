@@ -18,6 +18,11 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
 
 
+def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
+    """Columns of values (N, k) at other times (M,), linearly; held beyond the ends."""
+    return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Times (N,) [s] that are finite and strictly increase.
 

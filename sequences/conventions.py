@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from dataclasses import replace
 
@@ -115,17 +114,9 @@ def axes_matrix(axes: str) -> FloatArray:
 
 def axes_named(R: FloatArray) -> str:
     """The text that `axes_matrix` turns into the right-handed axes nearest to a rotation (3, 3)."""
-    signed = [
-        (permutation, signs)
-        for permutation in itertools.permutations(range(3))
-        for signs in itertools.product((1, -1), repeat=3)
-    ]
-    texts = [
-        ",".join(("-" if s < 0 else "") + "xyz"[k] for k, s in zip(*choice, strict=True))
-        for choice in signed
-        if np.linalg.det(np.diag(choice[1]) @ np.eye(3)[list(choice[0])]) > 0.0
-    ]
-    return max(texts, key=lambda text: float((axes_matrix(text) * R).sum()))
+    group = Rotation.create_group("O").as_matrix()
+    best = group[int(np.argmax((group * R).sum(axis=(1, 2))))]
+    return ",".join(("-" if row.min() < -0.5 else "") + "xyz"[np.abs(row).argmax()] for row in best)
 
 
 def with_gravity(sequence: ImuSequence) -> ImuSequence:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -183,6 +184,15 @@ def json_text(obj: object) -> str:
         InputError: the object holds something that has no plain counterpart.
     """
     return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def write_rows(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write a CSV of rows by column; a row may lack some."""
+    names = dict.fromkeys(key for row in rows for key in row)
+    with atomic_write(path) as file:
+        writer = csv.DictWriter(file, list(names), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def write_npz(path: Path | str, **arrays: ArrayLike) -> None:

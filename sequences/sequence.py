@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
-from stario.sequences.arrays import checked_array, checked_time
+from stario.sequences.arrays import checked_array, checked_time, interpolated
 from stario.sequences.beside_imu import DeviceAttitude as DeviceAttitude
 from stario.sequences.beside_imu import Magnetometer as Magnetometer
 from stario.sequences.beside_imu import PositionTrack as PositionTrack
@@ -108,14 +108,16 @@ class Trajectory:
         known = np.flatnonzero(self.valid)
         t = self.time[known]
         clipped = np.clip(time, t[0], t[-1])
-        velocity = None if self.velocity_W is None else _lerp(clipped, t, self.velocity_W[known])
+        velocity = (
+            None if self.velocity_W is None else interpolated(clipped, t, self.velocity_W[known])
+        )
         covariance = None
         if self.position_covariance_W is not None:
             flat = self.position_covariance_W[known].reshape(len(t), 9)
-            covariance = _lerp(clipped, t, flat).reshape(-1, 3, 3)
+            covariance = interpolated(clipped, t, flat).reshape(-1, 3, 3)
         return Trajectory(
             time=time,
-            position_W=_lerp(clipped, t, self.position_W[known]),
+            position_W=interpolated(clipped, t, self.position_W[known]),
             attitude_WB=Slerp(t, self.attitude_WB[known])(clipped),
             velocity_W=velocity,
             position_covariance_W=covariance,
@@ -160,7 +162,7 @@ class Trajectory:
             return 0.0
         t = self.time[known]
         ticks = np.append(second_ticks(t), t[-1])
-        chords = np.diff(_lerp(ticks, t, self.position_W[known]), axis=0)
+        chords = np.diff(interpolated(ticks, t, self.position_W[known]), axis=0)
         return float(np.linalg.norm(chords, axis=1).sum())
 
 
@@ -304,8 +306,3 @@ def second_ticks(time: FloatArray) -> FloatArray:
     seconds = np.floor(time - time[0])
     ticks = time[0] + np.union1d(seconds, seconds + 1.0)
     return np.asarray(ticks[ticks < time[-1]])
-
-
-def _lerp(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
-    columns = [np.interp(time, t, values[:, k]) for k in range(values.shape[1])]
-    return np.stack(columns, axis=1)

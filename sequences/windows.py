@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
@@ -133,13 +134,13 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     step = 1.0 / WINDOW_RATE
     steps = time[1:] - time[:-1]
     if len(time) < 2 or np.sort(steps)[len(steps) // 2] > 0.67 * step:
-        return _interpolate(grid, time, values)
+        return interpolated(grid, time, values)
     areas = 0.5 * steps[:, None] * (values[1:] + values[:-1])
     integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
     edges = np.clip(np.append(grid - 0.5 * step, grid[-1] + 0.5 * step), time[0], time[-1])
     widths = np.diff(edges)
-    means = np.diff(_interpolate(edges, time, integral), axis=0) / np.maximum(widths, 1e-9)[:, None]
-    return np.where((widths > 0.25 * step)[:, None], means, _interpolate(grid, time, values))
+    means = np.diff(interpolated(edges, time, integral), axis=0) / np.maximum(widths, 1e-9)[:, None]
+    return np.where((widths > 0.25 * step)[:, None], means, interpolated(grid, time, values))
 
 
 _SHORTEST_SECONDS = 2.0 * WINDOW_SECONDS
@@ -168,7 +169,7 @@ def world_streams(
     world = imu_in_world(sequence, sequence.truth, attitude)
     known = sequence.truth.valid
     truth = sequence.truth
-    position_W = _interpolate(world.time, truth.time[known], truth.position_W[known])
+    position_W = interpolated(world.time, truth.time[known], truth.position_W[known])
     return [
         WorldStream(
             name=sequence.name,
@@ -278,11 +279,6 @@ def unbroken(time: FloatArray) -> list[tuple[int, int]]:
     return list(pairwise([0, *breaks.tolist(), len(time)]))
 
 
-def windows_of(stream: WorldStream, stride: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Windows (M, 6, 200) every `stride` samples with their displacements (M, 3) [m]."""
-    return windows_at(stream, window_starts(stream, stride))
-
-
 def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
     """First samples (M,) of the windows every `stride` samples."""
     return np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
@@ -319,7 +315,3 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
 def _spans_gap(time: FloatArray, grid: FloatArray) -> BoolArray:
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
     return np.asarray(time[right] - time[right - 1] > MAX_IMU_GAP)
-
-
-def _interpolate(grid: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
-    return np.stack([np.interp(grid, time, values[:, k]) for k in range(values.shape[1])], axis=1)

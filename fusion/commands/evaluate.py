@@ -56,9 +56,6 @@ def evaluate(
             "{group} in the name of weights is each recording's group: leave one group out."
         ),
     ] = None,
-    every: Annotated[
-        int, typer.Option(min=1, help="With --by: judge by every so many recordings of a group.")
-    ] = 1,
     ekf: Annotated[
         bool, typer.Option("--ekf", help="With --by: the mean NIS of the EKF as well; slow.")
     ] = False,
@@ -90,7 +87,7 @@ def evaluate(
     if by is not None:
         listed, skipped = _listed(reading, paths or [], data, split)
         skipped += judge_by_groups(
-            listed, reading, by, estimating.model, against, every, ekf, jobs, out, as_json
+            listed, reading, by, estimating.model, against, ekf, jobs, out, as_json
         )
         leave_with_skipped(skipped)
         return

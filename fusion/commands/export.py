@@ -21,7 +21,6 @@ def export(
     runs: Annotated[
         Path, typer.Option(help="Folder of training runs, where named networks are found.")
     ] = Path("runs"),
-    format: Annotated[str, typer.Option("--format", help="Format of the file: onnx.")] = "onnx",
     out: Annotated[
         Path | None, typer.Option("--out", help="File to write; else the network's name here.")
     ] = None,
@@ -30,8 +29,6 @@ def export(
     from stario.network.model import load_model, weights_named
     from stario.network.runtime.export import export_onnx
 
-    if format != "onnx":
-        raise InputError("--format", repr(format), "onnx")
     loaded = load_model(weights_named(model, runs))
     path = out or Path(f"{loaded.name}.onnx")
     if path.suffix != ".onnx":

@@ -24,7 +24,6 @@ def judge_by_groups(
     by: str,
     ours: str,
     theirs: str | None,
-    every: int,
     ekf: bool,
     jobs: int,
     out: Path | None,
@@ -43,7 +42,6 @@ def judge_by_groups(
     from stario.sequences.datasets.stream_cache import cache_folder
 
     grouping = check_by(by)
-    chosen = _thinned(recordings, every)
     names = [ours] if theirs is None else [ours, theirs]
     models = {name: partial(_for_group, name) for name in names}
     for name in names:
@@ -51,16 +49,16 @@ def judge_by_groups(
             _for_group(name, "")  # what cannot be loaded is told before anything is prepared
     if out is not None:
         make_folder(out)
-    paths = [one.path for one in chosen]
+    paths = [one.path for one in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
-    groups = {one.path: one.group for one in chosen}
-    with progress_bar("judge", len(chosen)) as progress:
+    groups = {one.path: one.group for one in recordings}
+    with progress_bar("judge", len(recordings)) as progress:
         judged, skipped = judge(
             prepared,
             models,
             groups,
             reading.read if ekf else None,
-            lambda done: progress(done / len(chosen)),
+            lambda done: progress(done / len(recordings)),
         )
     if not judged:
         return skipped
@@ -90,15 +88,3 @@ def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
 def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
     """Weights by name; `{group}` in it is the group, blanks as underscores."""
     return _loaded(name.replace(_GROUP, group.replace(" ", "_")))
-
-
-def _thinned(recordings: list[Listed], every: int) -> list[Listed]:
-    """Every so many recordings of each group, the first of each included."""
-    seen: dict[str, int] = {}
-    chosen = []
-    for one in recordings:
-        number = seen.get(one.group, 0)
-        seen[one.group] = number + 1
-        if number % every == 0:
-            chosen.append(one)
-    return chosen

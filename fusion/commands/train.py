@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
     from stario.network.training.data import Recorded
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.windows import Attitude, WorldStream
+    from stario.sequences.windows import Attitude
 
 
 @grouped
@@ -62,9 +62,6 @@ def train(
     leave_out: Annotated[
         str | None,
         typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
-    ] = None,
-    captured: Annotated[
-        Path | None, typer.Option(help="Captured trajectories (npz) to drive a simulated IMU.")
     ] = None,
     generated: Annotated[int, typer.Option(min=0, help="Number of generated walks of 60 s.")] = 150,
     recorded_only: Annotated[
@@ -115,15 +112,12 @@ def train(
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
-    if recorded_only:
-        captured, generated = None, 0
     material = gather(
         recorded + held_out if last_stage is not None else recorded,
-        _captured(captured, recipe, folder) if captured else [],
-        cached_walks(generated, recipe.seed, folder, recipe.attitude),
+        cached_walks(0 if recorded_only else generated, recipe.seed, folder, recipe.attitude),
         recipe.shares,
     )
-    kept = gather(held_out, [], [])
+    kept = gather(held_out, [])
     if recorded and not (kept.streams or kept.legs):
         raise InputError(
             "recordings",
@@ -240,15 +234,3 @@ def _streams_of(
                 recordings.append(Recorded(path, outcome, licence))
             progress(done / len(files))
     return recordings, skipped
-
-
-def _captured(walks: Path, recipe: TrainingConfig, folder: Path) -> list[WorldStream]:
-    from stario.network.training.data import captured_streams, simulated_streams
-    from stario.sequences.simulation.vicon import read_vicon_walks
-
-    seed, attitude = recipe.seed, recipe.attitude
-
-    def build() -> list[WorldStream]:
-        return captured_streams(read_vicon_walks(walks), seed, attitude)
-
-    return simulated_streams("captured", build, folder, walks, seed, attitude)

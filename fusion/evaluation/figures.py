@@ -5,8 +5,6 @@ Drawn as those of `stario.sequences.drawing.plots`, without pyplot.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -14,15 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.fusion.evaluation.tables import PROTOCOLS, Entry, NetworkTable, Sample, table_dict
-from stario.sequences.files import atomic_write, write_json
+from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
+from stario.sequences.drawing.figures import INK, dress, new_figure, save_figure
+from stario.sequences.files import write_json, write_rows
 from stario.sequences.sequence import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_INK, _GREY = "#333333", "#999999"
 _COLOURS = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#7F5539", "#6A4C93",
     "#999999", "#000000", "#8DB600",
@@ -34,15 +32,7 @@ _AGAINST = "R-ResNet"
 
 def write_table(folder: Path, table: NetworkTable) -> list[Path]:
     """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
-    from stario.sequences.drawing.figures import save_figure
-
-    text = io.StringIO()
-    names = list(Entry.__dataclass_fields__)
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(entry) for entry in table.entries)
-    with atomic_write(folder / "networks.csv") as file:
-        file.write(text.getvalue())
+    write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
     written = [folder / "networks.csv", folder / "networks.json"]
     for name, figure in figures(table).items():
@@ -65,7 +55,7 @@ def figures(table: NetworkTable) -> dict[str, Figure]:
 
 
 def _ate_against_parameters(table: NetworkTable) -> Figure:
-    fig = _figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
+    fig = new_figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
     axes = fig.subplots()
     for k, (network, parameters) in enumerate(table.parameters.items()):
         mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
@@ -83,12 +73,12 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     axes.set_ylim(bottom=0.0)
     # Beside, not at the points: half of the networks have about as many parameters and errors.
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    _dress(axes)
+    dress(axes)
     return fig
 
 
 def _distributions(table: NetworkTable) -> Figure:
-    fig = _figure(11.0, 5.0, "Share of recordings below an error, true attitude")
+    fig = new_figure(11.0, 5.0, "Share of recordings below an error, true attitude")
     panels = fig.subplots(1, 2, sharey=True)
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, network in enumerate(table.parameters):
@@ -100,14 +90,14 @@ def _distributions(table: NetworkTable) -> Figure:
             )  # fmt: skip
         axes.set(xlabel=title, ylim=(0.0, 1.02))
         axes.set_xlim(left=0.0)
-        _dress(axes)
+        dress(axes)
     panels[0].set_ylabel("share of tracks [1]")
     panels[1].legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return fig
 
 
 def _pde_boxes(table: NetworkTable) -> Figure:
-    fig = _figure(4.0 + 3.0 * len(PROTOCOLS), 5.0, "Position drift at the end, per recording")
+    fig = new_figure(4.0 + 3.0 * len(PROTOCOLS), 5.0, "Position drift at the end, per recording")
     panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
     names = list(table.parameters)
     for axes, (protocol, words) in zip(panels, PROTOCOLS.items(), strict=True):
@@ -117,12 +107,12 @@ def _pde_boxes(table: NetworkTable) -> Figure:
         )
         for k, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
             box.set(facecolor=_colour(k), alpha=0.35, edgecolor=_colour(k))
-            median.set(color=_INK, lw=1.6)
+            median.set(color=INK, lw=1.6)
             axes.plot(np.full(len(values[k]), k + 1), values[k], ".", color=_colour(k), ms=6)
         axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
         axes.set_title(words, loc="left", fontsize=10)
         axes.set_ylim(bottom=0.0)
-        _dress(axes)
+        dress(axes)
     panels[0].set_ylabel("PDE [% of the path]")
     return fig
 
@@ -131,7 +121,9 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
     """Tracks of StarIO's kind against R-ResNet's, or of the first four networks without it."""
     columns = min(2, len(samples))
     rows = math.ceil(len(samples) / columns)
-    fig = _figure(5.5 * columns, 5.2 * rows, "Tracks with true attitude, aligned by the first pose")
+    fig = new_figure(
+        5.5 * columns, 5.2 * rows, "Tracks with true attitude, aligned by the first pose"
+    )
     panels = np.ravel(fig.subplots(rows, columns, squeeze=False))
     for axes, sample in zip(panels, samples, strict=False):
         _draw_sample(axes, sample, colours)
@@ -154,12 +146,12 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
         label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"
         axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=label)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
-    axes.plot(*path[0, :2], "o", mfc="white", mec=_INK, ms=8)
+    axes.plot(*path[0, :2], "o", mfc="white", mec=INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
-    _dress(axes)
+    dress(axes)
 
 
 def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -167,24 +159,6 @@ def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     ordered = np.sort(values)
     share = np.arange(1, len(ordered) + 1) / max(len(ordered), 1)
     return np.concatenate([[0.0], ordered]), np.concatenate([[0.0], share])
-
-
-def _figure(width: float, height: float, title: str) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(fig)
-    fig.suptitle(title, fontsize=13, color=_INK, x=0.02, ha="left")
-    return fig
-
-
-def _dress(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(_GREY)
-    axes.tick_params(colors=_INK, labelsize=9)
-    axes.grid(color="#E6E6E6", lw=0.7)
-    axes.set_axisbelow(True)
 
 
 def _colour(index: int) -> str:

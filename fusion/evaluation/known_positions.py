@@ -6,6 +6,7 @@ import numpy as np
 
 from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
+from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
 LEAST = 2
@@ -53,8 +54,7 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:
     """The track from above (n, 2) [m]."""
-    at = [np.interp(time, track.time, track.trajectory.position_W[:, k]) for k in (0, 1)]
-    return np.column_stack(at)
+    return interpolated(time, track.time, track.trajectory.position_W[:, :2])
 
 
 def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None:

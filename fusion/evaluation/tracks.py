@@ -17,6 +17,7 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
+from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -171,8 +172,7 @@ def _chained(
     time: FloatArray, attitude: Rotation, middle: FloatArray, velocity: FloatArray
 ) -> Trajectory:
     """Integrate velocities known at the windows' middles to positions at `time`."""
-    columns = [np.interp(time, middle, velocity[:, k]) for k in range(3)]
-    at_time = np.stack(columns, axis=1)
+    at_time = interpolated(time, middle, velocity)
     steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return Trajectory(time, position, attitude, velocity_W=at_time)

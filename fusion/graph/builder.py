@@ -55,7 +55,6 @@ class GraphBuilder:
         graph: the graph so far.
         segments: by keyframe, the intervals' segments from it to the next (or to now).
         count: intervals since the start or the last gap.
-        starts: the keyframes that nothing binds to the one before.
     """
 
     def __init__(
@@ -69,7 +68,6 @@ class GraphBuilder:
     ) -> None:
         self._config, self._turn_sigma = config, turn_sigma
         self.graph = KeyframeGraph(first, config.filter.gate, turn)
-        self.starts = [0]
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
         f = config.filter
@@ -190,7 +188,6 @@ class GraphBuilder:
         """Behind a gap too long to be bridged: from the filter's new start."""
         self.count = 0
         k = self.graph.add_apart(state)
-        self.starts.append(k)
         self.segments[k] = []
         self._joints[0] = k
 

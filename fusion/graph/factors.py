@@ -293,7 +293,6 @@ class GyroBias:
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
 
 
-KINDS: tuple[type, ...] = (Prior, Displacement, TurnWander, Position, Velocity, Yaw, GyroBias)
 """Every kind of term."""
 
 

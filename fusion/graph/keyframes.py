@@ -20,7 +20,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
-from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.filter.network_turn import KnownTurn
 from stario.fusion.graph.factors import Prior, Term, TurnWander, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
@@ -159,7 +159,7 @@ class KeyframeGraph:
         """A keyframe with its marginal covariance, after `solve`."""
         R, v, p, b_g, b_a = self.pose(k)
         joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
-        to_world = _world_from_local(R)
+        to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
@@ -279,14 +279,13 @@ class KeyframeGraph:
 def _prior(k: int, state: NavState, turn: KnownTurn | None = None) -> Prior:
     """A state's covariance, and that of the network's turn, as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-    to_invariant = about.invariant_from_local() @ np.linalg.inv(_world_from_local(state.R_WB))
     covariance: FloatArray = state.covariance
     turns: tuple[tuple[int, float], ...] = ()
     if turn is not None:
         across = turn.covariance[:CORE, None]
         covariance = np.block([[covariance, across], [across.T, turn.covariance[CORE:, None]]])
-        to_invariant, turns = block_diag(to_invariant, 1.0), ((k, turn.turn),)
-    root = _root_information(to_invariant @ covariance @ to_invariant.T)
+        turns = ((k, turn.turn),)
+    root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
     return Prior(k, (about,), root, np.zeros(len(root)), turns)
 
 
@@ -296,17 +295,6 @@ def _root_information(covariance: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     values = np.maximum(values, _LEAST_CORRELATED)
     return np.asarray((vectors / np.sqrt(values)).T / scale)
-
-
-def _world_from_local(R_WB: FloatArray) -> FloatArray:
-    """(15, 15) from w, dp, dv, b_a, b_g to the order and axes of `NavState.covariance`."""
-    matrix = np.zeros((CORE, CORE))
-    matrix[0:3, 0:3] = R_WB
-    matrix[3:6, 6:9] = np.eye(3)
-    matrix[6:9, 3:6] = R_WB
-    matrix[9:12, 12:15] = np.eye(3)
-    matrix[12:15, 9:12] = np.eye(3)
-    return matrix
 
 
 def _says_nothing(k: int, turned: bool) -> Any:

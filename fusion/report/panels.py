@@ -12,6 +12,7 @@ import plotly.graph_objects as go
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.arrays import interpolated
 from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -156,10 +157,7 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
     for name, series in tracks.items():
         inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
         known = np.isfinite(truth.position[:, 0])
-        at = np.stack(
-            [np.interp(series.time, truth.time[known], truth.position[known, k]) for k in (0, 1)],
-            axis=1,
-        )
+        at = interpolated(series.time, truth.time[known], truth.position[known, :2])
         error = np.linalg.norm(series.position[:, :2] - at, axis=1)
         traces += curve(name, series.time, np.where(inside, error, np.nan), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})

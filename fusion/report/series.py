@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.state import Track
+from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray, Trajectory
 
@@ -148,9 +149,6 @@ def _speed_of(trajectory: Trajectory) -> FloatArray:
         return np.full(len(t), np.nan)
     first, last = t[known[0]], t[known[-1]]
     before, after = (np.clip(t + sign * half, first, last) for sign in (-1.0, 1.0))
-    ends = [
-        np.stack([np.interp(at, t[known], trajectory.position_W[known, k]) for k in range(3)], 1)
-        for at in (before, after)
-    ]
+    ends = [interpolated(at, t[known], trajectory.position_W[known]) for at in (before, after)]
     span = np.maximum(after - before, 1e-9)
     return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / span)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +25,7 @@ from stario.fusion.table.text import table_dict, table_text
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
 from stario.network.runtime.survey import ModelRow, survey
-from stario.sequences.files import atomic_write, write_json
+from stario.sequences.files import atomic_write, write_json, write_rows
 from stario.sequences.sequence import FloatArray, Trajectory
 
 
@@ -70,8 +68,7 @@ def write_results(
     with atomic_write(out / "table.md") as file:
         file.write(text)
     write_json(out / "table.json", table_dict(tables, costs, work, recipe))
-    with atomic_write(out / "table.csv") as file:
-        file.write(_csv(tables))
+    write_rows(out / "table.csv", _rows(tables))
     for name, found in filled.items() if drawn else ():
         samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
         table = _network_table(found, samples)
@@ -82,17 +79,15 @@ def write_results(
     return text
 
 
-def _csv(tables: Sequence[SetTable]) -> str:
+def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
     """A line for each network on each set: means over seeds."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["set", "network", "seeds", *COLUMNS, "rank"])
-    for table in tables:
-        for row in table.rows:
-            values = [row.figures[key].value if key in row.figures else "" for key in COLUMNS]
-            place = "" if row.rank is None else row.rank.rank
-            writer.writerow([table.dataset.name, row.network, len(row.seeds), *values, place])
-    return text.getvalue()
+    return [
+        {"set": table.dataset.name, "network": row.network, "seeds": len(row.seeds)}
+        | {key: row.figures[key].value if key in row.figures else "" for key in COLUMNS}
+        | {"rank": "" if row.rank is None else row.rank.rank}
+        for table in tables
+        for row in table.rows
+    ]
 
 
 def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:

@@ -89,8 +89,8 @@ def train_cell(
     held_out, missing = _streams(dataset.validation, recipe, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for one in streams for s in one.streams)
-    material = gather(streams, [], [] if poses else simulated(_WALKS, 0))
-    kept = gather(held_out, [], [])
+    material = gather(streams, [] if poses else simulated(_WALKS, 0))
+    kept = gather(held_out, [])
     clock = _Clock(folder / SPARE[1])
 
     def finished(report: EpochReport) -> None:

@@ -10,14 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from stario.network.baselines.parts import (
-    ConvNorm,
-    FCOut,
-    initialise_as_ronin,
-    residual_groups,
-    resnet_stem,
-    shortcut,
-)
+from stario.network.baselines.parts import ConvNorm, shortcut
+from stario.network.baselines.plain import RoninResNet
 
 
 class Attention(nn.Module):
@@ -63,19 +57,10 @@ class SeparableBlock(nn.Module):
         return result
 
 
-class DeepIls(nn.Module):
-    """(B, 6, 200) to (B, outputs)."""
+class DeepIls(RoninResNet):
+    """R-ResNet of other blocks."""
 
-    def __init__(self, outputs: int = 6) -> None:
-        super().__init__()
-        self.trunk = nn.Sequential(resnet_stem(), residual_groups(SeparableBlock))
-        self.head = FCOut(512, 128, 7, 512, outputs)
-        initialise_as_ronin(self)
-
-    def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
-        output: Tensor = self.head(self.trunk(windows))
-        return output
+    block = SeparableBlock
 
 
 def _depthwise(channels: int, stride: int) -> nn.Conv1d:

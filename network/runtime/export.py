@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.graph_form import graph_form
 from stario.network.runtime.onnx_file import CARD_KEY, onnx_packages
 from stario.sequences.files import atomic_write
 from stario.sequences.windows import WINDOW_SAMPLES
@@ -32,7 +31,6 @@ _UNITS = {
     "windows": "rows gyro xyz [rad/s], accel xyz (specific force) [m/s^2]; 200 samples at 200 Hz",
     "displacement": "xyz [m] over the window, in its frame",
     "log_sigma": "xyz, natural logarithm of [m], before the calibration on the card",
-    "frame": "gravity-aligned, z up, yaw arbitrary",
 }
 
 
@@ -48,7 +46,7 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
             the folder does not exist.
     """
     onnx_packages("onnx", "onnxscript")
-    network = graph_form(model.training_form)
+    network = model.training_form
     with _quiet():
         program = torch.onnx.export(
             _Step(network) if network.remembers else network,
@@ -62,7 +60,8 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
         )
     assert program is not None
     graph = program.model_proto
-    for key, text in {**_UNITS, CARD_KEY: dump_card(model.card)}.items():
+    card = {"frame": model.card.frame, CARD_KEY: dump_card(model.card)}
+    for key, text in {**_UNITS, **card}.items():
         graph.metadata_props.add(key=key, value=text)
     with atomic_write(path, "wb") as file:
         file.write(graph.SerializeToString())

@@ -1,9 +1,9 @@
-"""Training material: recordings, simulated IMU along captured walks, generated walks."""
+"""Training material: recordings and generated walks."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
 from stario.sequences.legs import LegStream
 from stario.sequences.readers.archive import split_name
-from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
@@ -25,16 +25,13 @@ log = logging.getLogger(__name__)
 SIMULATED = "simulated"
 """What a recipe's shares call the simulated walks."""
 
-_SIMULATED_SHARE, _CAPTURED_SHARE = 0.4, 0.7
-"""Of all windows, the simulated ones' where none is said; of those, along captured walks."""
+_SIMULATED_SHARE = 0.4
+"""Of all windows, where none is said."""
 
 _WALK_SECONDS = 60.0
 
 _SHORTEST = 400
 """Samples of the shortest stretch that is kept, 2 s."""
-
-_SMOOTH = 0.3
-"""Deviation of the specific force's size [m/s^2] below which no gait shows."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,6 @@ class Material:
 
 def gather(
     recorded: Sequence[Recorded],
-    captured: Sequence[WorldStream],
     generated: Sequence[WorldStream],
     shares: Mapping[str, float] = MappingProxyType({}),
 ) -> Material:
@@ -73,8 +69,7 @@ def gather(
 
     Args:
         recorded: streams of each recording.
-        captured: simulated along captured walks.
-        generated: simulated along generated walks.
+        generated: simulated walks.
         shares: of the sources among the recordings' windows, by a part of their path; recordings
             that none names make up what is left of 1. `SIMULATED` is that of the simulated walks
             among all windows.
@@ -85,13 +80,9 @@ def gather(
     streams: list[WorldStream] = []
     weights: list[float] = []
     simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
-    along_captured = _CAPTURED_SHARE if captured and generated else 1.0 if captured else 0.0
     sources = [(f"recorded, {name}", (1.0 - simulated) * share, members)
                for name, share, members in _sources(recorded, shares)]  # fmt: skip
-    sources.append(("simulated along captured walks", simulated * along_captured, list(captured)))
-    sources.append(
-        ("simulated along generated walks", simulated * (1.0 - along_captured), list(generated))
-    )
+    sources.append(("simulated walks", simulated, list(generated)))
     words = []
     for name, share, members in sources:
         if not members:
@@ -167,53 +158,14 @@ def _is_long(stream: Stream) -> bool:
     return len(stream) >= _SHORTEST and (isinstance(stream, WorldStream) or len(stream.start) > 1)
 
 
-def simulated_streams(
-    kind: str,
-    build: Callable[[], list[WorldStream]],
-    folder: Path,
-    *depends_on: object,
-) -> list[WorldStream]:
-    """Simulated streams from the cache in `folder`, built where they are not there yet.
-
-    Args:
-        kind: what they are called.
-        build: makes them.
-        folder: the cache's.
-        depends_on: plain values and files that the result depends on besides the code.
-    """
-    values = [
-        [str(x.resolve()), x.stat().st_size, x.stat().st_mtime_ns] if isinstance(x, Path) else x
-        for x in depends_on
-    ]
-    key = {"kind": kind, "values": values, "module": Path(__file__).read_text(encoding="utf-8")}
-    return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
-
-
 def cached_walks(
     count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
 ) -> list[WorldStream]:
     """`generated_streams` of walks of a minute, from the cache in `folder`."""
     build = partial(generated_streams, count, _WALK_SECONDS, seed, attitude)
-    return simulated_streams("generated", build, folder, count, seed, attitude)
-
-
-def captured_streams(
-    walks: dict[str, list[Trajectory]], seed: int, attitude: Attitude = "levelled"
-) -> list[WorldStream]:
-    """Stretches of a simulated phone's IMU along captured trajectories.
-
-    Captures are smoothed, and the rumble of wheels does not survive it: what then moves too
-    smoothly (a trolley) shows nothing of its speed, and would only teach to predict none.
-    """
-    rng = np.random.default_rng(seed)
-    streams = []
-    for name, pieces in walks.items():
-        for piece in pieces:
-            sensor = int(rng.integers(2**31))
-            simulated = simulate_imu(piece, 200.0, PHONE_IMU, sensor, name=name)
-            if np.linalg.norm(simulated.accel, axis=1).std() > _SMOOTH:
-                streams += world_streams(simulated, attitude=attitude)
-    return streams
+    module = Path(__file__).read_text(encoding="utf-8")
+    key = {"kind": "generated", "values": [count, seed, attitude], "module": module}
+    return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
 
 
 def generated_streams(

@@ -33,12 +33,7 @@ def about_z(yaw: FloatArray | float) -> Rotation:
 
 def tilt_aligning(up_B: FloatArray) -> Rotation:
     """The smallest rotation R_WB that takes the direction `up_B` (3,) to world z (yaw stays 0)."""
-    up = np.asarray(up_B, dtype=np.float64) / np.linalg.norm(up_B)
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
-    if sine < 1e-12:
-        return Rotation.identity() if cosine > 0 else Rotation.from_rotvec([np.pi, 0.0, 0.0])
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], np.atleast_2d(up_B))[0]
 
 
 def cumulative_rotations(steps: Rotation) -> FloatArray:

@@ -2,34 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.errors import InputError, ReadError
+from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.text import read_lines
-
-OFFICIAL: dict[str, dict[str, str]] = {
-    "ronin": {
-        "training": "list_train.txt",
-        "validation": "list_val.txt",
-        "test_seen": "list_test_seen.txt",
-        "test_unseen": "list_test_unseen.txt",
-    },
-    "ridi": {"training": "list_train_publish_v2.txt", "test": "list_test_publish_v2.txt"},
-    "imunet": {"training": "list_train.txt", "test": "list_test.txt"},
-    "tlio": {
-        "training": "train_list.txt",
-        "validation": "val_list.txt",
-        "test": "test_list.txt",
-    },
-    "oxiod": {"training": "Train.txt", "test": "Test.txt"},
-    "rnin": {"training": "data_train", "validation": "data_val", "test": "data_test"},
-}
-"""Each data set's parts and the list (or, of RNIN, the folder) that names their recordings."""
 
 _PAPER_SHARES = (8, 1, 1)
 
@@ -115,38 +96,3 @@ def random_split(recordings: Iterable[Path], seed: int) -> Split:
     each = max(1, round(len(known) * _PAPER_SHARES[1] / sum(_PAPER_SHARES)))
     parts = order[2 * each :], order[:each], order[each : 2 * each]
     return Split(*(tuple(known[k] for k in sorted(part)) for part in parts))
-
-
-def official_split(
-    dataset: str,
-    root: Path,
-    part: str,
-    on_error: Callable[[ReadError], None] | None = None,
-) -> list[Path]:
-    """The recordings that a data set's own list names for a part.
-
-    The list is looked for in the root and in the folders in it (`lists/`, OxIOD's carriages, of
-    which each has its own).
-
-    Args:
-        dataset: a name in `OFFICIAL`.
-        root: the data set's folder.
-        part: one of the data set's parts in `OFFICIAL`.
-        on_error: called for each entry that is empty or not there, as in `find_recordings`;
-            without it such an entry is raised.
-
-    Raises:
-        InputError: data set or part is unknown.
-        ReadError: there is no list, or an entry is wrong.
-    """
-    from stario.sequences.readers import find_recordings
-
-    if dataset not in OFFICIAL:
-        raise InputError("data set", repr(dataset), f"one of {', '.join(OFFICIAL)}")
-    if part not in OFFICIAL[dataset]:
-        raise InputError(f"{dataset}'s part", repr(part), f"one of {', '.join(OFFICIAL[dataset])}")
-    name = OFFICIAL[dataset][part]
-    lists = [root / name] if (root / name).exists() else sorted(root.glob(f"*/{name}"))
-    if not lists:
-        raise ReadError(root, name, "no such list", "in the folder or one below")
-    return [path for one in lists for path in find_recordings(one, on_error)]

@@ -61,13 +61,18 @@ def panels_of(fig: Figure, *heights: float) -> list[Axes]:
     ratios = heights or (1,)
     panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color(GREY)
-        axes.tick_params(colors=INK, labelsize=9)
-        axes.grid(color="#E6E6E6", lw=0.7)
-        axes.set_axisbelow(True)
+        dress(axes)
         axes.margins(x=0.01)
     return list(panels)
+
+
+def dress(axes: Axes) -> None:
+    """Axes as all figures have them."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.tick_params(colors=INK, labelsize=9)
+    axes.grid(color="#E6E6E6", lw=0.7)
+    axes.set_axisbelow(True)
 
 
 def style_of(name: str, index: int) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.sequences.arrays import correlation
+from stario.sequences.arrays import correlation, interpolated
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, unbroken
@@ -211,10 +211,12 @@ def _against_gyro(
     steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     half = 0.5 * _SPAN_S
-    rate = (_at(grid + half, time, angle) - _at(grid - half, time, angle)) / _SPAN_S
+    rate = (
+        interpolated(grid + half, time, angle) - interpolated(grid - half, time, angle)
+    ) / _SPAN_S
 
     def fit(lag: float) -> tuple[float, FloatArray, FloatArray]:
-        before, after = (_at(grid + lag + d, stamps, values) for d in (-half, half))
+        before, after = (interpolated(grid + lag + d, stamps, values) for d in (-half, half))
         change, mean = (after - before) / _SPAN_S, 0.5 * (after + before)
         # dm/dt + w x m = w x b, linear in b
         cross = np.cross(rate[:, None, :], np.eye(3)[None]).transpose(0, 2, 1).reshape(-1, 3)
@@ -235,10 +237,6 @@ def _against_gyro(
         lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
-
-
-def _at(time: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:
-    return np.stack([np.interp(time, t, values[:, k]) for k in range(3)], axis=1)
 
 
 def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
@@ -53,8 +54,7 @@ def on_one_clock(
     exact = (gyro_ns == before) | (gyro_ns == after)
     kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
-    resampled = np.stack([np.interp(time, t, accel[:, k]) for k in range(3)], axis=1)
-    return gyro_ns[kept], gyro[kept], resampled
+    return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:

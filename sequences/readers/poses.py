@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.levelling import LEAST_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.errors import InputError, ReadError
@@ -231,9 +232,7 @@ def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
     sequence = accel_axes(sequence, truth)
     inside = (sequence.time >= time[0]) & (sequence.time <= time[-1])
     pose = truth.at(np.unique(sequence.time[inside]))
-    force = np.stack(
-        [np.interp(pose.time, sequence.time, sequence.accel[:, k]) for k in range(3)], axis=1
-    )
+    force = interpolated(pose.time, sequence.time, sequence.accel)
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
     if np.linalg.norm(up) < LEAST_FORCE:
         _log.warning("%s: no gravity to level %s by", sequence.name, way.file.name)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation
+from stario.sequences.arrays import correlation, interpolated
 from stario.sequences.attitude.levelling import LEAST_FORCE
 from stario.sequences.attitude.rotations import cumulative_rotations, tilt_aligning
 from stario.sequences.errors import InputError
@@ -101,7 +101,7 @@ def align_tracked_body(
     lag += _lag_by_axes(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept)
     time = truth_time + lag
     mounts = _mounts(time, attitude_WV, gyro_B.attitude(time), pieces)
-    force_B, rate_B = _sampled(time, imu_time, accel), _sampled(time, imu_time, gyro)
+    force_B, rate_B = interpolated(time, imu_time, accel), interpolated(time, imu_time, gyro)
     attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     if position_WV is not None:
         inside = kept & (time >= imu_time[0]) & (time <= imu_time[-1])
@@ -122,10 +122,6 @@ def align_tracked_body(
             for (start, stop), mount in zip(pieces, mounts, strict=True)
         ),
     )
-
-
-def _sampled(time: FloatArray, imu_time: FloatArray, values: FloatArray) -> FloatArray:
-    return np.stack([np.interp(time, imu_time, values[:, k]) for k in range(3)], axis=1)
 
 
 def _mounted(
@@ -177,7 +173,7 @@ class _GyroIntegral:
 
     def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
         """Mean rate [rad/s] from each of M times to the one `stride` later (M - stride, 3)."""
-        angle = _sampled(time, self.time, self.angle)
+        angle = interpolated(time, self.time, self.angle)
         lengths = time[stride:] - time[:-stride]
         return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
 

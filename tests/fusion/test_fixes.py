@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import support
 from scipy.spatial.transform import Rotation
+from se23 import exp_se23
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import NavigatorConfig
@@ -21,7 +22,7 @@ from stario.fusion.fix_file import read_fixes
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.cutting import cut
 from stario.fusion.imu.front_end import cut_recording
-from stario.fusion.lie import exp_se23, yaw_twist
+from stario.fusion.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError, ReadError

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
@@ -19,7 +20,6 @@ from stario.sequences.windows import (
     mean_heading,
     resample,
     turned_windows,
-    windows_of,
     world_streams,
 )
 

@@ -140,7 +140,7 @@ def _run(
 ) -> Track:
     rng = np.random.default_rng(seed)
     spoilt = sequence if fault.spoil is None else fault.spoil(sequence, rng)
-    navigator = Navigator(model or _Silent(), config, backend=backend)
+    navigator = Navigator(model or Silent(), config, backend=backend)
     preprocessed = navigator.observe(spoilt)
     if model is None and sequence.truth is not None:
         preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
@@ -149,10 +149,11 @@ def _run(
     return navigator.track(preprocessed)
 
 
-class _Silent:
+class Silent:
     """Stands where a network would."""
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Nothing, surely."""
         n = len(np.asarray(windows))
         return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
 

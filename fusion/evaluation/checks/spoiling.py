@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 
 Spoil = Callable[[ImuSequence, np.random.Generator], ImuSequence]
@@ -113,8 +114,7 @@ def _resampled(rate: float) -> Spoil:
     def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         time = np.arange(sequence.time[0], sequence.time[-1], 1.0 / rate)
         gyro, accel = (
-            np.stack([np.interp(time, sequence.time, column) for column in values.T], axis=1)
-            for values in (sequence.gyro, sequence.accel)
+            interpolated(time, sequence.time, values) for values in (sequence.gyro, sequence.accel)
         )
         return replace(sequence, time=time, gyro=gyro, accel=accel)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.fusion.evaluation.judging.judge import POOLED, Row
+from stario.sequences.drawing.figures import dress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +63,7 @@ def _medians(
         axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
                       ha="center", fontsize=8, color=_AFTER)  # fmt: skip
     axes.margins(x=0.12)
-    _dress(axes)
+    dress(axes)
 
 
 def _ratios(axes: Axes, rows: Sequence[Row]) -> None:
@@ -80,15 +81,9 @@ def _ratios(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_xticks([], minor=True)
     title = "error over 10 s, after / before, 95 % interval\n(waypoints: residuals)"
     axes.set_title(title, loc="left", fontsize=10)
-    _dress(axes)
+    dress(axes)
 
 
 def _first(row: Row, weights: str, keys: tuple[str, ...]) -> float:
     values = (row.medians[weights][key] for key in keys)
     return next((value for value in values if np.isfinite(value)), float("nan"))
-
-
-def _dress(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#E6E6E6", lw=0.7)
-    axes.set_axisbelow(True)

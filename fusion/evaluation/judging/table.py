@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +12,7 @@ from stario.fusion.evaluation.judging.figure import groups_figure
 from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.files import atomic_write, write_json
+from stario.sequences.files import write_json, write_rows
 
 _COLUMNS = {
     "ate_fit_m": ("fit [m]", ".2f"),
@@ -134,7 +132,7 @@ def write_judgement(folder: Path, found: Judgement) -> list[Path]:
     ]
     written = [folder / name for name in ("groups.csv", "recordings.csv", "groups.json")]
     for path, content in zip(written, (rows, single), strict=False):
-        _write_csv(path, content)
+        write_rows(path, content)
     write_json(written[2], judgement_dict(found))
     save_figure(groups_figure(found.rows, found.ours, found.theirs), folder / "groups.png")
     return [*written, folder / "groups.png"]
@@ -154,16 +152,6 @@ def _ratios(row: Row) -> dict[str, float]:
         for key, interval in row.ratios.items()
         for part in ("ratio", "low", "high")
     }
-
-
-def _write_csv(path: Path, rows: Sequence[dict[str, object]]) -> None:
-    names = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_write(path) as file:
-        file.write(text.getvalue())
 
 
 def _interval(found: Interval) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.phones.files import PhoneFiles
@@ -78,7 +79,7 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
     steps = 0.5 * np.diff(clock)[:, None] * (rate[1:] + rate[:-1])
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     time = seconds(stamps_ns, stamps_ns[0])
-    turned: FloatArray = np.stack([np.interp(time, clock, angle[:, k]) for k in range(3)], axis=1)
+    turned = interpolated(time, clock, angle)
     seen = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
     inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1])
     inside &= np.diff(time) < _LONGEST_STEP_S

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.readers.phones.files import PhoneFiles
 from stario.sequences.readers.phones.sensor_table import Samples
 from stario.sequences.readers.text import IntArray, head_lines, seconds
@@ -123,7 +124,7 @@ def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> 
         return None
     up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     time, clock = (seconds(ns, stamps_ns[0]) for ns in (accel.stamps_ns[inside], stamps_ns))
-    seen = np.stack([np.interp(time, clock, up_B[:, k]) for k in range(3)], axis=1)
+    seen = interpolated(time, clock, up_B)
     force = accel.values[inside]
     sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
     cosine = float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))

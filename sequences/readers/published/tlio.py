@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, rotations, trajectory
 from stario.sequences.readers.published.json_fields import JsonFields, as_array
@@ -188,9 +189,9 @@ def _imu_pose(
     if posed.truth is None or not inside.any():
         found = f"times {offset:.3f} s off"
         raise ReadError(calibration.path.with_name(_RESAMPLED), "ts_us", found, f"those of {_RAW}")
-    rate_I = [np.interp(time[inside], sequence.time, sequence.gyro[:, k]) for k in range(3)]
+    rate_I = interpolated(time[inside], sequence.time, sequence.gyro)
     misfit = [
-        float(np.square(R.apply(np.stack(rate_I, axis=1)) - posed.gyro[inside]).mean())
+        float(np.square(R.apply(rate_I) - posed.gyro[inside]).mean())
         for R in (Rotation.identity(), R_DI)
     ]
     truth = posed.truth

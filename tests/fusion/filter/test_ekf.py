@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
+from se23 import exp_se23
 
 from stario.fusion.evaluation.checks.benchmark import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
-from stario.fusion.lie import exp_se23
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.errors import InputError

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
@@ -13,7 +14,7 @@ from stario.fusion.imu.front_end import FrontEnd, cut_recording
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU
-from stario.sequences.windows import WINDOW_SECONDS, windows_of, world_streams
+from stario.sequences.windows import WINDOW_SECONDS, world_streams
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10))
 

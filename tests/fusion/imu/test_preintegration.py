@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from se23 import exp_se23
 
 from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.preintegration import corrected_increments, preintegrate
-from stario.fusion.lie import exp_se23, log_se23
+from stario.fusion.lie import log_se23
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.noise import ImuNoise
 

@@ -3,6 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from cut_windows import windows_of
 from torch import Tensor, nn
 
 from stario.network.architectures import ARCHITECTURES, build_network
@@ -14,7 +15,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.windows import windows_of, world_streams
+from stario.sequences.windows import world_streams
 
 
 def live_in(network: nn.Module) -> None:

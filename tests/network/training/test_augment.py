@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cut_windows import windows_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +13,7 @@ from stario.network.training.lever_arm import draw_swing
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, windows_of, world_streams
+from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, world_streams
 
 NOTHING = Augmentation(
     speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,

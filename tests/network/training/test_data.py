@@ -10,8 +10,6 @@ from stario.network.training.data import (
     SIMULATED,
     Recorded,
     gather,
-    generated_streams,
-    simulated_streams,
     split_off,
 )
 from stario.sequences.errors import ConfigError
@@ -41,11 +39,9 @@ def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
 
 def test_kinds_of_streams_make_up_their_shares() -> None:
     recorded = of([stream("a", 3000), stream("a", 1000)])
-    captured, generated = [stream("b", 500)], [stream("c", 700)]
-    for simulated in ([captured, []], [[], generated], [captured, generated]):
-        material = gather(recorded, *simulated, {SIMULATED: 0.05})
-        drawn = np.array([len(s) for s in material.streams]) * material.weights
-        assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
+    material = gather(recorded, [stream("c", 700)], {SIMULATED: 0.05})
+    drawn = np.array([len(s) for s in material.streams]) * material.weights
+    assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
     assert material.words[0].startswith("recorded")
 
 
@@ -55,42 +51,23 @@ def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> 
         Recorded(Path("a/short.h5:y"), [moving("y", 1.0)]),
         Recorded(Path("other.csv"), [moving("z", 1.0)]),
     ]
-    material = gather(recorded, [], [], {"long.h5": 0.5, "short.h5": 0.3})
+    material = gather(recorded, [], {"long.h5": 0.5, "short.h5": 0.3})
     drawn = {name: 0.0 for name in "xyz"}
     for one, weight in zip(material.streams, material.weights, strict=True):
         drawn[one.name] += weight * len(one)
     assert drawn["y"] / drawn["x"] == pytest.approx(0.6)
     assert drawn["z"] / drawn["x"] == pytest.approx(0.4)
     with pytest.raises(ConfigError, match="shares"):
-        gather(recorded, [], [], {"long.h5": 0.5, "short.h5": 0.5})
+        gather(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
 
 
 def of(*recordings: list[WorldStream]) -> list[Recorded]:
     return [Recorded(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 
 
-def test_simulated_streams_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
-    calls: list[int] = []
-    walks = tmp_path / "walks.npz"
-    walks.write_bytes(b"1")
-
-    def build() -> list[WorldStream]:
-        calls.append(1)
-        return generated_streams(1, 4.0, 0)
-
-    for _ in range(2):
-        streams = simulated_streams("captured", build, tmp_path / "cache", walks, 0)
-    np.testing.assert_array_equal(streams[0].imu_W, generated_streams(1, 4.0, 0)[0].imu_W)
-    assert len(calls) == 1
-    simulated_streams("captured", build, tmp_path / "cache", walks, 1)
-    walks.write_bytes(b"22")
-    simulated_streams("captured", build, tmp_path / "cache", walks, 0)
-    assert len(calls) == 3
-
-
 def test_lively_recordings_are_drawn_more_often() -> None:
     calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = gather(of([calm], [lively]), [], [])
+    material = gather(of([calm], [lively]), [])
     assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
     assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from cut_windows import windows_of
 
 from stario.network.architectures import build_network
 from stario.network.card import Calibration, card_path
@@ -26,7 +27,7 @@ from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.windows import WorldStream, windows_of
+from stario.sequences.windows import WorldStream
 
 TINY = TrainingConfig(
     epochs=4,

@@ -5,9 +5,7 @@ import pytest
 
 from stario.network.training.splits import NAMES, listed
 from stario.sequences.datasets.splits import (
-    OFFICIAL,
     leave_out,
-    official_split,
     random_split,
     read_list,
 )
@@ -41,66 +39,6 @@ def test_the_papers_split_is_by_recording_and_by_seed() -> None:
     assert [len(few.training), len(few.validation), len(few.test)] == [1, 1, 1]
     with pytest.raises(InputError, match="at least 3"):
         random_split(paths[:2], seed=0)
-
-
-def test_ronins_lists_stand_in_a_folder_of_their_own(tmp_path: Path) -> None:
-    ronin(tmp_path / "train_dataset_1", "a000_1", "a001_2")
-    ronin(tmp_path / "unseen_subjects_test_set", "a006_2")
-    (tmp_path / "lists").mkdir()
-    (tmp_path / "lists/list_train.txt").write_text("# names\na001_2\na000_1\n\n")
-    (tmp_path / "lists/list_test_unseen.txt").write_text("a006_2\n")
-    train = official_split("ronin", tmp_path, "training")
-    assert train == [tmp_path / "train_dataset_1" / name for name in ("a001_2", "a000_1")]
-    unseen = official_split("ronin", tmp_path, "test_unseen")
-    assert unseen == [tmp_path / "unseen_subjects_test_set/a006_2"]
-    with pytest.raises(ReadError, match=r"list_val\.txt: found no such list"):
-        official_split("ronin", tmp_path, "validation")
-
-
-def test_ridis_lines_carry_a_type(tmp_path: Path) -> None:
-    for name in ("dan_body3", "ma_handheld2"):
-        (tmp_path / name / "processed").mkdir(parents=True)
-        (tmp_path / name / "processed/data.csv").write_text("time,rv_w,rv_x,grav_x\n")
-    text = "# test\ndan_body3,body\n#dan_leg2,leg\nma_handheld2,handheld # good\n"
-    (tmp_path / "list_test_publish_v2.txt").write_text(text)
-    found = official_split("ridi", tmp_path, "test")
-    assert found == [tmp_path / "dan_body3", tmp_path / "ma_handheld2"]
-
-
-def test_oxiod_has_lists_for_each_carriage(tmp_path: Path) -> None:
-    """Entries are files without their folder `syn`, or whole folders; carriages stay apart."""
-    handheld = [phone(tmp_path / f"handheld/data1/syn/imu{k}.csv") for k in (1, 2)]
-    phone(tmp_path / "handheld/data1/raw/imu1.csv")
-    other = [phone(tmp_path / f"handheld/data5/syn/imu{k}.csv") for k in (1, 2)]
-    pocket = phone(tmp_path / "pocket/data1/syn/imu1.csv")
-    (tmp_path / "handheld/Train.txt").write_text("data1/imu2.csv\n")
-    (tmp_path / "handheld/Test.txt").write_text("data5\n")
-    (tmp_path / "pocket/Train.txt").write_text("data1\n")
-    assert official_split("oxiod", tmp_path, "training") == [handheld[1], pocket]
-    assert official_split("oxiod", tmp_path, "test") == other
-    (tmp_path / "handheld/Train.txt").write_text("data7\n")
-    with pytest.raises(ReadError, match="line 1: found data7, not there"):
-        official_split("oxiod", tmp_path, "training")
-
-
-def test_rnin_and_tlio(tmp_path: Path) -> None:
-    for name in ("data_train/0", "data_train/10", "data_val/0"):
-        (tmp_path / name).mkdir(parents=True)
-        (tmp_path / name / "SenseINS.csv").touch()
-    assert [p.name for p in official_split("rnin", tmp_path, "training")] == ["0", "10"]
-    assert official_split("rnin", tmp_path, "validation") == [tmp_path / "data_val/0"]
-    (tmp_path / "1108").mkdir()
-    (tmp_path / "1108/imu0_resampled.npy").touch()
-    (tmp_path / "val_list.txt").write_text("1108\n")
-    assert official_split("tlio", tmp_path, "validation") == [tmp_path / "1108"]
-
-
-def test_unknown_names_are_told() -> None:
-    with pytest.raises(InputError, match="found 'kitti', expected one of ronin"):
-        official_split("kitti", Path(), "test")
-    with pytest.raises(InputError, match="found 'test', expected one of training, validation"):
-        official_split("ronin", Path(), "test")
-    assert all(OFFICIAL.values())
 
 
 def test_a_list_of_any_mixture_is_read(tmp_path: Path) -> None:
