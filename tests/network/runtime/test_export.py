@@ -91,7 +91,7 @@ def test_the_file_says_what_its_windows_are(exported: Path) -> None:
     metadata = session.get_modelmeta().custom_metadata_map
     assert "200 Hz" in metadata["windows"]
     assert "[m]" in metadata["displacement"]
-    assert metadata["frame"] == load_model().card.frame
+    assert metadata["frame"] == load_model(exported).card.frame
     assert '"architecture": "RNIN"' in metadata["stario_card"]
 
 
