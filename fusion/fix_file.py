@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.filter.map_frame import UNKNOWN_YAW
-from stario.fusion.fixes import KINDS, Fix, make_fix
+from stario.fusion.fixes import KINDS, LARGEST_YAW, Fix, make_fix
+from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import advancing
@@ -28,7 +28,6 @@ from stario.sequences.time_order import advancing
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _NEEDED = (*_COLUMNS[:3], "sx")
 
-_LARGEST_YAW = 20.0 * math.pi
 """A yaw of more than ten turns was not meant in radians; nor was a deviation beyond that of a yaw
 of which nothing is known."""
 
@@ -105,7 +104,7 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
         raise ReadError(path, f"{where}, sigma", f"{sigma.min():g}", "a standard deviation > 0")
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
-    if kind == "yaw" and (abs(value[0]) > _LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
+    if kind == "yaw" and (abs(value[0]) > LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
         found, fix = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
         raise ReadError(path, f"{where}, yaw", found, "radians", fix)
     (time,) = _numbers(path, where, cells, ["t"])

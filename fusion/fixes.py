@@ -21,6 +21,9 @@ from stario.sequences.sequence import FloatArray
 
 FixKind = Literal["position", "yaw", "velocity"]
 
+LARGEST_YAW = 20.0 * math.pi
+"""Beyond this a yaw [rad] is in other units, or no yaw at all."""
+
 KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 """Kinds of fixes and how many numbers each measures."""
 
@@ -56,6 +59,8 @@ class Fix:
         numbers = (np.atleast_1d(self.time), self.value, self.covariance)
         if not all(np.isfinite(array).all() for array in numbers):
             return "value that is not finite"
+        if self.kind == "yaw" and abs(self.value[0]) > LARGEST_YAW:
+            return "yaw not in radians"
         C = self.covariance
         if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or np.linalg.eigvalsh(C).min() <= 0.0:
             return "covariance not positive definite"

@@ -18,6 +18,9 @@ import numpy as np
 from stario.sequences.attitude.so3 import exp_and_left_jacobian, log_so3, series_coefficients, skew
 from stario.sequences.sequence import FloatArray
 
+UNKNOWN_YAW = math.pi / math.sqrt(3.0)
+"""Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
+
 _EYE = np.eye(3)
 
 

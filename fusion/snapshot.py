@@ -36,25 +36,27 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 13
+FORMAT, VERSION = "stario snapshot", 14
 
 
 _HOLDS = """
 fusion.config fusion.continuous fusion.fixes
-fusion.filter.displacements fusion.filter.ekf_state fusion.filter.estimator_state
+fusion.filter.accelerometer fusion.filter.ekf_state fusion.filter.estimator_state
 fusion.filter.frame_transform fusion.filter.gyro_bias fusion.filter.initial
 fusion.filter.innovations fusion.filter.magnetic fusion.filter.map_frame fusion.filter.sceptic
 fusion.filter.seen_positions fusion.filter.zero_velocity
 fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
 fusion.graph.keyframes fusion.graph.whitening
-fusion.imu.buffers fusion.imu.front_end fusion.imu.intervals fusion.imu.outliers
-fusion.imu.preintegration fusion.imu.watches sequences.noise sequences.attitude.levelling
+fusion.imu.field_buffer fusion.imu.front_end fusion.imu.gyro_unit fusion.imu.intervals
+fusion.imu.outliers fusion.imu.preintegration fusion.imu.set_back fusion.imu.window_buffer
+sequences.noise sequences.attitude.levelling
 """
+"""Modules whose classes a snapshot may hold: plain data, made anew from their attributes."""
 
 
 @cache
 def _classes() -> dict[str, type]:
-    """Every class that a snapshot may hold: plain data, made anew from its attributes."""
+    """Every class that a snapshot may hold, by name."""
     modules = [importlib.import_module(f"stario.{name}") for name in _HOLDS.split()]
     return {
         name: each

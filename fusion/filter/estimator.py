@@ -32,29 +32,20 @@ from stario.fusion.filter.innovations import (
     stacked,
 )
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
-from stario.fusion.filter.map_frame import KNOWN_YAW, UNKNOWN_YAW, MapFrame, MapFrameState
+from stario.fusion.filter.map_frame import KNOWN_YAW, MapFrame, MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.preintegration import Segment, segment_of
+from stario.fusion.imu.preintegration import Segment, segment_of, turned_in_gap
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
-GAP_TURN = 0.5
-"""How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
-second and 0.36 to 0.7 per second over three in the training and validation recordings."""
-
 _ROUNDING = 1e-6
 """Of times [s]."""
-
-
-def turned_in_gap(seconds: float) -> float:
-    """Variance of a walker's turn since a gap began [rad^2]: as of one rate all through it."""
-    return min(GAP_TURN * seconds, UNKNOWN_YAW) ** 2
 
 
 class Estimator:

@@ -2,11 +2,14 @@
 
 In the words of ROS REP 105 the track starts in an `odom` frame of its own and a transform takes it
 to `map`. What is not known of a transform is added to the covariance of the states before it, as if
-it were independent of theirs; that is on the safe side, for the fix saw the track's errors too.
+it were independent of theirs; that is on the safe side, for the fix saw the track's errors too. A
+turn says how the track lay at the fix: by how far its yaw may have drifted, or turned in a gap,
+since a state is added as well.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.changed import changed
 from stario.fusion.state import NavState, SmoothedPose
-from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray, Trajectory
 
-_UP = np.array([0.0, 0.0, 1.0])
+_ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_LEVEL = np.diag([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,9 @@ class FrameTransform:
         pivot: (3,) the point of the new frame that a wrong turn would leave where it is [m].
         placed: whether it is the shift of a position fix, not a turn.
         since: states before this time [s] are not transformed: they are in the map already.
+        until: nor are states from this time on [s].
         yaw_sigma: of the turn [rad].
+        drift: variance of the track's own yaw at the time of a turn [rad^2].
         position_covariance: (3, 3) of the shift [m^2].
     """
 
@@ -42,17 +47,37 @@ class FrameTransform:
     pivot: FloatArray
     placed: bool
     since: float
+    until: float = math.inf
     yaw_sigma: float = 0.0
+    drift: float = 0.0
     position_covariance: FloatArray | None = None
 
     def position(self, p_W: FloatArray) -> FloatArray:
         """A position (3,) in the new frame [m]."""
         return np.asarray(self.R @ p_W + self.shift)
 
-    def position_covariance_of(self, p_W: FloatArray, covariance: FloatArray) -> FloatArray:
-        """Covariance (3, 3) of a position that is now `p_W`, from the one it had before [m^2]."""
-        across = skew(p_W - self.pivot) @ (-self.yaw_sigma * _UP)
-        covariance = self.R @ covariance @ self.R.T + np.outer(across, across)
+    def applies_to(self, time: float) -> bool:
+        """Whether a state of before, at a time [s], is transformed."""
+        return self.since <= time < self.until
+
+    def turn_variance(self, own: float) -> float:
+        """Of the yaw of a state that had this variance in the track's own frame [rad^2]."""
+        return self.yaw_sigma**2 + max(0.0, self.drift - own)
+
+    def position_covariance_of(
+        self, p_W: FloatArray, covariance: FloatArray, own: float
+    ) -> FloatArray:
+        """Covariance (3, 3) of a position that is now `p_W`, from the one it had before [m^2].
+
+        Args:
+            p_W: (3,) [m].
+            covariance: (3, 3) before.
+            own: variance of the yaw there, in the track's own frame [rad^2].
+        """
+        arm = p_W - self.pivot
+        across, along, _ = _moments(self.turn_variance(own))
+        covariance = self.R @ covariance @ self.R.T
+        covariance = covariance + across * _outer(_ACROSS @ arm) + along * _outer(_LEVEL @ arm)
         return (
             covariance
             if self.position_covariance is None
@@ -63,18 +88,14 @@ class FrameTransform:
         """A state of before, in the new frame."""
         if state.time >= self.time:
             return state
-        if state.time < self.since:
+        if not self.applies_to(state.time):
             return changed(state, map_frame=state.map_frame + 1)
         v_W, p_W = self.R @ state.v_W, self.position(state.p_W)
         A = np.eye(15)
         for first in (0, 3, 6):
             A[first : first + 3, first : first + 3] = self.R
         covariance = A @ state.covariance @ A.T
-        turn = np.zeros((15, 1))
-        turn[2] = 1.0
-        turn[3:6, 0] = skew(v_W) @ -_UP
-        turn[6:9, 0] = skew(p_W - self.pivot) @ -_UP
-        covariance += self.yaw_sigma**2 * (turn @ turn.T)
+        covariance += _turned(self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot)
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
         return changed(
@@ -85,6 +106,34 @@ class FrameTransform:
             covariance=covariance,
             map_frame=state.map_frame + 1,
         )
+
+
+def _moments(variance: float) -> tuple[float, float, float]:
+    """Second moments of a turn t by a normal angle of this variance, also where it is large.
+
+    Returns:
+        E sin^2 t, E (1 - cos t)^2 and E t sin t: across an arm of length one, along it, and of
+        across with the angle; the variance, 0 and the variance where it is small.
+    """
+    once, twice = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
+    return 0.5 * (1.0 - twice), 1.0 - 2.0 * once + 0.5 * (1.0 + twice), variance * once
+
+
+def _turned(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
+    """Covariance (15, 15) of a state by its turn: yaw, velocity (3,) and arm (3,) to the pivot."""
+    across, along, both = _moments(variance)
+    level = np.zeros((15, 2))  # columns: across and along
+    level[3:6, 0], level[6:9, 0] = _ACROSS @ v_W, _ACROSS @ arm
+    level[3:6, 1], level[6:9, 1] = _LEVEL @ v_W, _LEVEL @ arm
+    covariance = level @ np.diag([across, along]) @ level.T
+    covariance[2, 2] = variance
+    covariance[2] += both * level[:, 0]
+    covariance[:, 2] += both * level[:, 0]
+    return covariance
+
+
+def _outer(vector: FloatArray) -> FloatArray:
+    return np.outer(vector, vector)
 
 
 def in_last_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
@@ -104,9 +153,10 @@ def smoothed_track(
     for pose in poses:
         R_WB, p_W, covariance = pose.R_WB, pose.p_W, pose.covariance[3:, 3:]
         for transform in transforms[pose.map_frame :]:
-            if pose.time >= transform.since:
+            if transform.applies_to(pose.time):
                 R_WB, p_W = transform.R @ R_WB, transform.position(p_W)
-                covariance = transform.position_covariance_of(p_W, covariance)
+                own = pose.covariance[2, 2]
+                covariance = transform.position_covariance_of(p_W, covariance, own)
         rows.append((pose.time, p_W, R_WB, covariance))
     time, position, attitude, covariances = zip(*rows, strict=True)
     return Trajectory(

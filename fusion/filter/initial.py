@@ -10,9 +10,8 @@ import numpy as np
 from stario.fusion.checked import checked
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.lie import yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
@@ -25,7 +24,7 @@ STILL_TILT_SIGMA = 0.01
 WALKING_SPEED = 1.5
 """How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
 
-_ORTHOGONAL = 1e-4
+_ORTHOGONAL, _ROUNDED = 1e-4, 1e-9
 """By so much a rotation's rows may be off unit length and right angles: rounded input."""
 
 FARTHEST = 1e4
@@ -64,6 +63,9 @@ class PriorPose:
         R_WB = checked("R_WB", self.R_WB, (3, 3))
         if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R_WB) < 0.0:
             raise InputError("R_WB", "a matrix that is no rotation", "a rotation from B to W")
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDED:
+            left, _, right = np.linalg.svd(R_WB)
+            R_WB = left @ right  # the nearest rotation
         object.__setattr__(self, "R_WB", R_WB)
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
             object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))

@@ -10,7 +10,9 @@ nothing were known of this shift or turn, then the fix is an ordinary measuremen
 "Fixes").
 
 Behind a gap in which the direction was lost the same holds of the track from there on: the next
-position places it, the next direction turns it, and what was before the gap stays where it is.
+position places it, the next direction turns it, and what was before the gap stays where it is; if
+its own direction was never told, nobody knows it once the frame has one. A track that no fix has
+placed yet goes through the gap as one.
 """
 
 from __future__ import annotations
@@ -30,14 +32,11 @@ from stario.fusion.filter.innovations import is_gated
 from stario.fusion.filter.network_turn import begun
 from stario.fusion.filter.seen_positions import SeenPositions
 from stario.fusion.fixes import Fix
-from stario.fusion.lie import yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
-
-UNKNOWN_YAW = math.pi / math.sqrt(3.0)
-"""Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
 
 KNOWN_YAW = 0.5
 """A first yaw given to better than this [rad] is kept; a coarser one is left to the fixes."""
@@ -80,6 +79,9 @@ class MapFrameState:
         seen: positions since it was placed, from the pivot, while its yaw is not known.
         apart: how many of the last positions lay at another distance from the pivot than the track.
         off: (3,) residuals of the last positions, if they were outliers [m].
+        left: of stretches that were placed before a gap and never turned, what is not known of them
+            as soon as the frame has a direction.
+        jumps: how often positions have shown that the track was wrong, not they.
     """
 
     placed: bool
@@ -91,6 +93,8 @@ class MapFrameState:
     seen: SeenPositions = field(default_factory=SeenPositions)
     apart: int = 0
     off: tuple[FloatArray, ...] = ()
+    left: tuple[FrameTransform, ...] = ()
+    jumps: int = 0
 
 
 class MapFrame:
@@ -141,11 +145,15 @@ class MapFrame:
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
-        now = _nav_state(ekf)
-        if self.state.oriented and now.covariance[2, 2] > KNOWN_YAW**2:
-            self.state = changed(
-                self.state, placed=False, oriented=False, pivot=now.p_W, since=now.time
-            )
+        now, s = _nav_state(ekf), self.state
+        if not (s.placed or s.oriented) or now.covariance[2, 2] <= KNOWN_YAW**2:
+            return
+        left = s.left
+        if not s.oriented:
+            left = (*left, _unturned(s.pivot, s.since, now.time))
+        self.state = MapFrameState(
+            False, False, s.transforms, now.p_W, now.time, left=left, jumps=s.jumps
+        )
 
     def _asks_for_place(self, ekf: StateCloningEkf, fix: Fix) -> bool:
         """Whether a position is to place the track: the first, and later a much better one.
@@ -184,7 +192,8 @@ class MapFrame:
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
         """None where the fix does not tell the direction."""
         pivot, since = self.state.pivot, self.state.since
-        turn, sigma = _turn(_nav_state(ekf), pivot, fix)
+        now = _nav_state(ekf)
+        turn, sigma = _turn(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
         if not (
             math.isfinite(turn) and sigma <= (COARSEST_YAW if fix.kind == "yaw" else FAR_ENOUGH)
@@ -196,10 +205,15 @@ class MapFrame:
                 self._remember(ekf, fix)
                 return None
         R = exp_so3(np.array([0.0, 0.0, turn]))
-        transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since)
+        drift = float(now.covariance[2, 2])
+        transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
         moved = ekf.state.transformed(transform.R, transform.shift)
         ekf.state = moved.with_yaw_inflated(pivot, inflation)
-        self.state = changed(self.state, oriented=True, seen=SeenPositions())
+        left = (changed(stretch, time=fix.time) for stretch in self.state.left)
+        transforms = (*self.state.transforms, *left)
+        self.state = changed(
+            self.state, oriented=True, transforms=transforms, seen=SeenPositions(), left=()
+        )
         return transform
 
     def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
@@ -242,9 +256,17 @@ class MapFrame:
         self.state = changed(self.state, off=(*alike, off))
         if len(self.state.off) < _CONVINCING:
             return result
-        self.state = changed(self.state, off=())
+        self.state = changed(self.state, off=(), jumps=self.state.jumps + 1)
         ekf.state = before.with_position_inflated(float(norm(off)))
         return ekf.update_position_W(fix.value, fix.covariance, gate)
+
+
+def _unturned(pivot: FloatArray, since: float, until: float) -> FrameTransform:
+    """Of a stretch about its pivot: stays where it is, its direction is not known."""
+    zero = np.zeros(3)
+    return FrameTransform(
+        math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
+    )
 
 
 def _nav_state(ekf: StateCloningEkf) -> NavState:
@@ -254,7 +276,8 @@ def _nav_state(ekf: StateCloningEkf) -> NavState:
 def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
     """Turn of the frame about a point that a fix asks for, and how well it tells it [rad]."""
     if fix.kind == "yaw":
-        return float(fix.value[0]) - yaw_twist(state.R_WB), math.sqrt(fix.covariance[0, 0])
+        turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
+        return turn, math.sqrt(fix.covariance[0, 0])
     first, seen, ours = 3, fix.value, state.v_W
     if fix.kind == "position":
         first, seen, ours = 6, fix.value - pivot, state.p_W - pivot

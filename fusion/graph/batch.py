@@ -10,12 +10,12 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform
-from stario.fusion.filter.map_frame import UNKNOWN_YAW
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import Segment
+from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray

@@ -17,7 +17,13 @@ from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
+from stario.fusion.imu.preintegration import (
+    Segment,
+    segment_of,
+    segment_of_all,
+    turned_in_gap,
+    unseen,
+)
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
@@ -80,6 +86,7 @@ class GraphBuilder:
         self._pending: list[ImuInterval] = []
         # Keyframes where windows end and begin, by the count of intervals; a gap ends them all.
         self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
+        self._gaps: list[int] = []  # keyframes that a gap follows
 
     @property
     def knows_turn(self) -> bool:
@@ -172,6 +179,7 @@ class GraphBuilder:
         self.graph.marginalise(first)
         self._joints = {n: k for n, k in self._joints.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
+        self._gaps = [k for k in self._gaps if k >= first]
 
     def reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
@@ -192,8 +200,15 @@ class GraphBuilder:
         self._joints[0] = k
 
     def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
-        if segment is None or interval.gap:
-            R, _, _, b_g, b_a = self.graph.pose(self.graph.last)
+        R, _, _, b_g, b_a = self.graph.pose(self.graph.last)
+        if interval.gap:
+            ends, turned = (
+                (interval.start, interval.stop),
+                turned_in_gap(interval.stop - interval.start),
+            )
+            segment = unseen(*ends, R, b_g, b_a, self._config, turned)
+            self._gaps.append(self.graph.last)
+        elif segment is None:
             segment = segment_of(interval, R, b_g, b_a, self._config)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
@@ -221,14 +236,18 @@ class GraphBuilder:
         dt = fix.time - graph.time(k)
         R_k, v_k, p_k, _, _ = graph.pose(k)
         R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.reckoned(k, fix.time)
-        drift = self._config.noise.accel_noise**2 * max(dt, 0.0) * np.eye(3)  # of what the IMU adds
+        dt, f = max(dt, 0.0), self._config.filter
+        # What the IMU adds, or what happens unseen.
+        accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
+        turned = f.gap_gyro_noise**2 * dt + turned_in_gap(dt) if k in self._gaps else 0.0
+        drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift
             return Position(k, fix.value, covariance, dt, p - p_k - dt * v_k)
         if fix.kind == "velocity":
             return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
-        turn = np.array([0.0, 0.0, fix.value[0] - yaw_twist(R)])
-        return Yaw(k, exp_so3(turn) @ R_k, fix.covariance)
+        turn = np.array([0.0, 0.0, math.remainder(fix.value[0] - yaw_twist(R), 2.0 * math.pi)])
+        return Yaw(k, exp_so3(turn) @ R_k, fix.covariance + turned)
 
 
 def _usable(value: FloatArray, covariance: FloatArray) -> bool:

@@ -47,6 +47,7 @@ class FixedLagState:
         ahead: the newest state, carried on by the IMU from the last keyframe.
         origin_W: (3,) of the graph's positions [m]: see `EkfState`.
         map_frame: frame transforms before the graph began.
+        jumps: of the filter's track before that.
         bias_prior: variance of the gyroscope bias's prior as the graph has it [rad^2/s^2].
         fallbacks: how often the graph fell back to the filter, and why it last did.
     """
@@ -56,6 +57,7 @@ class FixedLagState:
     ahead: EkfState
     origin_W: FloatArray
     map_frame: int
+    jumps: int
     bias_prior: float
     fallbacks: tuple[int, str]
 
@@ -81,7 +83,7 @@ class FixedLagEstimator:
         self._fallbacks = (0, "")
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
         self._origin_W = np.zeros(3)
-        self._map_frame = 0
+        self._map_frame, self._jumps = 0, 0
         self._bias_prior = 0.0
         self._builder: GraphBuilder
         self._begin(0)
@@ -126,6 +128,7 @@ class FixedLagEstimator:
             self._ahead.state,
             self._origin_W,
             self._map_frame,
+            self._jumps,
             self._bias_prior,
             self._fallbacks,
         )
@@ -134,7 +137,7 @@ class FixedLagEstimator:
     def state(self, s: FixedLagState) -> None:
         self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
         self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
-        self._bias_prior = s.bias_prior
+        self._bias_prior, self._jumps = s.bias_prior, s.jumps
 
     @property
     def time(self) -> float:
@@ -160,7 +163,8 @@ class FixedLagEstimator:
         """Whether the filter knows by now that the graph began from something else."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
         turned = self._filter.ekf.state.has_turn and not self._builder.knows_turn
-        return wider or turned or self._filter.map_frame != self._map_frame
+        jumped = self._filter.frames.jumps != self._jumps
+        return wider or turned or jumped or self._filter.map_frame != self._map_frame
 
     def _narrow_bias_prior(self) -> None:
         """As the filter did: what the narrower prior knows more, as a measurement of zero."""
@@ -182,6 +186,7 @@ class FixedLagEstimator:
         """A new graph from the filter's state."""
         first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
+        self._jumps = self._filter.frames.jumps
         self._bias_prior = self._filter.bias_prior.variance
         first = first.shifted(-self._origin_W)
         turn = known_turn(self._filter.ekf.state)

@@ -25,6 +25,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.outliers import Flags
+from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
@@ -35,6 +36,10 @@ _POSITION_NOISE = 1e-5
 _LEAST_WALK = 1e-7
 
 _GAP_STEPS = 10
+
+GAP_TURN = 0.5
+"""How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
+second and 0.36 to 0.7 per second over three in the training and validation recordings."""
 
 _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
 """Densities where up to a fifth of a second is missing and what was measured around it is taken for
@@ -108,11 +113,51 @@ def segment_of(
         config: noise and gravity.
     """
     if interval.gap:
-        return _unseen(interval, R_WB, b_g, b_a, config)
+        return unseen(interval.start, interval.stop, R_WB, b_g, b_a, config)
     noise = _noise(interval, config)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
     )
+
+
+def turned_in_gap(seconds: float) -> float:
+    """Variance of a walker's turn since a gap began [rad^2]: as of one rate all through it."""
+    return min(GAP_TURN * seconds, UNKNOWN_YAW) ** 2
+
+
+def unseen(
+    start: float,
+    stop: float,
+    R_WB: FloatArray,
+    b_g: FloatArray,
+    b_a: FloatArray,
+    config: NavigatorConfig,
+    turned: float = 0.0,
+) -> Segment:
+    """Through a gap: constant velocity and attitude, under noise wide enough for a walker.
+
+    Args:
+        start: of the gap [s].
+        stop: its end [s].
+        R_WB: (3, 3) attitude at its start.
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        config: noise and gravity.
+        turned: variance of a turn about the vertical within it [rad^2]; the filter, which turns
+            the velocity with it, adds that itself.
+    """
+    f, dt = config.filter, (stop - start) / _GAP_STEPS
+    noise = replace(config.noise, gyro_noise=f.gap_gyro_noise, accel_noise=f.gap_accel_noise)
+    params = _new_params(noise, config.gravity)
+    up_B = R_WB.T @ [0.0, 0.0, 1.0]
+    density = turned / (stop - start) * np.outer(up_B, up_B)
+    params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
+    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
+    hover = config.gravity * up_B + b_a
+    # In one step position and velocity would be in error together: no graph can invert that.
+    for _ in range(_GAP_STEPS):
+        pim.integrateMeasurement(hover, b_g, dt)
+    return Segment(start, stop, config.gravity, pim)
 
 
 def segment_of_all(
@@ -131,26 +176,6 @@ def segment_of_all(
     noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in intervals)
     samples = joined("time"), joined("gyro"), joined("accel")
     return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
-
-
-def _unseen(
-    interval: ImuInterval,
-    R_WB: FloatArray,
-    b_g: FloatArray,
-    b_a: FloatArray,
-    config: NavigatorConfig,
-) -> Segment:
-    """Through a gap: constant velocity and attitude, under noise wide enough for a walker."""
-    hover = R_WB.T @ [0.0, 0.0, config.gravity] + b_a
-    noise = replace(
-        config.noise,
-        gyro_noise=config.filter.gap_gyro_noise,
-        accel_noise=config.filter.gap_accel_noise,
-    )
-    # In one step position and velocity would be in error together: no graph can invert that.
-    time = np.linspace(interval.start, interval.stop, _GAP_STEPS + 1)
-    gyro, accel = np.tile(b_g, (len(time), 1)), np.tile(hover, (len(time), 1))
-    return preintegrate(time, gyro, accel, b_g, b_a, noise, config.gravity)
 
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
@@ -269,5 +294,5 @@ def _set_white_noise(params: Any, noise: ImuNoise) -> None:
     params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
 
 
-# Noise that grows with motion comes in steps (`segments`): the range in use fits.
+# The accelerometer's factor comes in steps: the range in use fits.
 _params = lru_cache(maxsize=512)(_new_params)

@@ -1,0 +1,163 @@
+"""Fixes before, within and behind gaps in which a walker turns unseen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support import GRAPH as CONFIG
+from support import stream
+
+from stario.fusion import Navigator, PriorPose, Track
+from stario.fusion.evaluation.checks.fixed import true_fixes
+from stario.fusion.filter.frame_transform import FrameTransform
+from stario.fusion.fixes import position_fix, yaw_fix
+from stario.fusion.state import NavState
+from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
+BACKENDS = ("ekf", "graph")
+
+
+def yaw_error(track: Track, walk: ImuSequence, rows: Any) -> np.ndarray:
+    """In a world that is the truth's, wrapped [rad]."""
+    truth = walk.truth.at(track.time[rows])
+    found = yaw_of(track.trajectory.attitude_WB[rows])
+    return np.angle(np.exp(1j * (found - yaw_of(truth.attitude_WB))))
+
+
+def position_nees(track: Track, walk: ImuSequence, row: int) -> float:
+    error = (
+        track.trajectory.position_W[row] - walk.truth.at(track.time[row : row + 1]).position_W[0]
+    )
+    return float(error @ np.linalg.solve(track.covariance[row, 6:9, 6:9], error))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (3, 15.0), (4, 3.0)])
+def test_a_position_before_a_gap_turns_nothing_behind_it(
+    make_walk: Make, make_oracle: Make, without: Make, backend: Any, seed: int, gap: float
+) -> None:
+    """Its direction was never told, so that the way to there is none of the track behind."""
+    walk = make_walk(seed, 60.0)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = [f for f in true_fixes(walk.truth, 3.0, 0.3, 0) if not 1.0 < f.time < 20.0 + gap]
+    track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=fixes)
+    late = track.time > 50.0
+    late &= track.time < walk.time[-1]
+    assert np.abs(yaw_error(track, walk, late)).max() < 0.2
+    early = int(np.searchsorted(track.time, 15.0))
+    turn = float(yaw_error(track, walk, slice(early, early + 1))[0])
+    assert abs(turn) < 3.0 * np.sqrt(track.covariance[early, 2, 2])
+    # A graph's marginals are of first order: across the arm alone.
+    assert backend == "graph" or position_nees(track, walk, early) < 20.0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 4])
+def test_what_was_before_a_gap_is_not_known_by_what_is_told_behind_it(
+    make_walk: Make, make_oracle: Make, without: Make, seed: int
+) -> None:
+    walk = make_walk(seed, 60.0)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 35.0))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = [f for f in true_fixes(walk.truth, 3.0, 0.3, 0) if f.time > 35.0]
+    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    before = int(np.searchsorted(track.time, 15.0))
+    assert track.covariance[before, 2, 2] > 1.0
+    assert position_nees(track, walk, before) < 20.0
+    assert position_nees(track, walk, len(track.time) - 2) < 12.0
+
+
+@pytest.mark.parametrize("gap", [1.5, 3.0, 7.0])
+def test_a_graph_knows_no_more_of_the_turn_in_a_gap_than_the_filter(
+    make_walk: Make, make_oracle: Make, without: Make, gap: float
+) -> None:
+    walk = make_walk(1, 40.0)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    after = 20.0 + gap + 0.2
+
+    def sigma(track: Track) -> float:
+        return float(np.sqrt(track.covariance[np.searchsorted(track.time, after), 2, 2]))
+
+    expected = sigma(Navigator(oracle, CONFIG).run(holed))
+    assert expected > 0.45 * min(gap, 3.0)
+    assert sigma(Navigator(oracle, CONFIG, backend="graph").run(holed)) > 0.85 * expected
+    states = stream(Navigator(oracle, CONFIG, backend="graph"), holed)
+    streamed = next(s for s in states if s.time > after)
+    assert np.sqrt(streamed.covariance[2, 2]) > 0.85 * expected
+
+
+@pytest.mark.parametrize("kind", ["yaw", "position"])
+def test_a_fix_within_a_gap_says_little_of_what_was_before_it(
+    make_walk: Make, make_oracle: Make, without: Make, kind: str
+) -> None:
+    nees = []
+    for seed in range(4):
+        walk = make_walk(seed, 30.0)
+        holed = without(walk, (walk.time > 15.0) & (walk.time < 15.9))
+        oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+        truth = walk.truth.at(np.array([15.85]))
+        fix = (
+            yaw_fix(15.85, yaw_of(truth.attitude_WB)[0], 0.02)
+            if kind == "yaw"
+            else position_fix(15.85, truth.position_W[0], 0.05**2 * np.eye(3))
+        )
+        track = Navigator(oracle, CONFIG, true_start(walk), "graph").run(holed, fixes=[fix])
+        nees.append(position_nees(track, walk, int(np.searchsorted(track.time, 14.9))))
+    assert np.mean(nees) < 7.8  # 95 % of a chi-square with three degrees of freedom
+
+
+@pytest.mark.parametrize("jump", [(0.0, 0.0, 8.0), (20.0, 0.0, 0.0)])
+def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
+    make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
+) -> None:
+    """A lift, or a positioning system that was anchored anew."""
+    walk = make_walk(2, 50.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    navigator = Navigator(oracle, CONFIG, true_start(walk), "graph")
+    for fix in true_fixes(walk.truth, 2.0, 0.3, 0):
+        value = fix.value + (np.array(jump) if fix.time > 30.0 else 0.0)
+        navigator.update_position(fix.time, value, fix.covariance)
+    for state in stream(navigator, walk):
+        if state.time > 36.5:
+            truth = walk.truth.at(np.array([state.time])).position_W[0] + jump
+            assert np.linalg.norm(state.p_W - truth) < 1.5
+
+
+def test_the_moments_of_a_large_turn_are_those_of_turned_arms() -> None:
+    arm, sigma = np.array([3.0, -1.0, 0.5]), 1.2
+    zero, sure = np.zeros(3), np.zeros((15, 15))
+    turn = FrameTransform(1.0, np.eye(3), zero, zero, False, -np.inf, yaw_sigma=sigma)
+    state = NavState(0.0, np.eye(3), 0.5 * arm, arm, zero, zero, sure)
+    angles = np.random.default_rng(0).normal(0.0, sigma, 200_000)
+    off = about_z(angles).apply(arm) - arm
+    errors = np.column_stack([angles, 0.5 * off, off])
+    rows = [2, *range(3, 9)]
+    expected = errors.T @ errors / len(angles)
+    found = turn.state(state).covariance[np.ix_(rows, rows)]
+    np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
+    assert np.linalg.eigvalsh(found).min() > -1e-9
+
+
+def test_a_yaw_that_is_no_angle_is_refused_and_told(make_walk: Make, make_oracle: Make) -> None:
+    walk = make_walk(3, 12.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    track = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
+    assert track.health.fixes == {"yaw not in radians": 1}
+
+
+def test_a_rotation_rounded_to_four_digits_is_taken(still_model: Any, make_walk: Make) -> None:
+    walk, zero = make_walk(3, 5.0), np.zeros(3)
+    R_WB = np.round(about_z(0.7).as_matrix(), 4)
+    states = stream(Navigator(still_model, prior=PriorPose(R_WB, zero, zero)), walk)
+    np.testing.assert_allclose(states[0].R_WB @ states[0].R_WB.T, np.eye(3), atol=1e-9)
+
+
+def true_start(walk: ImuSequence) -> PriorPose:
+    truth = walk.truth
+    return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
