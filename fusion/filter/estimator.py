@@ -206,6 +206,7 @@ class Estimator:
 
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
         if not self._stillness.is_still(interval):
+            self._bias.refused_rest(0.0)
             return None
         measured = zero_velocity(self._stillness)
         before = self.ekf.state, self._bias.prior, self._opinion.sceptic
@@ -215,7 +216,9 @@ class Estimator:
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
             self.ekf.state, self._bias.prior, self._opinion.sceptic = before
+            self._bias.refused_rest(interval.stop - interval.start)
             return None
+        self._bias.refused_rest(0.0)
         self._opinion.sceptic = None
         return measured
 

@@ -42,6 +42,10 @@ _WIDEST = 0.015
 _AT_REST = 2.5e-3
 """Where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
+_PATIENCE, _RAW = 10.0, 0.1
+"""What looks like rest for so long [s] is rest, though the gyroscope reads up to this [rad/s]: of
+what is raw about the vertical gravity tells nothing."""
+
 _ROUNDING = 1e-6
 """Of times [s]."""
 
@@ -58,12 +62,14 @@ class GyroBiasPrior:
         variance: per axis, now [rad^2/s^2].
         raw: of the bias beyond what such a device leaves, at most so far [rad/s].
         evident: variance that the data asked for, at most so far.
+        refused: for how long it has looked like rest and was refused [s].
     """
 
     sigma: float
     variance: float
     raw: float = 0.0
     evident: float = 0.0
+    refused: float = 0.0
 
     @classmethod
     def first(cls, sigma: float) -> GyroBiasPrior:
@@ -94,7 +100,7 @@ class GyroBiasPrior:
         raw = max(self.raw, levelled - _CORRECTED)
         evident = max(self.evident, min(self._asked(b_g, P, wander), _WIDEST**2))
         known = self.sigma**2 + (_ALIKE * levelled_sigma) ** 2 + raw**2
-        return GyroBiasPrior(self.sigma, max(known, evident), raw, evident)
+        return changed(self, variance=max(known, evident), raw=raw, evident=evident)
 
     def _asked(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
         """The variance that the data ask for.
@@ -147,8 +153,14 @@ class FollowedBiasPrior:
 
     def widen_for_rest(self) -> None:
         """Rest tells the bias, be it what it may."""
-        wide = max(self.prior.variance, _AT_REST**2)
-        self._exchange(changed(self.prior, variance=wide))
+        sigma = _AT_REST if self.prior.refused < _PATIENCE else _RAW
+        self._exchange(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
+
+    def refused_rest(self, seconds: float) -> None:
+        """What looked like rest was refused for so long again; 0 where it was not, or moves [s]."""
+        refused = self.prior.refused + seconds if seconds else 0.0
+        if refused != self.prior.refused:
+            self.prior = changed(self.prior, refused=refused)
 
     def _exchange(self, wanted: GyroBiasPrior) -> None:
         """Everything as if it had been the prior from the start."""
