@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -23,6 +24,8 @@ from stario.sequences.windows import (
     window_starts,
     windows_at,
 )
+
+log = logging.getLogger(__name__)
 
 VALIDATION_STRIDE = 20
 """Samples from the start of a window to the next one's."""
@@ -124,9 +127,14 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
         # What is kept of a short walk is shorter than what is learned from.
         longest = (max(len(stream) for stream in members) - 1) // WINDOW_SAMPLES
         seconds = min(usual, longest - longest % config.successive)
-        if seconds >= LEAST_SECONDS:
-            generator = torch.Generator().manual_seed(0)
-            found[kind] = LegSampler(members, seconds, plain, generator).batch(_STRETCHES)
+        if seconds < LEAST_SECONDS:
+            continue
+        try:
+            sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
+        except InputError as error:  # an error of nothing would be the least of all
+            log.warning("validation goes without %s", error)
+            continue
+        found[kind] = sampler.batch(_STRETCHES)
     return found
 
 

@@ -33,6 +33,8 @@ that cannot tell every second shortens them all (Indoor Location left out: error
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,6 +56,8 @@ from stario.sequences.windows import (
     WINDOW_SAMPLES,
 )
 
+log = logging.getLogger(__name__)
+
 VARIANCE_RATE = 0.05
 """Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
 
@@ -63,6 +67,9 @@ VELOCITY_SIGMA = 0.1
 _COS_TURNED, _CHANCE = 0.5, 0.25
 """Of the angle beyond which a stretch is walked another way than the accelerometer says, and what
 chance makes of the correlation of a dozen changes of velocity."""
+
+_SECONDS = {"waypoints": "waypoint_seconds", "positions": "track_seconds"}
+"""The setting of a recipe that says how long stretches of each kind are."""
 
 _HUBER = 3.0
 """Whitened residuals beyond this many deviations count linearly."""
@@ -107,16 +114,16 @@ class LegBatch:
 
 
 class LegSampler:
-    """Draws stretches of consecutive windows with their legs.
+    """Draws stretches of consecutive windows with two legs at least.
 
     Args:
-        streams: at least one of `seconds` or more.
+        streams: of one kind, at least one; those without two legs within `seconds` are left out.
         seconds: windows in a row, K.
         augmentation: how windows are shown.
         generator: of all randomness; shared with the sampler of windows with full truth.
 
     Raises:
-        InputError: no stream is long enough.
+        InputError: no stream has two legs within `seconds`.
     """
 
     def __init__(
@@ -128,16 +135,25 @@ class LegSampler:
     ) -> None:
         self._seconds, self.augmentation = seconds, augmentation
         self._length = seconds * WINDOW_SAMPLES
-        self._streams = [s for s in streams if len(s) > self._length]
-        if not self._streams:
-            raise InputError("positions", "no stretch long enough", f"one of {seconds} s")
-        lengths = torch.tensor([len(s) - self._length for s in self._streams], dtype=torch.float64)
-        self._cumulative = (lengths / lengths.sum()).cumsum(0)
-        self._lengths = lengths
+        found = [_beginnings(stream, seconds) for stream in streams]
+        if not any(found):
+            raise _too_far_apart(streams, seconds)
+        if not all(found):
+            log.warning(
+                "%s: nothing is drawn from %d of %d stretches, which hold no two legs within %d s",
+                streams[0].kind, sum(not runs for runs in found), len(found), seconds,
+            )  # fmt: skip
+        self._runs = [
+            (stream, first, count)
+            for stream, runs in zip(streams, found, strict=True)
+            for first, count in runs
+        ]
+        counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
+        self._cumulative = (counts / counts.sum()).cumsum(0)
         self._generator = generator
 
     def batch(self, size: int) -> LegBatch:
-        """Stretches that hold two legs each; few that hold less may remain."""
+        """Stretches that hold two legs each."""
         drawn = [self._draw() for _ in range(size)]
         imu_N = torch.from_numpy(np.stack([s.imu_N[o : o + self._length] for s, o in drawn]))
         facing_N = torch.from_numpy(
@@ -153,14 +169,32 @@ class LegSampler:
         return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *told)
 
     def _draw(self) -> tuple[LegStream, int]:
-        for _ in range(20):
-            uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
-            index = int(torch.searchsorted(self._cumulative, uniform[0]))
-            index = min(index, len(self._streams) - 1)
-            stream, offset = self._streams[index], int(uniform[1] * self._lengths[index])
-            if len(_inside(stream, offset, self._seconds)) >= 2:
-                break
-        return stream, offset
+        uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
+        index = int(torch.searchsorted(self._cumulative, uniform[0]))
+        stream, first, count = self._runs[min(index, len(self._runs) - 1)]
+        return stream, first + int(uniform[1] * count)
+
+
+def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
+    """Samples at which stretches with two legs may begin: of each run of them first and count."""
+    begin = np.arange(len(stream) - seconds * WINDOW_SAMPLES) / WINDOW_RATE
+    # As `_inside` counts them: legs follow one another.
+    over = np.searchsorted(stream.stop, begin + seconds, side="right")
+    enough = over - np.searchsorted(stream.start, begin) >= 2
+    edges = np.flatnonzero(np.diff(enough, prepend=False, append=False)).reshape(-1, 2)
+    return [(int(first), int(stop - first)) for first, stop in edges]
+
+
+def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
+    kind = streams[0].kind
+    apart = float(np.median(np.concatenate([s.stop - s.start for s in streams])))
+    longest = max(len(stream) for stream in streams) / WINDOW_RATE
+    return InputError(
+        kind,
+        f"one every {apart:.1f} s in stretches of at most {longest:.0f} s",
+        f"two legs within {seconds} s",
+        f"set `{_SECONDS[kind]}` in the recipe to {math.ceil(2.0 * apart) + 1} or so",
+    )
 
 
 def _inside(stream: LegStream, offset: int, seconds: int) -> NDArray[np.int64]:
@@ -200,7 +234,7 @@ def leg_samplers(
     """A sampler for each kind of weak truth that there is, and how many stretches a step draws.
 
     Raises:
-        InputError: a kind has no stretch that is long enough.
+        InputError: a kind has no stretch that is long enough for two legs.
         ConfigError: a stretch is no whole number of the rows of windows that a step draws.
     """
     kinds = by_kind(streams, config)

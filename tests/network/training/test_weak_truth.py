@@ -280,3 +280,37 @@ def test_short_walks_choose_weights_by_themselves() -> None:
     assert held_out.deciding(errors) == 0.25
     besides = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
     assert besides.deciding(errors) == 2.625
+
+
+def sampler_of(streams: list[LegStream], seconds: int) -> LegSampler:
+    return LegSampler(streams, seconds, PLAIN, torch.Generator().manual_seed(0))
+
+
+def test_stretches_begin_where_two_legs_follow(caplog: pytest.LogCaptureFixture) -> None:
+    """Legs of ten seconds fit twice into twenty one only where a stretch begins at a waypoint."""
+    [far], [near] = leg_streams(known("waypoints", 10.0)), leg_streams(known("waypoints", 6.0))
+    assert int(sampler_of([far], 21).batch(32).known.sum(1).min()) == 2
+    assert not caplog.text
+    both = sampler_of([far, near], 15).batch(32)
+    assert int(both.known.sum(1).min()) == 2
+    assert "nothing is drawn from 1 of 2" in caplog.text
+    assert float(both.seconds[both.known].max()) == pytest.approx(6.0)
+
+
+def test_waypoints_too_far_apart_to_teach_are_refused_with_the_seconds_that_would_do() -> None:
+    legs = leg_streams(known("waypoints", 25.0))
+    expected = r"waypoints: found one every 25.0 s .*two legs within 20 s.*`waypoint_seconds`.* 51 "
+    with pytest.raises(InputError, match=expected):
+        sampler_of(legs, 20)
+    assert int(sampler_of(legs, 51).batch(4).known.sum()) == 8
+
+
+def test_validation_goes_without_legs_that_tell_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Their error would be 0, the best of all."""
+    held_out = ValidationSet(
+        world_streams(WALK), torch.device("cpu"), leg_streams(known("waypoints", 25.0)),
+        TrainingConfig(), chosen_by_legs=True,
+    )  # fmt: skip
+    assert held_out.legs == {}
+    assert held_out.deciding({"walk": 5.0}) == 5.0
+    assert "goes without waypoints" in caplog.text
