@@ -26,6 +26,10 @@ _SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
 _FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
 """A track that moves faster between two samples [m/s] has jumped; a longer step [s] is a gap."""
 
+_SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
+"""Of a slow track, as satellites give, a gap is longer than so many usual steps, or than so long
+[s]: a walker has turned by then."""
+
 _TRACK_SIGMA = 0.15
 """Of a track's positions [m]: what carries the truth is not what carries the IMU."""
 
@@ -120,7 +124,14 @@ def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
     """
     step = np.diff(time)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
-    return np.asarray((speed > _FASTEST_STEP) | (step > _LONGEST_STEP))
+    return np.asarray((speed > _FASTEST_STEP) | (step > _longest_step(step)))
+
+
+def _longest_step(step: FloatArray) -> float:
+    """Of a track with these steps (n,) the longest that is no gap [s]."""
+    if not len(step):
+        return _LONGEST_STEP
+    return max(_LONGEST_STEP, min(_SLOW_STEP * float(np.median(step)), _SLOWEST_STEP))
 
 
 def _ticks(time: FloatArray) -> NDArray[np.int64]:

@@ -197,6 +197,20 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
     assert leg_streams(ride) == []
 
 
+@pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])
+def test_a_slow_track_has_legs_but_across_its_gaps(every: float, legs: int) -> None:
+    recording = known("positions", every)
+    assert recording.positions is not None
+    [whole] = leg_streams(recording)
+    assert len(whole.start) == pytest.approx(legs, abs=1)
+    time = recording.positions.time
+    valid = (time < 20.0) | (time > 28.0)
+    gap = PositionTrack(time, recording.positions.position_W, "positions", valid)
+    [cut] = leg_streams(replace(recording, positions=gap))
+    assert not ((cut.start < 21.0) & (cut.stop > 27.0)).any()
+    assert len(cut.start) < len(whole.start)
+
+
 def test_two_processes_share_the_stretches_out_and_three_cannot() -> None:
     batch, cpu = batch_of(known("positions", 0.1)), torch.device("cpu")
     halves = [batch.shared(Workers(rank, 2, cpu)) for rank in (0, 1)]

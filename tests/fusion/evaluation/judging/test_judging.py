@@ -117,6 +117,17 @@ def test_of_positions_the_yaw_is_fitted_and_nothing_compared_across_a_jump(
     assert jumped.blocks["10"][:, 1].sum() < smooth.blocks["10"][:, 1].sum()
 
 
+def test_positions_once_a_second_are_judged_as_well(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    time = np.arange(1.0, 74.0)
+    track = PositionTrack(time, walk.truth.at(time).position_W, "positions")
+    slow = replace(walk, truth=None, positions=track)
+    found = errors_of(slow, Stub(walk, 0.9, yaw=2.0))
+    assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    often = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
+    assert found.figures["rms_10s_m"] == pytest.approx(often.figures["rms_10s_m"], rel=0.05)
+
+
 def test_of_waypoints_residuals_follow_a_fit_of_yaw_and_position(walk: ImuSequence) -> None:
     exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
     short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
