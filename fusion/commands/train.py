@@ -116,6 +116,7 @@ def train(
         recorded + held_out if last_stage is not None else recorded,
         cached_walks(0 if recorded_only else generated, recipe.seed, folder, recipe.attitude),
         recipe.shares,
+        recipe.reach,
     )
     kept = gather(held_out, [])
     if recorded and not (kept.streams or kept.legs):

@@ -89,7 +89,7 @@ def train_cell(
     held_out, missing = _streams(dataset.validation, recipe, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for one in streams for s in one.streams)
-    material = gather(streams, [] if poses else simulated(_WALKS, 0))
+    material = gather(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
     kept = gather(held_out, [])
     clock = _Clock(folder / SPARE[1])
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from stario.network.architectures import ARCHITECTURES
-from stario.network.training.augment import Augmentation
+from stario.network.training.augment import Augmentation, reach_of
 from stario.sequences.errors import ConfigError
 from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import Attitude
@@ -30,6 +30,9 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
     "RNIN": {"successive": 10, "batch": 250, "track_seconds": 10},
 }
 """Settings that a network's own paper asks for, over the recipe's defaults."""
+
+SIMULATED = "simulated"
+"""What a recipe's shares call the simulated walks."""
 
 SIGMA_WEIGHT = 0.05
 """Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
@@ -89,8 +92,9 @@ class TrainingConfig:
         track_stretches: the same of stretches along a track of positions without attitude.
         track_seconds: windows in each; short, as heads and phones drift apart in yaw.
         shares: of the windows that each source makes up, by a part of its recordings' path;
-            those that none names are drawn by their length and liveliness. "simulated" is the
-            share of simulated walks among all windows.
+            those that none names are drawn by their length and liveliness. What is named but not
+            there leaves its share to the other recordings. "simulated" is the share of simulated
+            walks among all windows.
         compiled: compile the network for training (torch.compile; needs a C++ compiler on CPUs,
             which saves a third of the time).
         augmentation: how windows are varied.
@@ -134,6 +138,11 @@ class TrainingConfig:
         for name, share in self.shares.items():
             if not (isinstance(share, int | float) and 0.0 <= share <= 1.0):
                 raise ConfigError(f"shares, {name}", repr(share), "a share from 0 to 1")
+        recorded = sum(share for name, share in self.shares.items() if name != SIMULATED)
+        if recorded > 1.0 + 1e-9:
+            raise ConfigError(
+                "shares", f"{recorded:g} of the recordings' windows in all", "1 or less"
+            )
         if self.architecture not in ARCHITECTURES:
             known = f"one of {', '.join(ARCHITECTURES)}"
             raise ConfigError("architecture", repr(self.architecture), known)
@@ -152,6 +161,11 @@ class TrainingConfig:
             raise ConfigError("device", repr(self.device), "auto, cpu or cuda")
         if self.attitude not in ("levelled", "true"):
             raise ConfigError("attitude", repr(self.attitude), "levelled or true")
+
+    @property
+    def reach(self) -> int:
+        """Samples that a stream must have to be drawn from."""
+        return reach_of(self.augmentation, self.successive)
 
     @property
     def steps_per_epoch(self) -> int:

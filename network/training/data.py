@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from stario.network.training.config import SIMULATED
 from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
 from stario.sequences.legs import LegStream
@@ -21,9 +22,6 @@ from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
-
-SIMULATED = "simulated"
-"""What a recipe's shares call the simulated walks."""
 
 _SIMULATED_SHARE = 0.4
 """Of all windows, where none is said."""
@@ -64,6 +62,7 @@ def gather(
     recorded: Sequence[Recorded],
     generated: Sequence[WorldStream],
     shares: Mapping[str, float] = MappingProxyType({}),
+    reach: int = 1,
 ) -> Material:
     """Mix recordings and simulated walks so that each source makes up its share of the windows.
 
@@ -71,27 +70,33 @@ def gather(
         recorded: streams of each recording.
         generated: simulated walks.
         shares: of the sources among the recordings' windows, by a part of their path; recordings
-            that none names make up what is left of 1. `SIMULATED` is that of the simulated walks
-            among all windows.
+            that none names make up what is left of 1. What is named but not there leaves its
+            share to the others. `SIMULATED` is that of the simulated walks among all windows.
+        reach: samples that a stream must have to be drawn from (`TrainingConfig.reach`).
 
     Raises:
-        ConfigError: nothing is left for them.
+        ConfigError: nothing is left for recordings that none names, or for anything at all.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []
     simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
-    sources = [(f"recorded, {name}", (1.0 - simulated) * share, members)
-               for name, share, members in _sources(recorded, shares)]  # fmt: skip
+    named = _sources(recorded, shares)
+    there = sum(share for _, share, members in named if any(len(s) >= reach for s in members))
+    sources = [(f"recorded, {name}", (1.0 - simulated) * share / (there or 1.0), members)
+               for name, share, members in named]  # fmt: skip
     sources.append(("simulated walks", simulated, list(generated)))
     words = []
     for name, share, members in sources:
         if not members:
             continue
         lively = [_liveliness(s) if name.startswith("recorded") else 1.0 for s in members]
-        whole = sum(v * len(s) for v, s in zip(lively, members, strict=True)) / WINDOW_RATE
+        starts = [max(0, len(s) - reach + 1) for s in members]
+        whole = sum(v * n for v, n in zip(lively, starts, strict=True)) / WINDOW_RATE
         streams += members
-        weights += [share * v / whole for v in lively]
+        weights += [share * v / whole if whole else 0.0 for v in lively]
         words.append(f"{name}: {_minutes(members):.0f} min")
+    if any(len(s) >= reach for s in streams) and not any(weights):
+        raise ConfigError("shares", "0 for all that is there to learn from", "some above 0")
     legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
@@ -122,7 +127,7 @@ def _sources(
         source = next((name for name in shares if name in str(one.path)), "")
         members[source] += [s for s in one.streams if isinstance(s, WorldStream)]
     left = 1.0 - sum(shares.values())
-    if members[""] and left <= 0.0:
+    if members[""] and left < 1e-9:
         raise ConfigError(
             "shares", "1 or more in all", "less than 1", f"{members[''][0].name} is of no source"
         )

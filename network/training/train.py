@@ -11,7 +11,7 @@ from pathlib import Path
 from stario.network.card import Calibration
 from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
-from stario.network.training.augment import WindowSampler, reach_of
+from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import workers
 from stario.network.training.run import EpochReport, TrainingRun
@@ -93,7 +93,7 @@ def _sampler(
     config: TrainingConfig, streams: Sequence[WorldStream], weights: Sequence[float]
 ) -> WindowSampler:
     """Of the streams that are long enough for as many windows in a row as the recipe draws."""
-    reach = reach_of(config.augmentation, config.successive)
+    reach = config.reach
     if config.successive > 1:
         pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= reach]
         if not pairs:

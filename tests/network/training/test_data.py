@@ -6,12 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.network.training.data import (
-    SIMULATED,
-    Recorded,
-    gather,
-    split_off,
-)
+from stario.network.training.config import SIMULATED, TrainingConfig
+from stario.network.training.data import Material, Recorded, gather, split_off
 from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream
@@ -59,6 +55,51 @@ def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> 
     assert drawn["z"] / drawn["x"] == pytest.approx(0.4)
     with pytest.raises(ConfigError, match="shares"):
         gather(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
+
+
+def drawn(material: Material, reach: int = 1) -> dict[str, float]:
+    """Share of the windows that are drawn from streams of each name."""
+    found: dict[str, float] = {}
+    for one, weight in zip(material.streams, material.weights, strict=True):
+        starts = max(0, len(one) - reach + 1)
+        found[one.name] = found.get(one.name, 0.0) + weight * starts
+    return {name: value / sum(found.values()) for name, value in found.items()}
+
+
+def test_what_is_named_but_absent_leaves_its_share_to_the_other_recordings() -> None:
+    recorded = [
+        Recorded(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
+        Recorded(Path("other.csv"), [moving("z", 1.0)]),
+    ]
+    shares = {"ridi": 0.2, "kipd": 0.5, SIMULATED: 0.1}
+    found = drawn(gather(recorded, [moving("c", 1.0)], shares))
+    assert found["c"] == pytest.approx(0.1)
+    assert found["x"] == pytest.approx(0.9 * 0.4)
+    alone = drawn(gather(recorded[:1], [moving("c", 1.0)], shares))
+    assert alone["c"] == pytest.approx(0.1)
+
+
+def test_shares_are_of_the_windows_that_can_be_drawn() -> None:
+    """Of stretches hardly longer than a window few are: they are drawn the more often."""
+    whole = moving("y", 1.0)
+    recorded = [
+        Recorded(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
+        Recorded(Path("a/kipd.h5:y"), [whole.part(0, 420)] * 5),
+        Recorded(Path("a/tyrex.h5:w"), [moving("w", 1.0).part(0, 300)]),
+    ]
+    shares = {"ridi": 0.3, "kipd": 0.3, "tyrex": 0.4}
+    found = drawn(gather(recorded, [], shares, reach=361), reach=361)
+    assert found == {"x": pytest.approx(0.5), "y": pytest.approx(0.5), "w": 0.0}
+
+
+def test_shares_that_leave_nothing_are_refused() -> None:
+    recorded = of([moving("x", 1.0)])
+    for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
+        with pytest.raises(ConfigError, match="shares: found 0 for all"):
+            gather([] if generated else recorded, generated, given)
+    with pytest.raises(ConfigError, match=r"shares: found 1\.2 of the recordings"):
+        TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
+    TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
 def of(*recordings: list[WorldStream]) -> list[Recorded]:
