@@ -207,7 +207,9 @@ class TrainingRun:
 
     @property
     def _first_with_sigma(self) -> int:
-        return math.ceil(self.config.likelihood_from * self.config.epochs) + 1
+        """The first epoch all of whose steps learn sigma; of a short run the last, which ends so."""
+        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
+        return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
 
     def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch: the leading process alone, the others are told."""

@@ -172,6 +172,22 @@ def test_an_epoch_without_a_finite_error_is_never_the_best(
     assert model.card.figures["validation_mse_m2"] in choice
 
 
+def test_of_a_short_run_the_epoch_that_learned_sigma_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sigma joins within the second of two epochs, whose error is the larger one here."""
+    whole, epoch = ValidationSet.errors, count(1)
+
+    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+        return whole(self, *arguments) | {"c": float(next(epoch))}
+
+    monkeypatch.setattr(ValidationSet, "errors", errors)
+    path = run(tmp_path, replace(TINY, epochs=2, epoch_windows=32, likelihood_from=0.6))
+    state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
+    kept = safetensors.torch.load_file(path)
+    assert all(torch.equal(state[f"averaged.network.{k}"], v) for k, v in kept.items())
+
+
 def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(tmp_path: Path) -> None:
     spoilt = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
 
