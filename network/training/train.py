@@ -19,7 +19,7 @@ from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_samplers
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
-from stario.sequences.windows import WorldStream
+from stario.sequences.windows import WINDOW_RATE, WorldStream
 
 log = logging.getLogger(__name__)
 
@@ -93,13 +93,17 @@ def _sampler(
     config: TrainingConfig, streams: Sequence[WorldStream], weights: Sequence[float]
 ) -> WindowSampler:
     """Of the streams that are long enough for as many windows in a row as the recipe draws."""
-    reach = config.reach
-    if config.successive > 1:
-        pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= reach]
-        if not pairs:
-            raise InputError("streams", "none long enough", f"one of {reach} samples at 200 Hz")
-        streams, weights = [s for s, _ in pairs], [w for _, w in pairs]
-    return WindowSampler(streams, weights, config.augmentation, config.seed, config.successive)
+    pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= config.reach]
+    if not pairs:
+        found = f"none of {config.reach} samples at 200 Hz"
+        raise InputError("streams", found, "one as long as windows reach at the fastest replay")
+    if len(pairs) < len(streams):
+        log.warning(
+            "nothing is drawn from %d of %d stretches, shorter than the %.1f s that windows reach",
+            len(streams) - len(pairs), len(streams), config.reach / WINDOW_RATE,
+        )  # fmt: skip
+    kept, weights = [s for s, _ in pairs], [w for _, w in pairs]
+    return WindowSampler(kept, weights, config.augmentation, config.seed, config.successive)
 
 
 def _material(

@@ -266,6 +266,17 @@ def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
         train(TINY, [], [], VALIDATION, tmp_path)
 
 
+def test_stretches_too_short_for_the_fastest_replay_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fast = replace(TINY, epochs=1, epoch_windows=16, augmentation=Augmentation(speeds=(0.6, 1.8)))
+    short = swaying("short", 0.3, 1.5)
+    train(fast, [*STREAMS, short], [1.0] * 3, VALIDATION, tmp_path / "a")
+    assert "nothing is drawn from 1 of 3 stretches" in caplog.text
+    with pytest.raises(InputError, match="streams: found none of 361 samples"):
+        train(fast, [short], [1.0], VALIDATION, tmp_path / "b")
+
+
 def test_the_rate_warms_up_and_falls() -> None:
     config = replace(TINY, epochs=100, warm_up=0.1, rate=1.0)
     rates = [learning_rate(config, step) for step in range(config.steps)]
@@ -322,7 +333,7 @@ def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -
     change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
     assert float(change.abs().max()) > 0.0
     # Streams shorter than ten seconds cannot give any.
-    with pytest.raises(InputError, match="none long enough"):
+    with pytest.raises(InputError, match="streams: found none of 3601 samples"):
         train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
 
 
