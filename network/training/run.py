@@ -207,7 +207,7 @@ class TrainingRun:
 
     @property
     def _first_with_sigma(self) -> int:
-        """The first epoch all of whose steps learn sigma; of a short run the last, which ends so."""
+        """The first epoch that learns sigma in every step; of a short run the last one."""
         first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
         return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
 
