@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.judge import POOLED, Row
+from stario.fusion.evaluation.judging.judge import Row
 from stario.sequences.drawing.figures import dress
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    groups = [row for row in rows if row.name != POOLED]
+    groups = [row for row in rows if not row.pooled]
     fig = Figure(figsize=(12.0 if theirs else 9.0, 1.8 + 0.55 * len(rows)), layout="constrained")
     FigureCanvasAgg(fig)
     panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
@@ -41,7 +41,7 @@ def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
     panels[1].axvline(1.0, color=_INK, lw=1.0)
     shown = groups
     if theirs:
-        shown = [*groups, *(row for row in rows if row.name == POOLED)]
+        shown = [*groups, *(row for row in rows if row.pooled)]
         _ratios(panels[2], shown)
     panels[0].set_yticks(range(len(shown)), [f"{row.name} ({row.recordings})" for row in shown])
     panels[0].set_ylim(len(shown) - 0.5, -0.5)

@@ -32,7 +32,7 @@ from stario.sequences.sequence import ImuSequence
 By = Literal["set", "group", "person", "device", "place", "carry"]
 
 POOLED = "all"
-"""The row over all sets, each counting alike."""
+"""Name of the row over all sets, each counting alike; a group may be called so, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,7 @@ class Row:
         medians: over recordings by the name of the weights and by figure.
         ratios: of errors over 1, 10 and 30 s, ours over theirs, by figure; without weights to
             compare with empty. Of waypoints the residuals stand in for 10 s.
+        pooled: whether it is over all groups.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Row:
     path_km: float
     medians: dict[str, dict[str, float]]
     ratios: dict[str, Interval]
+    pooled: bool = False
 
 
 def check_by(name: str) -> By:
@@ -138,9 +140,10 @@ def rows_of(judged: Sequence[Judged], by: By, ours: str, theirs: str | None) -> 
     """
     names = sorted({one.labels[by] for one in judged})
     parts = [(name, [one for one in judged if one.labels[by] == name]) for name in names]
-    if len(parts) > 1:
-        parts.append((POOLED, list(judged)))
-    return [_row(name, part, ours, theirs) for name, part in parts]
+    rows = [_row(name, part, ours, theirs) for name, part in parts]
+    if len(rows) > 1:
+        rows.append(replace(_row(POOLED, judged, ours, theirs), pooled=True))
+    return rows
 
 
 def _row(name: str, part: Sequence[Judged], ours: str, theirs: str | None) -> Row:

@@ -9,7 +9,7 @@ from pathlib import Path
 from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.judging.displacement_error import FIGURES
 from stario.fusion.evaluation.judging.figure import groups_figure
-from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row
+from stario.fusion.evaluation.judging.judge import Judged, Row
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.files import write_json, write_rows
@@ -89,8 +89,9 @@ def verdict(rows: Sequence[Row]) -> str:
 
     Taken is what is surely better over all and nowhere worse by more than a tenth.
     """
-    ratios = {row.name: row.ratios[_DECIDES] for row in rows if _DECIDES in row.ratios}
-    pooled = ratios.pop(POOLED, None)
+    told = [row for row in rows if _DECIDES in row.ratios]
+    ratios = {row.name: row.ratios[_DECIDES] for row in told if not row.pooled}
+    pooled = next((row.ratios[_DECIDES] for row in told if row.pooled), None)
     if pooled is None:
         return ""
     worst = max(ratios, key=lambda name: ratios[name].ratio)
@@ -99,8 +100,8 @@ def verdict(rows: Sequence[Row]) -> str:
         return (
             f"not decided, {len(ratios)} groups are too few: over all {_interval(pooled)} in 10 s"
         )
-    told = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
-    return f"{'taken' if taken else 'not taken'}: {told}"
+    words = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
+    return f"{'taken' if taken else 'not taken'}: {words}"
 
 
 def judgement_dict(found: Judgement) -> dict[str, object]:

@@ -13,6 +13,7 @@ from recorded import DATA
 
 from stario.fusion.evaluation.judging.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
+from stario.fusion.evaluation.judging.figure import groups_figure
 from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row, judge, rows_of
 from stario.fusion.evaluation.judging.network_alone import answers
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
@@ -273,6 +274,21 @@ def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path
 
 def test_two_groups_decide_nothing() -> None:
     better = Interval(0.8, 0.7, 0.9)
-    rows = [Row(name, 5, 1.0, {}, {"rms_10s_m": better}) for name in ("a", "b", POOLED)]
+    rows = [Row(name, 5, 1.0, {}, {"rms_10s_m": better}) for name in ("a", "b")]
+    rows.append(Row(POOLED, 5, 1.0, {}, {"rms_10s_m": better}, pooled=True))
     assert verdict(rows).startswith("not decided")
     assert verdict([*rows, Row("c", 5, 1.0, {}, {"rms_10s_m": better})]).startswith("taken")
+
+
+def test_a_group_may_be_called_all(walk: ImuSequence) -> None:
+    judged = [
+        replace(one, labels=one.labels | {"person": person})
+        for one, person in zip(judged_pair(walk), ("a", POOLED), strict=True)
+    ]
+    rows = rows_of(judged, "person", "ours", "theirs")
+    assert [(row.name, row.pooled) for row in rows] == [("a", False), ("all", False), ("all", True)]
+    assert verdict(rows).startswith("not decided, 2 groups")
+    assert len(groups_figure(rows, "ours", "theirs").axes[0].get_yticks()) == 3
+    alone = rows_of(judged[1:], "person", "ours", "theirs")
+    assert verdict(alone) == ""
+    assert len(groups_figure(alone, "ours", "theirs").axes[0].get_yticks()) == 1
