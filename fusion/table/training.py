@@ -108,6 +108,7 @@ def train_cell(
         trained_on=material.words,
         legs=material.legs,
         validation_legs=kept.legs,
+        chosen_by_legs=not kept.streams,
     )
     clock.keep()
     history = json.loads((folder / "log.json").read_text(encoding="utf-8"))

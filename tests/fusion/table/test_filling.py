@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import pickle
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -25,6 +27,7 @@ from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.sequence import ImuSequence, PositionTrack
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
@@ -64,6 +67,37 @@ def test_a_cell_leaves_model_errors_and_tracks(
     assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
         (total / count / 2) ** 0.5
     )
+
+
+def test_where_only_waypoints_are_real_they_alone_choose(
+    dataset: DataSet, make_walk: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen: list[bool] = []
+
+    def trained(*arguments: Any, chosen_by_legs: bool = False, **rest: Any) -> None:
+        chosen.append(chosen_by_legs)
+        raise InputError("stop", "enough", "no training")
+
+    def waypoints(path: Path) -> ImuSequence:
+        walk = read_recording(path)
+        assert walk.truth is not None
+        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
+        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
+        return replace(walk, truth=None, positions=track)
+
+    long = [tmp_path / f"walk{seed}.csv" for seed in range(3)]
+    for seed, path in enumerate(long):
+        write_csv(path, make_walk(seed=seed, seconds=16.0))
+    monkeypatch.setattr(training, "train", trained)
+    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
+    recipe = cell_recipe(RECIPE, "DeepILS", 0, 1)
+    for files, read in ((long, waypoints), (long, read_recording)):
+        alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
+        with pytest.raises(InputError, match="stop"):
+            training.train_cell(
+                alone, recipe, tmp_path, Reading(read, {}, tmp_path / read.__name__)
+            )
+    assert chosen == [True, False]
 
 
 def test_a_killed_cell_goes_on_and_ends_the_same(
