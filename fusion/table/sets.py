@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -37,6 +38,8 @@ TITLES = {
     "ilc": "Indoor Location",
     ALL: "All together, left out by group",
 }
+
+Key = TypeVar("Key")
 
 _VALIDATION_SHARE = 0.05
 """Of each set's recordings outside the groups that are left out."""
@@ -109,9 +112,7 @@ def _single(name: str, recordings: Iterable[Listed], seed: int) -> DataSet:
 
 def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
     """The paper's split, by walks: two phones on one walk stay together."""
-    walks: dict[Path, list[Listed]] = {}
-    for one in recordings:
-        walks.setdefault(one.path.with_name(_walk(one.path.name)), []).append(one)
+    walks = _by(recordings, _walk)
     split = random_split(walks, seed)
 
     def members(part: tuple[Path, ...]) -> list[Listed]:
@@ -126,9 +127,9 @@ def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
     )
 
 
-def _walk(name: str) -> str:
+def _walk(one: Listed) -> Path:
     """KIPD's S9 and S20 recordings of one name are two phones on one walk."""
-    return re.sub(r"(?<=\w)S(9|20)$", "", name)
+    return one.path.with_name(re.sub(r"(?<=\w)S(9|20)$", "", one.path.name))
 
 
 def _together(data: Path, seed: int, per_group: int) -> DataSet:
@@ -138,9 +139,10 @@ def _together(data: Path, seed: int, per_group: int) -> DataSet:
     outside = [one for one in listed("all", data) if one.path not in held]
     rng = np.random.default_rng(seed)
     validation = {
-        members[k].path
+        one.path
         for members in _by(outside, _set_of).values()
-        for k in rng.permutation(len(members))[: max(1, round(_VALIDATION_SHARE * len(members)))]
+        for walk in _some(list(_by(members, _walk).values()), rng)
+        for one in walk
     }
     test = [
         Listed(one.path, name)
@@ -153,8 +155,8 @@ def _together(data: Path, seed: int, per_group: int) -> DataSet:
         tuple(one.path for one in outside if one.path in validation),
         tuple(Listed(one.path, _set_of(one)) for one in test),
         f"people, devices and places of the list `holdout` test, at most {per_group} recordings "
-        f"of each; of the others {_VALIDATION_SHARE:.0%} of each set at random, seed {seed}, "
-        "validate",
+        f"of each; of the others {_VALIDATION_SHARE:.0%} of each set's walks at random, "
+        f"seed {seed}, validate",
     )
 
 
@@ -162,8 +164,14 @@ def _set_of(one: Listed) -> str:
     return one.group.split(" ")[0]
 
 
-def _by(recordings: Iterable[Listed], key: Callable[[Listed], str]) -> dict[str, list[Listed]]:
-    parts: dict[str, list[Listed]] = {}
+def _some(walks: list[list[Listed]], rng: np.random.Generator) -> list[list[Listed]]:
+    """Those that validate."""
+    count = max(1, round(_VALIDATION_SHARE * len(walks)))
+    return [walks[k] for k in rng.permutation(len(walks))[:count]]
+
+
+def _by(recordings: Iterable[Listed], key: Callable[[Listed], Key]) -> dict[Key, list[Listed]]:
+    parts: dict[Key, list[Listed]] = {}
     for one in recordings:
         parts.setdefault(key(one), []).append(one)
     return parts

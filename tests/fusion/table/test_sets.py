@@ -37,6 +37,18 @@ def test_two_phones_on_one_walk_stay_together() -> None:
             assert all(walks.count(walk) == 2 for walk in walks)
 
 
+def test_two_phones_on_one_walk_validate_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    phones = [Listed(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")]
+    held = [Listed(Path("ridi.h5:dan"), "ridi dan")]
+    parts = {"all": [*phones, *held], "test": [], "holdout": held}
+    monkeypatch.setattr(sets, "listed", lambda name, data: parts[name])
+    for seed in range(9):
+        [together] = development_sets(Path(), seed, 2, [ALL])
+        names = [path.name.removesuffix("S9").removesuffix("S20") for path in together.validation]
+        assert len(names) == 2
+        assert len(set(names)) == 1
+
+
 @needs_data
 def test_sets_that_matter_come_first_and_no_part_meets_another() -> None:
     found = development_sets(DATA, 0, 2)
