@@ -107,6 +107,8 @@ def train(
     first = load_model(start_from) if start_from else None  # before anything takes time
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
+    if data is not None and reading.where:
+        raise InputError("--where", "with --data", "with PATH alone", "name the archive instead")
     recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
     )

@@ -220,6 +220,13 @@ def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_
     assert trained_on == ["recorded, others: 0 min"]  # nothing simulated, no licence known
 
 
+def test_lists_in_the_package_are_not_chosen_from_by_attributes(stario) -> None:
+    """They would all be learned from, whatever the option says."""
+    stario("train", "--data", "data", "--where", "person=dan").assert_one_line_error(
+        "--where: found with --data"
+    )
+
+
 def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
     stario("train", "missing.csv").assert_one_line_error("missing.csv", "nothing there")
     assert not (tmp_path / "runs").exists()
