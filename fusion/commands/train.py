@@ -207,6 +207,7 @@ def _recorded(
     files, missing = reading.recordings(paths)
     held_files, held_missing = reading.recordings(validation)
     files, held_files = files + lists[0], held_files + lists[1]
+    _check_apart(files, held_files)
     recordings, failed = streams_of(files)
     held_out, held_failed = streams_of(held_files)
     skipped = missing + failed + held_missing + held_failed
@@ -215,6 +216,17 @@ def _recorded(
     if held_files or not files:
         return recordings, held_out, skipped
     return *split_off(recordings), skipped
+
+
+def _check_apart(files: list[Path], held_files: list[Path]) -> None:
+    """Refuse a recording that is learned from and kept: it would say that all is learned."""
+    kept = {path.resolve() for path in held_files}
+    both = [path for path in files if path.resolve() in kept]
+    if both:
+        raise InputError(
+            "--validation", f"{both[0]}, which is learned from", "other recordings",
+            "leave it out; without --validation the last fifth of each recording is kept",
+        )  # fmt: skip
 
 
 def _streams_of(
