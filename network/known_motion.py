@@ -32,6 +32,13 @@ STEP_SECONDS = 5.0
 """Length of the stretches whose step rate is told [s]."""
 
 _CENTRES = 200
+_WINDOWS_OF_CENTRE = 20
+"""Windows without overlap for each centre: of fewer the centres are the windows themselves, and
+nothing else is near them."""
+
+_LEAST_WINDOWS = 60
+"""Of so many on, a minute, it is told what is known."""
+
 _MOST_WINDOWS = 20_000
 _AT_ONCE = 256
 _WALKING = 0.3
@@ -154,22 +161,26 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
 
 def known_motion(
     streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
-) -> KnownMotion:
-    """What weights know that were trained on these streams.
+) -> KnownMotion | None:
+    """What weights know that were trained on these streams, None of less than a minute of them.
 
     Args:
-        streams: with full truth; at least a window in all.
+        streams: with full truth.
         legs: with weak truth.
         seed: of the choice of windows and of the first centres.
     """
     imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
+    count = sum(len(imu) // WINDOW_SAMPLES for imu in imus)
+    if count < _LEAST_WINDOWS:
+        return None
     stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
     values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
     told = {
         "step_rate": np.concatenate([step_rates(imu) for imu in imus]),
         "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
-    centres, limit = _centres(described(values), seed)
+    most = min(_CENTRES, count // _WINDOWS_OF_CENTRE)
+    centres, limit = _centres(described(values), most, seed)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
 
@@ -188,12 +199,14 @@ def _speeds(stream: WorldStream, stride: int) -> FloatArray:
     return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
 
 
-def _centres(known: FloatArray, seed: int) -> tuple[tuple[tuple[float, ...], ...], float]:
+def _centres(
+    known: FloatArray, count: int, seed: int
+) -> tuple[tuple[tuple[float, ...], ...], float]:
     from scipy.cluster.vq import kmeans2, vq
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a centre that no window is nearest to
-        found, _ = kmeans2(known, min(_CENTRES, len(known)), minit="points", seed=seed)
+        found, _ = kmeans2(known, count, minit="points", seed=seed)
     rounded = np.round(found, 3)
     limit = max(float(np.percentile(vq(known, rounded)[1], _PERCENTILE)), 1e-3)
     return tuple(tuple(row) for row in rounded.tolist()), limit

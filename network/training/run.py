@@ -286,7 +286,7 @@ class TrainingRun:
         held_out: ValidationSet,
         trained_on: list[str],
         kept: Calibration | None,
-        known: KnownMotion,
+        known: KnownMotion | None,
     ) -> Path:
         """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
         path = self.folder / "model.safetensors"

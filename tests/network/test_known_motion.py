@@ -42,9 +42,25 @@ def windows(stream: WorldStream) -> np.ndarray:
     return stream.imu_W[: 200 * count].reshape(count, 200, 6).transpose(0, 2, 1)
 
 
+def known_of(*streams: WorldStream) -> KnownMotion:
+    known = known_motion(streams)
+    assert known is not None
+    return known
+
+
 @pytest.fixture(scope="module")
 def known() -> KnownMotion:
-    return known_motion([walked(seed, rate=1.6 + 0.1 * seed) for seed in range(5)])
+    return known_of(*(walked(seed, rate=1.6 + 0.1 * seed) for seed in range(5)))
+
+
+def test_a_short_walk_knows_its_own_gait_and_a_scrap_nothing() -> None:
+    """With a centre for each window every other window, of the same walk even, was strange."""
+    walk = walked(0, seconds=140.0)
+    known = known_of(walk.part(0, 70 * 200))
+    assert len(known.centres) == 3
+    assert np.mean(known.strangeness(windows(walk.part(70 * 200, len(walk)))) > 1.0) < 0.2
+    assert np.mean(known.strangeness(windows(walked(1, size=4.0))) > 1.0) > 0.9
+    assert known_motion([walk.part(0, 50 * 200)]) is None
 
 
 def test_of_familiar_motion_about_one_window_in_twenty_lies_outside(known: KnownMotion) -> None:

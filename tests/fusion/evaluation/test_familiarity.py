@@ -28,6 +28,7 @@ def simulated(seconds: float = 30.0, sensor: int = 9) -> ImuSequence:
 @pytest.fixture(scope="module")
 def model() -> DisplacementModel:
     known = known_motion([s for sensor in range(3) for s in world_streams(simulated(60.0, sensor))])
+    assert known is not None
     return knowing(known)
 
 
