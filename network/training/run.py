@@ -294,9 +294,11 @@ class TrainingRun:
             return path
         self.averaged.load_state_dict(self.best)
         residuals, log_sigma = held_out.residuals(self.averaged)
+        # Predictions for what is not known are widened besides: not once more by the calibration.
+        widened = 1.0 if known is None else held_out.variance_factors(known)[:, None]
         card = Card(
             architecture=self.config.architecture,
-            calibration=kept or calibrate(residuals, log_sigma),
+            calibration=kept or calibrate(residuals / np.sqrt(widened), log_sigma),
             trained_on=trained_on,
             recipe=json.loads(json.dumps(asdict(self.config))),
             figures={"validation_mse_m2": held_out.errors(self.averaged, residuals)},

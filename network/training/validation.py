@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
+from stario.network.known_motion import KnownMotion
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.weak_truth import LegBatch, LegSampler, by_kind, leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
@@ -32,6 +35,9 @@ VALIDATION_STRIDE = 20
 
 _DENSE_SAMPLES = 200 * 60 * 15
 """Of so many samples or less every window at that stride is asked."""
+
+_AT_ONCE = 256
+"""Windows in a batch."""
 
 _STRETCHES = 48
 """Of each kind of weak truth."""
@@ -76,16 +82,32 @@ class ValidationSet:
         errors, log_sigmas = [], []
         for stream in self.streams:
             answer = _Answers(network, self.stride)
-            starts = window_starts(stream, self.stride)
-            for first in range(0, len(starts), answer.batch):
-                windows, target = windows_at(stream, starts[first : first + answer.batch])
-                heading = headings_at(stream.facing_W, starts[first : first + answer.batch])
-                windows = turned_windows(windows, -heading)
-                target = about_z(-heading).apply(target).astype(np.float32)
+            for windows, target in self._cut(stream, answer.batch):
                 mean, log_sigma = answer(torch.from_numpy(windows).to(self.device))
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
+
+    def variance_factors(self, known: KnownMotion) -> FloatArray:
+        """By which predictions for the windows (M,) of `residuals` are widened."""
+        return np.concatenate(
+            [
+                known.variance_factor(windows)
+                for stream in self.streams
+                for windows, _ in self._cut(stream, _AT_ONCE)
+            ]
+        )
+
+    def _cut(
+        self, stream: WorldStream, batch: int
+    ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """Windows (B, 6, 200) and displacements (B, 3) [m] in H, in order of time."""
+        starts = window_starts(stream, self.stride)
+        for first in range(0, len(starts), batch):
+            windows, target = windows_at(stream, starts[first : first + batch])
+            heading = headings_at(stream.facing_W, starts[first : first + batch])
+            windows = turned_windows(windows, -heading)
+            yield windows, about_z(-heading).apply(target).astype(np.float32)
 
     def errors(
         self, network: DisplacementNetwork, residuals: np.ndarray | None = None
@@ -144,7 +166,7 @@ class _Answers:
     def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
         # Windows that begin within one second belong to series of their own, as in use.
-        self.batch = max(1, WINDOW_SAMPLES // stride) if network.remembers else 256
+        self.batch = max(1, WINDOW_SAMPLES // stride) if network.remembers else _AT_ONCE
         self._state = network.first_state(self.batch) if network.remembers else None
 
     def __call__(self, windows: Tensor) -> tuple[Tensor, Tensor]:

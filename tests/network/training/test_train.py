@@ -14,6 +14,7 @@ from cut_windows import windows_of
 from stario.network.architectures import build_network
 from stario.network.card import Calibration, card_path
 from stario.network.displacement import DisplacementNetwork
+from stario.network.known_motion import OUTSIDE_VARIANCE
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import (
@@ -112,6 +113,25 @@ def test_the_model_predicts_what_it_was_validated_on(
         assert error == pytest.approx(kept, rel=1e-3)
         # What is kept is the best epoch of the likelihood's, not the last one of all.
         assert any(kept == r.validation_by_recording[stream.name] for r in reports[2:])
+
+
+def test_sigma_is_calibrated_as_it_is_predicted(tmp_path: Path) -> None:
+    """Validated on what is strange to the weights: predictions are widened, and yet as they err.
+
+    A squared error counts up to 25 of its variances, as in the calibration.
+    """
+    streams = [swaying("a", 0.3, 40.0), swaying("b", 1.2, 40.0)]
+    strange = swaying("c", 0.8, 30.0)
+    strange.imu_W[:, :3] = np.random.default_rng(0).standard_normal((6000, 3))
+    path = train(replace(TINY, epochs=2), streams, [1.0, 1.0], [strange], tmp_path)
+    model = load_model(path)
+    assert model.card.known_motion is not None
+    windows, truth = windows_of(strange, 20)
+    assert model.card.known_motion.variance_factor(windows).min() == OUTSIDE_VARIANCE
+    mean, covariance = model.predict(windows)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    normalised = np.minimum((mean - truth) ** 2 / variance, 25.0)
+    assert normalised[:, :2].mean() == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_likelihood_teaches_sigma(finished: tuple[Path, list[EpochReport]]) -> None:
