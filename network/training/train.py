@@ -80,7 +80,9 @@ def train(
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
-        held_out = ValidationSet(validation, run.device, validation_legs, config, chosen_by_legs)
+        held_out = ValidationSet(
+            validation, run.device, validation_legs, config, chosen_by_legs, run.network.remembers
+        )
         while run.step < config.steps and not run.has_settled():
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)

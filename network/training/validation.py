@@ -33,6 +33,9 @@ log = logging.getLogger(__name__)
 VALIDATION_STRIDE = 20
 """Samples from the start of a window to the next one's."""
 
+_STRIDES = (20, 40, 50, 100, 200)
+"""For networks that remember: so, a window follows one a second before, as in use."""
+
 _DENSE_SAMPLES = 200 * 60 * 15
 """Of so many samples or less every window at that stride is asked."""
 
@@ -52,6 +55,7 @@ class ValidationSet:
         legs: of recordings kept from training, with weak truth.
         config: says how stretches of them are drawn.
         chosen_by_legs: whether weights are chosen by the legs alone, where there are some.
+        remembers: whether the networks that are asked remember earlier windows.
 
     Raises:
         InputError: no stream is longer than a second.
@@ -64,12 +68,18 @@ class ValidationSet:
         legs: Sequence[LegStream] = (),
         config: TrainingConfig | None = None,
         chosen_by_legs: bool = False,
+        remembers: bool = False,
     ) -> None:
-        self.streams, self.device, self._chosen_by_legs = streams, device, chosen_by_legs
+        self.device, self._chosen_by_legs = device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
         # Hours of them are cut sparsely: what matters is the kinds of motion.
         length = sum(len(stream) for stream in streams)
         self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
+        if remembers:
+            thinned = max(s for s in _STRIDES if s <= self.stride)
+            every, self.stride = self.stride // thinned, thinned
+            streams = _minutes(streams, every) if every > 1 else streams
+        self.streams = streams
         counts = [len(window_starts(stream, self.stride)) for stream in streams]
         if not sum(counts):
             raise InputError("validation", "no window", "stretches longer than a second")
@@ -136,6 +146,16 @@ class ValidationSet:
         mean, log_sigma = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
+
+
+def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
+    """The first minute of each stream, and each so many minutes the next."""
+    minute = 60 * WINDOW_SAMPLES
+    return [
+        stream.part(first, first + minute)
+        for stream in streams
+        for first in range(0, len(stream), every * minute)
+    ]
 
 
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:

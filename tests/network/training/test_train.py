@@ -357,6 +357,24 @@ def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -
         train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
 
 
+@pytest.mark.parametrize(("dense", "stride", "minutes"), [(200, 40, 7), (140, 50, 7), (15, 200, 4)])
+def test_hours_are_validated_a_second_apart_by_a_network_that_remembers(
+    monkeypatch: pytest.MonkeyPatch, dense: int, stride: int, minutes: int
+) -> None:
+    """Of seven minutes in two recordings the first and every so many are asked."""
+    monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
+    streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
+    cpu = torch.device("cpu")
+    held_out = ValidationSet(streams, cpu, remembers=True)
+    assert held_out.stride == stride
+    seconds = sum(len(stream) for stream in held_out.streams) / 200
+    assert seconds == 60 * minutes
+    assert list(dict.fromkeys(held_out.names)) == ["a", "b"]
+    others = ValidationSet(streams, cpu)
+    assert others.streams is streams
+    assert others.stride == 20 * max(1, 420 // dense)
+
+
 def build_network_of(config: TrainingConfig) -> torch.nn.Module:
     torch.manual_seed(config.seed)
     return build_network(config.architecture)
