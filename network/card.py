@@ -28,6 +28,9 @@ FRAMES = (FRAME, "gravity-aligned, z up, yaw arbitrary")
 MAX_SIGMA = 5.0
 """Nobody walks further in a second: a larger sigma [m] says nothing more."""
 
+_STEEPEST = 10.0
+"""An exponent beyond any that a calibration finds."""
+
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 
 
@@ -41,7 +44,7 @@ class Calibration:
     Attributes:
         scale: factors on the network's sigma.
         exponent: powers of the network's sigma.
-        floor: smallest sigma [m].
+        floor: smallest sigma [m], above 0.
     """
 
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -142,6 +145,9 @@ def parse_card(text: str, path: Path) -> Card:
     """
     try:
         content = json.loads(text)
+        missing = {f.name for f in fields(Card)} - {"known_motion", *content}
+        if missing:
+            raise ValueError(f"no {sorted(missing)[0]!r}")
         calibration = _calibration(content.pop("calibration"))
         known = content.pop("known_motion", None)
         known = None if known is None else known_from(known)
@@ -165,6 +171,10 @@ def _calibration(content: dict[str, list[float]]) -> Calibration:
     for name, values in content.items():
         if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
             raise ValueError(f"calibration.{name} {values!r}")
+    if min(content["floor"]) <= 0.0:
+        raise ValueError(f"calibration.floor {content['floor']!r}, a covariance of 0")
+    if max(content["exponent"]) > _STEEPEST:
+        raise ValueError(f"calibration.exponent {content['exponent']!r}, above {_STEEPEST:g}")
     return Calibration(**{name: (x, y, z) for name, (x, y, z) in content.items()})
 
 

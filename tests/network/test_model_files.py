@@ -65,6 +65,26 @@ def test_a_card_that_does_not_match_is_refused(model: Path, field: str, value: o
     assert field in refused(model)
 
 
+@pytest.mark.parametrize(
+    ("part", "value", "words"),
+    [("floor", 0.0, "a covariance of 0"), ("exponent", 1e300, "above 10")],
+)
+def test_a_calibration_that_makes_no_covariance_is_refused(
+    model: Path, part: str, value: float, words: str
+) -> None:
+    calibration = json.loads(card_path(DEFAULT).read_text(encoding="utf-8"))["calibration"]
+    spoil_card(model, calibration=calibration | {part: [0.5, 0.5, value]})
+    assert words in refused(model)
+
+
+@pytest.mark.parametrize("field", ["format", "outputs", "rate", "samples", "frame", "channels"])
+def test_what_a_card_does_not_say_is_not_guessed(model: Path, field: str) -> None:
+    content = json.loads(card_path(model).read_text(encoding="utf-8"))
+    del content[field]
+    card_path(model).write_text(json.dumps(content), encoding="utf-8")
+    assert f"no {field!r}" in refused(model)
+
+
 def test_the_unspoilt_copy_loads(model: Path) -> None:
     assert load_model(model).name == "StarIO"
     assert load_model(str(model)).name == "StarIO"
