@@ -20,6 +20,7 @@ from stario.fusion.commands.options import (
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
     from stario.network.training.data import Recorded
     from stario.sequences.datasets.batch import Skipped
@@ -32,7 +33,10 @@ def train(
     paths: PathsArgument = None,
     model: Annotated[
         str | None,
-        typer.Option("--model", help="Network to train, as `stario check models` names it."),
+        typer.Option(
+            "--model",
+            help="Network to train, as `stario check models` names it; else that of --start-from.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -103,8 +107,8 @@ def train(
     from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
 
-    recipe = _recipe(config, architecture=model, epochs=epochs, seed=seed)
     first = load_model(start_from) if start_from else None  # before anything takes time
+    recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     if data is not None and reading.where:
@@ -161,11 +165,22 @@ def train(
         leave_with_skipped(skipped)
 
 
-def _recipe(path: Path | None, **over: int | str | None) -> TrainingConfig:
+def _recipe(
+    path: Path | None, first: DisplacementModel | None, **over: int | str | None
+) -> TrainingConfig:
     from stario.network.training.config import training_config
 
-    values = {} if path is None else recipe_values(path)
-    return training_config(values | {k: v for k, v in over.items() if v is not None})
+    values = {} if first is None else {"architecture": first.card.architecture}
+    values |= {} if path is None else recipe_values(path)
+    recipe = training_config(values | {k: v for k, v in over.items() if v is not None})
+    if first is not None and first.card.architecture != recipe.architecture:
+        raise InputError(
+            "--start-from",
+            f"weights of {first.card.architecture}",
+            recipe.architecture,
+            "leave out --model, or name weights of that network",
+        )
+    return recipe
 
 
 def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:

@@ -212,6 +212,19 @@ def test_training_goes_on_past_what_fails_and_keeps_its_windows(
     assert first == second
 
 
+def test_weights_to_start_from_say_which_network_it_is(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
+    call = ("train", recording, "--recorded-only", "--config", "tiny.json")
+    assert stario(*call, "--model", "R-ResNet", "--out", "first").code == 0
+    first = ("--start-from", "first/model.safetensors")
+    assert stario(*call, *first, "--out", "second").code == 0
+    card = json.loads((tmp_path / "second/model.json").read_text())
+    assert card["architecture"] == "R-ResNet"
+    stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", "R-ResNet")
+
+
 def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
     done = stario("train", recording, "--recorded-only", "--config", "tiny.json", "--out", "alone")
