@@ -7,7 +7,8 @@
                 tf         map -> odom -> base_link (REP 105)
 
 `odom` is continuous (`Navigator.continuous`): it drifts, but neither updates nor fixes make it
-jump, so that controllers may use it. What they correct goes into map -> odom. Metres, radians,
+jump, so that controllers may use it; only behind a gap in the samples, of which nothing is known,
+it goes on elsewhere. What fixes correct goes into map -> odom. Metres, radians,
 quaternions x y z w (REP 103). `base_link` is the IMU's frame here; where it is not, publish its
 static transform and name the IMU's frame instead.
 
@@ -85,6 +86,7 @@ class OdometryBridge:
         self._navigator = navigator
         self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom, moved with the map
         self._first_ns: int | None = None
+        self._last: ContinuousPose | None = None
 
     def imu(self, message: Any) -> Odometry | None:
         """A sensor_msgs/Imu; odometry when it completed an update."""
@@ -95,7 +97,15 @@ class OdometryBridge:
         gyro = (rate.x, rate.y, rate.z)
         time = (stamp_ns - self._first_ns) / 1e9
         state = self._navigator.push(time, gyro, (force.x, force.y, force.z))
-        return None if state is None else self._odometry(state, np.array(gyro))
+        if state is None:
+            return None
+        if self._last is not None and self._last.map_frame != state.map_frame:
+            # A fix that waited for its time moved the map: base_link went on as it did.
+            dt = state.time - self._last.time
+            turned = _attitude(self._last) * Rotation.from_rotvec(dt * np.array(gyro))
+            self._follow(Transform(turned, self._last.p_W + dt * self._last.v_W), state)
+        self._last = self._navigator.continuous
+        return self._odometry(state, np.array(gyro))
 
     def fix(self, message: Any) -> None:
         """A geometry_msgs/PoseWithCovarianceStamped in map, for its position."""
@@ -110,9 +120,13 @@ class OdometryBridge:
         after = self._navigator.state
         if after.map_frame == before.map_frame:
             return  # an ordinary correction, which is bled in
-        # The map was moved: base_link stays where it was in odom, which stays level (REP 105).
-        stays = (self._frame.inverse() @ Transform(_attitude(steady), steady.p_W)).p
-        turn = about_z(float(yaw_of(_attitude(after) * _attitude(before).inv())[0]))
+        self._follow(Transform(_attitude(before), steady.p_W), after)
+        self._last = self._navigator.continuous
+
+    def _follow(self, before: Transform, after: NavState) -> None:
+        """The map was moved: base_link stays where it was in odom, which stays level (REP 105)."""
+        stays = (self._frame.inverse() @ before).p
+        turn = about_z(float(yaw_of(_attitude(after) * before.R.inv())[0]))
         R = turn * self._frame.R
         self._frame = Transform(R, after.p_W - R.apply(stays))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.changed import changed
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
@@ -60,4 +61,11 @@ def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
         missing = state.p_W - carried
         part = -math.expm1(-dt / BLEED_SECONDS) * missing
         p_W = carried + part * min(1.0, LARGEST_STEP / max(float(np.linalg.norm(part)), 1e-12))
-    return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, state.p_W - p_W, state.map_frame)
+    correction_W = state.p_W - p_W
+    return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, correction_W, state.map_frame)
+
+
+def copied(pose: ContinuousPose) -> ContinuousPose:
+    """One with arrays of its own: whoever gets it may write to them."""
+    arrays = {k: v.copy() for k, v in vars(pose).items() if isinstance(v, np.ndarray)}
+    return changed(pose, **arrays)

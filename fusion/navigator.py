@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
 from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.continuous import ContinuousPose, advanced
+from stario.fusion.continuous import ContinuousPose, advanced, copied
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.front_end import FrontEnd
@@ -121,8 +121,8 @@ class Navigator:
         """Take in a magnetic field of the stream, before the IMU's samples that follow it.
 
         Its bearing tells the gyroscope's bias about the vertical; steel and magnets are judged by
-        size, dip and consistency (`filter.magnetic`). Fields that are not finite, repeated or late
-        are dropped and counted. Without fields nothing changes.
+        size, dip and consistency (`filter.magnetic`). Fields that are not finite, repeated, or late
+        by more than a tenth of a second are dropped and counted. Without fields nothing changes.
 
         Args:
             time: [s], on the IMU's clock.
@@ -145,7 +145,7 @@ class Navigator:
         Args:
             time: [s], on the samples' clock.
             p_W: (3,) [m].
-            covariance: (3, 3) [m^2].
+            covariance: (3, 3) [m^2]; a large variance, such as 1e6, for a height that is not known.
 
         Raises:
             InputError: a value has another shape.
@@ -153,7 +153,10 @@ class Navigator:
         self._take(position_fix(time, p_W, covariance))
 
     def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> None:
-        """A velocity fix (3,) [m/s] with covariance (3, 3); else as `update_position`."""
+        """A velocity fix (3,) [m/s] in W with covariance (3, 3); else as `update_position`.
+
+        What is measured along the body's axes, as by wheels, is turned by the attitude first.
+        """
         self._take(velocity_fix(time, v_W, covariance))
 
     def update_yaw(self, time: float, yaw: float, sigma: float) -> None:
@@ -172,7 +175,7 @@ class Navigator:
     @property
     def continuous(self) -> ContinuousPose | None:
         """The newest pose without the steps of updates; None before the first second is over."""
-        return self._continuous
+        return None if self._continuous is None else copied(self._continuous)
 
     @property
     def smoothed(self) -> SmoothedPose | None:
@@ -309,7 +312,7 @@ class Navigator:
             (displacement,) = displacements_of(self._network, [interval], self._front_end.counts)
         self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         state = self._estimator.nav_state()
-        self._continuous = advanced(self._continuous, state)
+        self._continuous = copied(advanced(self._continuous, state))  # the state is the caller's
         return state
 
     def _take(self, fix: Fix) -> None:
@@ -317,6 +320,10 @@ class Navigator:
             self._fixes.add(fix)
         elif self._estimator.late_fix(fix) is None:
             self._fixes.refuse("too late")
+        elif self._continuous is not None:
+            state = self._estimator.nav_state()
+            if state.map_frame != self._continuous.map_frame:
+                self._continuous = advanced(self._continuous, state)
 
     def _check_gyro(self, interval: ImuInterval) -> None:
         try:

@@ -47,8 +47,9 @@ fusion.filter.innovations fusion.filter.magnetic fusion.filter.map_frame fusion.
 fusion.filter.seen_positions fusion.filter.zero_velocity
 fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
 fusion.graph.keyframes fusion.graph.whitening
-fusion.imu.field_buffer fusion.imu.front_end fusion.imu.gyro_unit fusion.imu.intervals
-fusion.imu.outliers fusion.imu.preintegration fusion.imu.set_back fusion.imu.window_buffer
+fusion.imu.field_buffer fusion.imu.frozen fusion.imu.front_end fusion.imu.gyro_unit
+fusion.imu.intervals fusion.imu.outliers fusion.imu.preintegration fusion.imu.set_back
+fusion.imu.window_buffer
 sequences.noise sequences.attitude.levelling
 """
 """Modules whose classes a snapshot may hold: plain data, made anew from their attributes."""

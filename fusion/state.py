@@ -20,7 +20,7 @@ class NavState:
         time: [s].
         R_WB: (3, 3) attitude, body to world.
         v_W: (3,) velocity [m/s].
-        p_W: (3,) position [m], zero at the start.
+        p_W: (3,) position [m]; zero at the start, until a fix places the track.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         covariance: (15, 15) of rotation about W's axes [rad], velocity, position, b_g, b_a; each
@@ -139,8 +139,8 @@ class Health:
             they told north.
         accel_noise_factor: of the accelerometer's noise to the configured density at the end, as
             the innovations tell.
-        final_sigma: standard deviations at the end: tilt and yaw [rad], velocity [m/s], position
-            [m], biases [rad/s], [m/s^2].
+        final_sigma: standard deviations at the end, the largest of the axes: tilt and yaw [rad],
+            velocity [m/s], position in the plane and height [m], biases [rad/s], [m/s^2].
         notes: one line each on what else went on, such as a graph that fell back to the filter.
     """
 

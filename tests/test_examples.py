@@ -180,6 +180,24 @@ def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("ahead_ns", [0, 30_000_000])
+def test_ros2_node_follows_a_map_that_is_moved_by_a_fix_of_now(ahead_ns):
+    """It waits for the sample of its time, and is taken in between two odometries."""
+    from stario.fusion import Navigator
+
+    example = load("ros2_node")
+    bridge = example.OdometryBridge(Navigator(load_model("default")))
+    outputs = []
+    for message in example.demonstration_messages(8.0):
+        found = bridge.imu(message)
+        outputs += [] if found is None else [found]
+        if found is not None and len(outputs) in (20, 60):
+            seen = np.array([1e5, 5e6, 0.0]) + 2.0 * found.odom_base.p[[1, 0, 2]]
+            bridge.fix(fix_at(found.stamp_ns + ahead_ns, seen, 0.05))
+    assert np.linalg.norm(outputs[-1].map_odom.p) > 4e6
+    check_odometry(outputs, largest_step=0.5)
+
+
 BAGS = sorted(DATA.glob("raw/rosbag/*.bag"))
 
 

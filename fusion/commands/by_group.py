@@ -61,7 +61,7 @@ def fixes(
     reading: Reading,
     estimating: Estimating,
     every: Annotated[float, typer.Option(min=0.1, help="Seconds between two fixes.")] = 5.0,
-    sigma: Annotated[float, typer.Option(min=0.001, help="Their error per axis [m].")] = 0.3,
+    sigma: Annotated[float, typer.Option(min=0.001, help="Their error per axis \\[m].")] = 0.3,
     backend: BackendOption = "ekf",
     by: ByOption = "set",
     as_json: JsonOption = False,

@@ -30,8 +30,8 @@ FixesOption = Annotated[
     Path | None,
     typer.Option(
         "--fixes",
-        help="CSV of absolute fixes with columns t, kind, x, y, z, sx, sy, sz: position [m], "
-        "velocity [m/s] or yaw [rad] (in x), and their sigmas.",
+        help="CSV of absolute fixes with columns t, kind, x, y, z, sx, sy, sz: position \\[m], "
+        "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas.",
     ),
 ]
 BackendOption = Annotated[str, typer.Option(help="What fuses: ekf, or graph.")]
@@ -142,7 +142,11 @@ class Estimating:
         Path | None, typer.Option("--config", help="TOML or JSON file with settings of the filter.")
     ] = None
     model: Annotated[
-        str, typer.Option("--model", help="Weights: default, or a safetensors file with its card.")
+        str,
+        typer.Option(
+            "--model",
+            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file.",
+        ),
     ] = "default"
     magnetometer: Annotated[
         bool,

@@ -77,7 +77,8 @@ def train(
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs, over the file's.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, over the file's.")] = None,
     start_from: Annotated[
-        str | None, typer.Option(help="Weights to start from: default, or a safetensors file.")
+        str | None,
+        typer.Option(help="Weights to start from: default, another name, or a safetensors file."),
     ] = None,
     last_stage: Annotated[
         str | None,

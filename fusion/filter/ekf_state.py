@@ -295,8 +295,8 @@ def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
             e.X[:, :3],
             e.X[:, 3],
             e.X[:, 4] + e.origin_W,
-            e.b_g,
-            e.b_a,
+            e.b_g.copy(),  # they are the filter's own
+            e.b_a.copy(),
             covariance,
             e.in_gap,
             e.map_frame,

@@ -42,9 +42,9 @@ _WIDEST = 0.015
 _AT_REST = 2.5e-3
 """Where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
-_PATIENCE, _RAW = 10.0, 0.1
+_PATIENCE, _RAW = 30.0, 0.1
 """What looks like rest for so long [s] is rest, though the gyroscope reads up to this [rad/s]: of
-what is raw about the vertical gravity tells nothing."""
+what is raw about the vertical gravity tells nothing, and nobody turns so long so evenly."""
 
 _ROUNDING = 1e-6
 """Of times [s]."""

@@ -81,7 +81,8 @@ class UpdateCounts:
             "tilt_rad": sigma[0:2],
             "yaw_rad": sigma[2:3],
             "velocity_m_s": sigma[3:6],
-            "position_m": sigma[6:9],
+            "position_m": sigma[6:8],
+            "height_m": sigma[8:9],
             "gyro_bias_rad_s": sigma[9:12],
             "accel_bias_m_s2": sigma[12:15],
         }

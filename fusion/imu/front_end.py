@@ -24,6 +24,7 @@ import numpy as np
 from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.field_buffer import FieldBuffer
+from stario.fusion.imu.frozen import FrozenWatch
 from stario.fusion.imu.gyro_unit import GyroUnitWatch
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.outliers import Flags, OutlierDetector
@@ -71,6 +72,7 @@ class FrontEnd:
         self._before_long_gap: Sample | None = None
         self._fields = FieldBuffer()
         self._late = SetBackWatch()
+        self._frozen = FrozenWatch(config.gravity)
         self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
         self.counts = SampleCounts()
@@ -86,6 +88,9 @@ class FrontEnd:
         time = sample[0]
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < ABSURD):
             self.counts.not_finite += 1
+            return []
+        if self._frozen.look(sample):
+            self.counts.frozen += 1
             return []
         if self._ahead and time > self._newest:
             self._drop_ahead(time)

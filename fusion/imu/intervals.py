@@ -106,6 +106,7 @@ class SampleCounts:
     Attributes:
         used: samples taken in.
         not_finite: dropped for a value that is not a number, infinite or absurdly large.
+        frozen: dropped for repeating all values of those before, though not at rest.
         duplicate: dropped for repeating the newest time.
         out_of_order: dropped for a time before the newest.
         future: dropped for a time ahead of those that followed.
@@ -122,6 +123,7 @@ class SampleCounts:
 
     used: int = 0
     not_finite: int = 0
+    frozen: int = 0
     duplicate: int = 0
     out_of_order: int = 0
     future: int = 0
@@ -143,7 +145,7 @@ class SampleCounts:
 
     def health(self) -> Health:
         """The part of the report that tells of the samples."""
-        names = ("used", "not_finite", "duplicate", "out_of_order", "future")
+        names = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
         return Health(
             samples={name: getattr(self, name) for name in names},
             flagged={"spike": self.spike, "saturated": self.saturated},

@@ -51,3 +51,35 @@ def test_a_stream_that_is_corrected_does_not_step(walk: ImuSequence, make_oracle
     stepped = np.diff(corrected, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
     assert np.linalg.norm(stepped, axis=1).max() > 2.0 * LARGEST_STEP
     assert np.linalg.norm(poses[-1].correction_W) < 0.5
+
+
+def test_a_late_fix_that_moves_the_map_moves_it_at_once(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
+    for row in zip(walk.time[:600], walk.gyro[:600], walk.accel[:600], strict=True):
+        navigator.push(*row)
+    navigator.update_position(walk.time[590], [1e5, 5e6, 0.0], np.eye(3))
+    assert navigator.continuous is not None
+    assert navigator.state is not None
+    assert navigator.continuous.map_frame == navigator.state.map_frame == 1
+    np.testing.assert_allclose(navigator.continuous.p_W, navigator.state.p_W)
+
+
+def test_what_is_given_out_may_be_written_to(walk: ImuSequence, make_oracle: Make) -> None:
+    ends = []
+    for spoilt in (False, True):
+        navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
+        for row in zip(walk.time[:800], walk.gyro[:800], walk.accel[:800], strict=True):
+            state = navigator.push(*row)
+            if state is not None and spoilt:
+                assert navigator.continuous is not None
+                for given in (state, navigator.continuous, navigator.state):
+                    for value in vars(given).values():
+                        if isinstance(value, np.ndarray):
+                            value *= 57.3
+        assert navigator.state is not None
+        assert navigator.continuous is not None
+        ends.append((navigator.state.p_W, navigator.state.b_g, navigator.continuous.p_W))
+    for clean, written in zip(*ends, strict=True):
+        np.testing.assert_array_equal(clean, written)

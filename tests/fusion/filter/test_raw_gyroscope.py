@@ -52,7 +52,7 @@ def test_the_doubt_grows_without_a_jump(make_walk, make_oracle) -> None:
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_what_looks_like_rest_for_long_is_rest(still_model, backend) -> None:
     """Flat on a table: gravity tells nothing of a raw bias about the vertical."""
-    rng, n, bias = np.random.default_rng(1), 3000, np.array([0.002, -0.001, 0.05])
+    rng, n, bias = np.random.default_rng(1), 4500, np.array([0.002, -0.001, 0.05])
     gyro = bias + rng.normal(0.0, 2e-3, (n, 3))
     accel = np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.02, (n, 3))
     still = ImuSequence(name="table", time=np.arange(n) / 100.0, gyro=gyro, accel=accel)

@@ -59,3 +59,11 @@ def test_fields_may_come_some_seconds_before_their_samples() -> None:
         for k in range(60):
             assert buffer.add(3.0 * batch + 0.05 * k, FIELD_B, now=3.0 * batch - 0.01)
         assert buffer.at(3.0 * batch + 0.12) is not None
+
+
+def test_a_field_that_comes_too_late_for_any_interval_is_told() -> None:
+    buffer = FieldBuffer()
+    assert buffer.add(1.0, FIELD_B, 1.0)
+    assert buffer.at(1.5) is None
+    assert not buffer.add(1.3, FIELD_B, 1.5)
+    assert buffer.add(1.45, FIELD_B, 1.5)
