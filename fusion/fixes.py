@@ -8,6 +8,7 @@ a level device the direction its x axis points to, counter-clockwise from the ma
 from __future__ import annotations
 
 import bisect
+import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -20,6 +21,8 @@ from stario.fusion.state import Health
 from stario.sequences.sequence import FloatArray
 
 FixKind = Literal["position", "yaw", "velocity"]
+
+log = logging.getLogger(__name__)
 
 LARGEST_YAW = 20.0 * math.pi
 """Beyond this a yaw [rad] is in other units, or no yaw at all."""
@@ -154,8 +157,10 @@ class FixQueue:
         return due
 
     def refuse(self, reason: str, count: int = 1) -> None:
-        """Count fixes that were left out."""
+        """Count fixes that were left out; the first of a kind is told."""
         if count:
+            if reason not in self.refused:
+                log.warning("a fix is left out: %s", reason)
             self.refused[reason] = self.refused.get(reason, 0) + count
 
     def start(self, time: float) -> None:

@@ -100,8 +100,9 @@ class Navigator:
                 is not in seconds; gyro or accel does not hold three; the first second's average
                 force cannot be gravity in m/s^2, or its rate is not about 50 Hz to 1 kHz; gyro
                 cannot be in rad/s, which shows once the device turns; or the clock was set back
-                for seconds. From the first second's force on the stream then begins anew, behind
-                a clock that was set back without prior and fixes.
+                by five seconds and more (by less, samples are late until it has caught up). From
+                the first second's force on the stream then begins anew, behind a clock that was
+                set back without prior and fixes.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
@@ -264,6 +265,9 @@ class Navigator:
             InputError: as for `run`.
         """
         check_type("sequence", sequence, ImuSequence, "read_recording(path) gives one")
+        if not callable(progress):
+            fix = "fixes are given by name: fixes=[...]"
+            raise InputError("progress", f"{progress!r:.60}", "a function of the share done", fix)
         return preprocess(sequence, self.model, self.config, progress)
 
     def track(

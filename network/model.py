@@ -184,6 +184,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
         WeightsError: the file or its card is missing, cut short, or they do not match.
         InputError: an ONNX file, but onnxruntime is not installed.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise InputError("name_or_path", f"{name_or_path!r:.60}", f"{packaged_names()}, or a file")
     path = Path(name_or_path)
     if path.suffix == ".onnx":
         from stario.network.runtime.onnx_file import load_onnx

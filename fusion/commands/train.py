@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from stario.sequences.windows import Attitude
 
 
+_GENERATED = 150
+"""Simulated walks beside the recordings."""
+
+
 @grouped
 def train(
     reading: Reading,
@@ -67,7 +71,9 @@ def train(
         str | None,
         typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
     ] = None,
-    generated: Annotated[int, typer.Option(min=0, help="Number of generated walks of 60 s.")] = 150,
+    generated: Annotated[
+        int | None, typer.Option(min=0, help=f"Generated walks of 60 s; {_GENERATED} if not said.")
+    ] = None,
     recorded_only: Annotated[
         bool, typer.Option("--recorded-only", help="Learn from no simulated walk at all.")
     ] = False,
@@ -110,6 +116,9 @@ def train(
 
     first = load_model(start_from) if start_from else None  # before anything takes time
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
+    if not paths and data is None and generated is None:
+        raise InputError("PATH", "none", "recordings, --data, or --generated for walks alone")
+    walks = 0 if recorded_only else _GENERATED if generated is None else generated
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     if data is not None and reading.where:
@@ -121,7 +130,7 @@ def train(
     make_folder(out)
     material = gather(
         recorded + held_out if last_stage is not None else recorded,
-        cached_walks(0 if recorded_only else generated, recipe.seed, folder, recipe.attitude),
+        cached_walks(walks, recipe.seed, folder, recipe.attitude),
         recipe.shares,
         recipe.reach,
     )

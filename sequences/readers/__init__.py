@@ -142,6 +142,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         InputError: the format's name is unknown, or it does not take an option.
         ReadError: nothing is there, no format fits, or the content is malformed.
     """
+    if not isinstance(path, str | Path):
+        raise InputError("path", f"{path!r:.60}", "the path of a recording")
     path = Path(path)
     if format != "auto" and format not in FORMATS:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from support import GRAPH
 
-from stario.fusion import FilterConfig, Navigator, NavigatorConfig, PriorPose, position_fix
-from stario.sequences import StarioError
+from stario.fusion import (
+    FilterConfig,
+    Navigator,
+    NavigatorConfig,
+    PriorPose,
+    position_fix,
+    yaw_fix,
+)
+from stario.network import load_model
+from stario.sequences import StarioError, read_recording
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
@@ -129,3 +137,14 @@ def test_a_stream_too_slow_or_too_fast_is_refused_as_a_recording_is(
     for k in range(300):
         navigator.push(100.0 + k / 100.0, np.zeros(3), [0.0, 0.0, 9.81])
     assert navigator.state is not None
+
+
+def test_arguments_in_each_others_place_are_named(still_model: Any, make_walk: Make) -> None:
+    walk = make_walk(1, 3.0)
+    with pytest.raises(InputError, match=r"progress.*fixes="):
+        Navigator(still_model).run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]
+    for wrong in (None, 3):
+        with pytest.raises(InputError, match="path"):
+            read_recording(wrong)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="name_or_path"):
+            load_model(wrong)  # type: ignore[arg-type]
