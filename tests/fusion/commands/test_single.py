@@ -416,7 +416,8 @@ def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: P
         (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
         (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
-        (["train", "--out", "RECORDING"], ["folder"]),
+        (["train"], ["PATH", "--data"]),
+        (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
 )
