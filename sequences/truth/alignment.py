@@ -30,6 +30,7 @@ _STRIDES_S = (0.03, 0.1, 0.25, 0.5)
 _FLIP_RAD = np.deg2rad(15.0)
 _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
+_SILENT_S = 0.5
 _MIN_PIECE_S = 1.0
 _MIN_FIT_S = 10.0
 _LAG_STEP_S = 0.0025
@@ -94,13 +95,13 @@ def align_tracked_body(
     pieces = _pieces(time, attitude_WV, attitude_B, valid)
     start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
     _check_length("capture that agrees with the gyroscope", time[start:stop])
-    mounts = _mounts(time, attitude_WV, attitude_B, pieces)
+    mounts = _mounts(time, attitude_WV, gyro_B, pieces)
     kept = np.zeros_like(valid)
     for start, stop in pieces:
         kept[start:stop] = valid[start:stop]
     lag += _lag_by_axes(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept)
     time = truth_time + lag
-    mounts = _mounts(time, attitude_WV, gyro_B.attitude(time), pieces)
+    mounts = _mounts(time, attitude_WV, gyro_B, pieces)
     force_B, rate_B = interpolated(time, imu_time, accel), interpolated(time, imu_time, gyro)
     attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     if position_WV is not None:
@@ -170,6 +171,12 @@ class _GyroIntegral:
         return Rotation.from_quat(self._quat[left]) * Rotation.from_rotvec(
             self._rate[left] * tau[:, None]
         )
+
+    def silent(self, start: float, stop: float) -> bool:
+        """Whether samples are missing for too long between two times to carry an attitude over."""
+        first, last = np.searchsorted(self.time, [start, stop])
+        inside = self.time[max(first - 1, 0) : last + 1]
+        return bool(np.diff(inside).max(initial=0.0) > _SILENT_S)
 
     def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
         """Mean rate [rad/s] from each of M times to the one `stride` later (M - stride, 3)."""
@@ -276,10 +283,14 @@ def _pieces(
 def _mounts(
     time: FloatArray,
     attitude_WV: Rotation,
-    attitude_B: Rotation,
+    gyro_B: _GyroIntegral,
     pieces: list[tuple[int, int]],
 ) -> list[Rotation]:
-    """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not."""
+    """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not.
+
+    What was turned while the gyroscope was silent is no flip: behind its gaps nothing is carried.
+    """
+    attitude_B = gyro_B.attitude(time)
     fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
     longest = int(np.argmax([stop - start for start, stop in pieces]))
     mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
@@ -287,13 +298,19 @@ def _mounts(
     order += [(k, k + 1) for k in range(longest - 1, -1, -1)]
     for k, neighbour in order:
         here, there = _facing_ends(pieces[k], pieces[neighbour])
-        across = attitude_B[there].inv() * attitude_B[here]
-        carried = attitude_WV[here].inv() * attitude_WV[there] * mounts[neighbour] * across
-        same = (mounts[neighbour].inv() * carried).magnitude() < _SAME_MOUNT_RAD
-        fit = fitted[k]
-        agrees = fit is not None and (fit.inv() * carried).magnitude() < _SAME_MOUNT_RAD
-        mounts[k] = mounts[neighbour] if same else (fit if agrees and fit else carried)
+        mount, fit = mounts[neighbour], fitted[k]
+        carried = fit or mount
+        if not gyro_B.silent(*sorted((time[here], time[there]))):
+            across = attitude_B[there].inv() * attitude_B[here]
+            carried = attitude_WV[here].inv() * attitude_WV[there] * mount * across
+        same = _alike(mount, carried) or (fit is not None and _alike(mount, fit))
+        agrees = fit is not None and _alike(fit, carried)
+        mounts[k] = mount if same else (fit if agrees and fit else carried)
     return [mounts[k] for k in range(len(pieces))]
+
+
+def _alike(mount: Rotation, other: Rotation) -> bool:
+    return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
 
 
 def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[int, int]:

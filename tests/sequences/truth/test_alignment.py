@@ -127,3 +127,28 @@ def test_single_frames_turned_about_any_axis_are_masked() -> None:
     )
     assert not aligned.valid[struck].any()
     assert aligned.valid.mean() > 0.99
+
+
+@pytest.mark.parametrize("silent", [(50.0, 53.0), (50.0, 61.0), (113.0, 115.0)])
+@pytest.mark.parametrize("flips", [False, True])
+def test_what_turns_while_the_imu_is_silent_is_no_flip(
+    silent: tuple[float, float], flips: bool
+) -> None:
+    """Behind it the mount is the one before; one that flips where the IMU sees it is another."""
+    imu, truth = recorded("handheld")
+    _, attitude_WV = captured(truth, 0.004)
+    late = truth.time > 30.0
+    if flips:
+        quat = attitude_WV.as_quat()
+        quat[late] = (attitude_WV[late] * Rotation.from_rotvec([0.0, 0.0, np.pi])).as_quat()
+        attitude_WV = Rotation.from_quat(quat)
+    kept = (imu.time < silent[0]) | (imu.time > silent[1])
+    seen = (truth.time < silent[0]) | (truth.time > silent[1])
+    aligned = align_tracked_body(
+        imu.time[kept], imu.gyro[kept], imu.accel[kept], truth.time, attitude_WV, seen
+    )
+    assert len(aligned.mounts) == 2 + flips
+    error = (truth.attitude_WB.inv() * aligned.attitude_WB)[seen].magnitude()
+    assert np.degrees(np.median(error[truth.time[seen] > silent[1]])) < 1.5
+    assert np.degrees(np.median(error[truth.time[seen] < silent[0]])) < 1.5
+    assert aligned.correlation > 0.95
