@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.evaluation.judging.network_alone import UPDATES, Answers
 from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.state import Track
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream, levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -82,7 +83,7 @@ class PedestrianDeadReckoning:
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:
-    """The track of a recording, levelled from the IMU; it stands during gaps.
+    """The track of a recording, levelled from the IMU; it stands during gaps and keeps its heading.
 
     Raises:
         InputError: there is no unbroken stretch of 2 s, or the rate is not accepted.
@@ -91,16 +92,20 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
-    places, end = [], 0j
+    places, attitudes, end, facing = [], [], 0j, 0j
     for stream in streams:
-        place = end + pedestrian_path(stream)
+        faces = stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1]
+        # Each begins at a yaw of its own: nobody saw what was turned in the gap, so nothing was.
+        turn = float(np.angle(facing * np.conj(faces[0])))
+        place = end + np.exp(1j * turn) * pedestrian_path(stream)
         places.append(place[::TICK_SAMPLES])
-        end = place[-1]
+        attitudes.append(about_z(turn) * Rotation.from_matrix(stream.R_NB))
+        end, facing = place[-1], np.exp(1j * turn) * faces[-1]
     xy = np.concatenate(places)
     trajectory = Trajectory(
         time=np.concatenate([stream.ticks for stream in streams]),
         position_W=np.stack([xy.real, xy.imag, np.zeros(len(xy))], axis=1),
-        attitude_WB=Rotation.from_matrix(np.concatenate([stream.R_NB for stream in streams])),
+        attitude_WB=Rotation.concatenate(attitudes),
     )
     return Track(trajectory, seconds_filter=perf_counter() - began)
 

@@ -16,7 +16,7 @@ from stario.fusion.evaluation.pedestrian import (
     steps_of,
 )
 from stario.sequences.accuracy.metrics import evaluate_track
-from stario.sequences.attitude.rotations import about_z
+from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
@@ -95,3 +95,19 @@ def test_a_gap_leaves_the_track_where_it_was() -> None:
     before, after = track.position_W[track.time < 8.0][-1], track.position_W[track.time > 12.0][0]
     assert np.linalg.norm(after - before) < 1.0
     assert np.linalg.norm(track.position_W[-1]) > 12.0
+
+
+def test_the_heading_is_carried_over_a_gap() -> None:
+    """Straight on, a quarter turn, straight on; the gap lies in the straight part behind it."""
+    time = np.arange(0.0, 40.0, 0.01)
+    rate = np.where((time > 10.0) & (time < 12.0), 0.25 * np.pi, 0.0)
+    phase = 2.0 * np.pi * RATE * time
+    accel = np.stack([-np.sin(phase), 0.0 * phase, STANDARD_GRAVITY + SIZE * np.cos(phase)], axis=1)
+    gyro = np.stack([0.0 * rate, 0.0 * rate, rate], axis=1)
+    kept = (time < 20.0) | (time > 21.0)
+    track = pedestrian_track(ImuSequence("g", time[kept], gyro[kept], accel[kept])).trajectory
+    for part in (slice(14.0, 19.0), slice(23.0, 39.0)):
+        inside = (track.time > part.start) & (track.time < part.stop)
+        moved = np.ptp(track.position_W[inside], axis=0)
+        assert moved[0] < 0.2 * moved[1]
+        np.testing.assert_allclose(yaw_of(track.attitude_WB[inside]), 0.5 * np.pi, atol=0.05)
