@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
+
 import numpy as np
 
-from stario.sequences.sequence import ABSURD, BoolArray, FloatArray, ImuSequence
+from stario.sequences.sequence import ABSURD, MAX_IMU_GAP, BoolArray, FloatArray, ImuSequence
+
+_log = logging.getLogger(__name__)
 
 _OUT_OF_ORDER = 0.05
 """Beyond this share of steps that go back the rows are in disorder."""
@@ -34,6 +39,27 @@ def disorder(time: FloatArray) -> str:
     back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
     many = back > _OUT_OF_ORDER * len(time)
     return f"{back} of {len(time)} times before the one above" if many else ""
+
+
+def in_order(sequence: ImuSequence) -> ImuSequence:
+    """The recording sorted by time where many rows are out of order, each by little.
+
+    Some loggers write what comes within a few milliseconds in any order: left out, as a few are, a
+    twentieth of the samples were lost. Rows that lie far off are of no order to be guessed.
+    """
+    time = sequence.time
+    if not disorder(time):
+        return sequence
+    back = float((np.maximum.accumulate(time) - time).max())
+    if not back < MAX_IMU_GAP:
+        return sequence
+    _log.warning(
+        "%s: %s, by %.0f ms at most: sorted by time", sequence.name, disorder(time), 1e3 * back
+    )
+    order = np.argsort(time, kind="stable")
+    return replace(
+        sequence, time=time[order], gyro=sequence.gyro[order], accel=sequence.accel[order]
+    )
 
 
 def usable(sequence: ImuSequence) -> BoolArray:

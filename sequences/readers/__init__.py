@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
     Where,
     archive_members,
@@ -156,7 +157,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
             raise InputError(option, f"an option of a {name} recording", known)
-    sequence = FORMATS[name].read(path, **options)
+    sequence = in_order(FORMATS[name].read(path, **options))
     return sequence if sequence.source else replace(sequence, source=FORMATS[name].words)
 
 
