@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.samples import disorder
+from stario.sequences.inspection.samples import dead_gyro, disorder
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import fit_truth
 from stario.sequences.units import GYRO_UNITS, TIME_UNITS
@@ -70,8 +70,8 @@ def check_units(sequence: ImuSequence) -> None:
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, the gyroscope is
-            in deg/s, the accelerometer is in g, lacks gravity or has its sign turned (known only
-            where there is a true attitude). The text names the option that mends it.
+            dead or in deg/s, the accelerometer is in g, lacks gravity or has its sign turned
+            (known only where there is a true attitude). The text names the option that mends it.
     """
     _check_content(sequence)
     _check_time(sequence)
@@ -80,6 +80,11 @@ def check_units(sequence: ImuSequence) -> None:
         raise InputError(
             f"{sequence.name}: duration", f"{time[-1] - time[0]:.2f} s", f"at least {MIN_SECONDS} s"
         )
+    if dead_gyro(time, gyro, accel):
+        raise InputError(
+            f"{sequence.name}: gyroscope", "values that never change while the accelerometer moves",
+            "angular rates", "is another column meant?",
+        )  # fmt: skip
     pieces = _pieces(time)
     if pieces:  # else the gaps leave nothing to average over
         force = float(np.median(np.linalg.norm(accel, axis=1)))

@@ -6,8 +6,10 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import ABSURD, MAX_IMU_GAP, BoolArray, FloatArray, ImuSequence
+from stario.sequences.windows import runs
 
 _log = logging.getLogger(__name__)
 
@@ -16,6 +18,13 @@ _OUT_OF_ORDER = 0.05
 
 _SET_BACK = 5.0
 """A step back by more than this [s] is of a clock that was set."""
+
+_STUCK_S = 1.0
+"""A sensor whose values repeat exactly for so long [s] is stuck; recorded ones do for 0.1 s."""
+
+_SHAKEN_M_S2 = 0.5
+_TILTING_RAD_S = 0.1
+"""Scatter of the force, and of the rate across it, from which on a device moves."""
 
 
 def sample_problems(sequence: ImuSequence) -> list[str]:
@@ -31,7 +40,54 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
     wild = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if wild:
         problems.append(f"{sequence.name}: values that no sensor gives, in {wild} samples")
+    return problems + _stuck_problems(sequence)
+
+
+def _stuck_problems(sequence: ImuSequence) -> list[str]:
+    """Which sensor repeats itself while the other moves; a `dead_gyro` is left to `check_units`."""
+    given = usable(sequence) & np.isfinite(sequence.time)
+    time, gyro, accel = sequence.time[given], sequence.gyro[given], sequence.accel[given]
+    problems = []
+    for sensor, values, other, moves in (
+        ("gyroscope", gyro, "accelerometer", _shaken),
+        ("accelerometer", accel, "gyroscope", _tilting),
+    ):
+        repeated = np.asarray(~np.diff(values, axis=0).any(axis=1))
+        stuck = [
+            (float(time[a] - time[0]), float(time[b] - time[0]))
+            for a, b in runs(repeated)
+            if time[b] - time[a] >= _STUCK_S
+            and moves(time[a : b + 1], gyro[a : b + 1], accel[a : b + 1])
+        ]
+        if stuck and not (moves is _shaken and repeated.all()):
+            start, stop = max(stuck, key=lambda stretch: stretch[1] - stretch[0])
+            problems.append(
+                f"{sequence.name}: {sensor}: its values repeat exactly for "
+                f"{sum(b - a for a, b in stuck):.1f} s while the {other} moves, "
+                f"longest from {start:.1f} to {stop:.1f} s"
+            )
     return problems
+
+
+def dead_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
+    """Whether the rate (n, 3) never changes and the force (n, 3) is that of another motion."""
+    return not np.diff(gyro, axis=0).any() and _shaken(time, gyro, accel)
+
+
+def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
+    """Whether a force (n, 3) is neither of a device at rest nor of one at the first rate.
+
+    Turning evenly it stays the same in the device's axes (a circle) or in the world's (in place).
+    """
+    turned = Rotation.from_rotvec(np.outer(time - time[0], gyro[0])).apply(accel)
+    scatter = min(float(np.linalg.norm(force.std(axis=0))) for force in (accel, turned))
+    return scatter > _SHAKEN_M_S2
+
+
+def _tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
+    """Whether a rate (n, 3) turns a force that stays the same in the device; an even one may."""
+    up = accel[0] / max(float(np.linalg.norm(accel[0])), 1e-9)
+    return float(np.linalg.norm(np.cross(gyro, up).std(axis=0))) > _TILTING_RAD_S
 
 
 def disorder(time: FloatArray) -> str:

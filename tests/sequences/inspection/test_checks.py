@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.conventions import with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -200,3 +201,39 @@ def test_a_clock_among_the_values_is_no_sensor() -> None:
         values = np.column_stack([clock, np.ones((len(walk), 2))])
         with pytest.raises(InputError, match=f"{name}: found 1.7e.18 on average, expected what"):
             check_units(replace(walk, **{name: values}))
+
+
+def test_a_gyroscope_that_never_changes_is_refused_while_the_accelerometer_moves(
+    walk: ImuSequence,
+) -> None:
+    for value in (0.0, 0.3):
+        dead = replace(walk, gyro=np.full_like(walk.gyro, value))
+        assert "gyroscope: found values that never change" in refused(dead)
+        assert len(inspect_recording(dead.without_truth()).problems) == 1
+
+
+def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
+    """Lying, in a circle, and in place about a leaning axis."""
+    time = np.arange(0.0, 20.0, 0.01)
+    turns = Rotation.from_rotvec(np.outer(time, [0.0, 0.5, 0.5]))
+    circle = np.tile([0.0, 1.5, STANDARD_GRAVITY], (len(time), 1))
+    for rate, accel in (
+        ([0.0, 0.0, 0.0], np.tile(UP, (len(time), 1))),
+        ([0.0, 0.0, 0.8], circle),
+        ([0.0, 0.5, 0.5], turns.apply(UP, inverse=True)),
+    ):
+        gyro = np.tile(rate, (len(time), 1)).astype(np.float64)
+        even = ImuSequence("even", time, gyro, accel)
+        check_units(even)
+        assert inspect_recording(even).problems == ()
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_a_sensor_that_repeats_itself_for_seconds_is_named(walk: ImuSequence, sensor: str) -> None:
+    values = getattr(walk, sensor).copy()
+    values[2000:2800], values[4000:4300] = values[2000], values[4000]
+    stuck = replace(walk, **{sensor: values}).without_truth()
+    (problem,) = (p for p in inspect_recording(stuck).problems if "repeat exactly" in p)
+    assert {"gyro": "gyroscope", "accel": "accelerometer"}[sensor] + ": its values" in problem
+    assert "from 10.0 to 14.0 s" in problem
+    assert "for 5.5 s" in problem
