@@ -99,9 +99,14 @@ class Comparison:
 
     @property
     def path_m(self) -> float | None:
-        """Length of the true path [m], None without truth."""
+        """Length of the true path [m] that the filter's track is held against, None without truth.
+
+        Horizontal and within the times compared, as the errors are.
+        """
         truth = self.sequence.truth
-        return None if truth is None else truth.path_length()
+        if truth is None:
+            return None
+        return evaluate_track(self.tracks["ekf"].trajectory, truth, alignment="none").path_m
 
     def as_dict(self) -> dict[str, object]:
         """The recording's entry in `metrics.json`."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
 from stario.fusion.evaluation import compare as compare_module
@@ -23,7 +24,7 @@ from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 KEYS = {
@@ -76,6 +77,21 @@ def folder(
     return path
 
 
+def test_the_path_is_that_of_the_times_compared_and_level(compared: Comparison) -> None:
+    """A truth that goes on behind the IMU, in a lift: neither counts in the errors."""
+    truth = compared.sequence.truth
+    assert truth is not None
+    lift = truth.position_W + np.outer(truth.time, [0.0, 0.0, 3.0])
+    after = truth.time[-1] + 1.0 + truth.time
+    longer = Trajectory(
+        np.concatenate([truth.time, after]),
+        np.concatenate([lift, lift]),
+        Rotation.concatenate([truth.attitude_WB, truth.attitude_WB]),
+    )
+    other = replace(compared, sequence=replace(compared.sequence, truth=longer))
+    assert other.path_m == pytest.approx(compared.path_m)
+
+
 def test_a_fit_takes_out_what_the_first_pose_turned(compared: Comparison) -> None:
     for name, figures in compared.metrics.items():
         first, fitted = figures["ate_m"], figures["ate_fit_m"]
@@ -112,7 +128,8 @@ def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> 
             assert set(figures) == KEYS
     entry = content["recordings"][walk.name]
     assert entry["duration_s"] == pytest.approx(20.0)
-    assert entry["path_m"] == pytest.approx(walk.truth.path_length())
+    level = replace(walk.truth, position_W=walk.truth.position_W * [1.0, 1.0, 0.0])
+    assert entry["path_m"] == pytest.approx(level.path_length(), rel=0.01)
     assert set(content["conventions"]) >= KEYS
 
 
