@@ -58,6 +58,9 @@ _G_RANGE = (0.8, 1.25)
 _FORCE_RANGE = (7.5, 12.5)
 """Average force of a recording in g and in m/s^2: sensors are off by a few percent, not by 25."""
 
+_UNIT_NAMED = "its unit is the one that the file names: is that right?"
+"""Where `with_units` takes no other."""
+
 _SAMPLES = 10_000
 """That are turned by the true attitude: more say nothing more of the average force."""
 
@@ -90,7 +93,8 @@ def check_units(sequence: ImuSequence) -> None:
         force = float(np.median(np.linalg.norm(accel, axis=1)))
         average = average_force(time, gyro, accel, pieces)
         in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
-        check_gyro(sequence.name, gyro, force, average, in_degrees)
+        known = "gyro" in sequence.converted
+        check_gyro(sequence.name, gyro, force, average, in_degrees, known)
         _check_force(sequence, force, average)
     _check_direction(sequence, time, accel)
 
@@ -132,7 +136,12 @@ def _check_time(sequence: ImuSequence) -> None:
 
 
 def check_gyro(
-    name: str, gyro: FloatArray, force: float, average: float, in_degrees: float
+    name: str,
+    gyro: FloatArray,
+    force: float,
+    average: float,
+    in_degrees: float,
+    unit_known: bool = False,
 ) -> None:
     """Refuse a gyroscope whose turns the accelerometer contradicts.
 
@@ -142,6 +151,7 @@ def check_gyro(
         force: median size of the specific force [m/s^2].
         average: `average_force` of it [m/s^2].
         in_degrees: the same with the gyroscope read as deg/s.
+        unit_known: from the file, which takes no option then.
 
     Raises:
         InputError: it cannot be in rad/s.
@@ -156,12 +166,12 @@ def check_gyro(
         seen += " that the accelerometer does not see"
     elif speed <= _FAST_RAD_S:
         return
-    raise InputError(
-        f"{name}: gyroscope",
-        seen,
-        "rad/s",
-        "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header",
-    )
+    fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
+    if speed <= _FAST_RAD_S:  # as fast as a hand turns it; in deg/s a device that lies still
+        fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
+    elif unit_known:
+        fix = _UNIT_NAMED
+    raise InputError(f"{name}: gyroscope", seen, "rad/s", fix)
 
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
@@ -186,8 +196,10 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
             field,
             f"an average of {average:.3g}",
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if an iPhone wrote it) "
-            "or write `ax [g]` in the CSV's header",
+            _UNIT_NAMED
+            if "accel" in sequence.converted
+            else "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if an iPhone "
+            "wrote it) or write `ax [g]` in the CSV's header",
         )
     if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
         raise InputError(
@@ -218,7 +230,9 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
             f"{sequence.name}: accelerometer",
             "a force that points down in the true attitude",
             "specific force: up at rest",
-            "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header",
+            _UNIT_NAMED
+            if "accel" in sequence.converted
+            else "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header",
         )
     raise InputError(
         f"{sequence.name}: truth's attitude",

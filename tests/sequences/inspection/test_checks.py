@@ -237,3 +237,25 @@ def test_a_sensor_that_repeats_itself_for_seconds_is_named(walk: ImuSequence, se
     assert {"gyro": "gyroscope", "accel": "accelerometer"}[sensor] + ": its values" in problem
     assert "from 10.0 to 14.0 s" in problem
     assert "for 5.5 s" in problem
+
+
+def test_turns_of_a_hand_that_the_accelerometer_does_not_see_are_no_degrees() -> None:
+    """At the ear it turns by 1.3 rad/s: its axes mixed up, deg/s are not the reason."""
+    style = WalkStyle(carry="call", preferred_speed=1.4, vigor=1.5)
+    walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1).without_truth()
+    text = refused(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
+    assert "does not see" in text
+    assert "--gyro-unit" not in text
+    assert "axes and signs" in text
+
+
+def test_no_option_is_named_that_the_file_refuses(walk: ImuSequence) -> None:
+    named = replace(walk, converted=frozenset({"gyro", "accel"}))
+    for spoiled in (
+        in_degrees(named),
+        replace(named, accel=named.accel / STANDARD_GRAVITY),
+        replace(named, accel=-named.accel),
+    ):
+        text = refused(spoiled)
+        assert "--" not in text
+        assert "the one that the file names" in text
