@@ -35,7 +35,8 @@ CONVENTIONS: dict[str, str] = {
     "path_m": "length of the true path [m] along 1 s chords, within the times compared",
     "duration_s": "time [s] between the first and the last pose compared",
     "alignment": "what is done to the estimate before: none; first (yaw and position of the first "
-    "common pose); yaw (least squares in yaw and position); tilt is never changed",
+    "common pose); yaw (least squares in yaw and position, at rest the attitudes' yaw); tilt "
+    "is never changed",
     "horizontal": "true: position errors and path in x and y alone; false: in x, y and z",
     "convention": "rms as said above; ronin averages the squares over coordinates too, as RoNIN's "
     "code does, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
@@ -63,6 +64,10 @@ class TrackMetrics:
     convention: Convention
     rte_interval_s: float
     rte_scaled: bool
+
+
+_PLACE_M = 0.05
+"""A track that stays within this of its middle [m] is of a device at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +124,7 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
         truth: where to.
         mode: "none"; "first", by yaw and position of the first common pose; "yaw", by the yaw and
             position of least squared position error (Horn 1987, restricted to the vertical axis).
+            Positions of a device that stays where it is tell no yaw: there it is the attitudes'.
 
     Raises:
         InputError: unknown mode, or no overlap.
@@ -133,7 +139,10 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     center, target = ours.mean(axis=0), theirs.mean(axis=0)
     x, y = (ours - center)[:, :2].T
     u, v = (theirs - target)[:, :2].T
-    yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
+    if min(np.hypot(x, y).max(), np.hypot(u, v).max()) < _PLACE_M:
+        yaw = -np.angle(np.exp(1j * errors.yaw).mean())
+    else:
+        yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
     return _moved(estimate, float(yaw), center, target)
 
 

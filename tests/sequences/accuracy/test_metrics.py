@@ -343,3 +343,19 @@ def test_nees_refuses_what_has_no_meaning():
         position_nees(walk(), walk())
     with pytest.raises(InputError, match="runs"):
         nees_bounds(3, 0)
+
+
+@pytest.mark.parametrize("poses", [1, 600])
+def test_positions_at_rest_tell_no_yaw(poses: int) -> None:
+    """A millimetre of noise turned the track by any angle; its attitudes know better."""
+    rng = np.random.default_rng(0)
+    time = np.arange(poses) / 10.0
+    about = np.linspace(0.0, 2.0 * np.pi, poses)
+    truth = Trajectory(time, 1e-3 * rng.normal(size=(poses, 3)), about_z(about))
+    if poses == 1:
+        truth = Trajectory(np.array([0.0, 0.05]), np.zeros((2, 3)), about_z(np.zeros(2)))
+    turned = about_z(np.full(poses, 3.0)) * truth.attitude_WB[:poses]
+    estimate = Trajectory(time, 1e-3 * rng.normal(size=(poses, 3)), turned)
+    found = evaluate_track(estimate, truth, alignment="yaw")
+    assert found.aye_rad < 1e-9
+    assert found.ate_m < 3e-3
