@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.fit import MAX_OFFSET_S, TruthFit
 from stario.sequences.truth.yaw_drift import YawDrift
 
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)
 _LEANING_RAD = math.radians(3.0)
-_ALIKE = 0.8
-"""Offset, misalignment, tilt and correlation from which a truth deserves a word."""
+"""Offset, misalignment and tilt from which a truth deserves a word."""
 
 
 def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
@@ -49,9 +48,11 @@ def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
 def fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
     """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
     field = f"{name}: truth"
-    if fit.correlation < _ALIKE:
+    if not fit.alike:
         return [
-            f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f})"
+            f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f}, "
+            f"{fit.agreeing:.0%} of the poses agree): clocks more than {MAX_OFFSET_S:.0f} s apart, "
+            "another walk, or an axis or sign of the gyroscope"
         ]
     problems = []
     if abs(fit.time_offset) > _LATE_S:

@@ -11,6 +11,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.truth.findings import fit_problems
 from stario.sequences.truth.fit import fit_truth
 
 
@@ -101,3 +102,18 @@ def test_too_little_to_compare_is_refused(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     with pytest.raises(InputError):
         fit_truth(replace(walk, truth=replace(truth, time=truth.time + 500.0)))
+
+
+@pytest.mark.parametrize(
+    "found", [{"time_offset": 4.97}, {"correlation": 0.87}, {"correlation": 0.94, "agreeing": 0.6}]
+)
+def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
+    walk: ImuSequence, found: dict[str, float]
+) -> None:
+    """An even gait is like itself some steps later, and a search ends somewhere."""
+    fit = fit_truth(with_axes(replace(walk, name="w"), "y,-x,z"))
+    assert fit.axes() == "-y,x,z"
+    other = replace(fit, **{"time_offset": -2.0} | found)
+    assert other.axes() is None
+    (problem,) = fit_problems("w", other, "")
+    assert "clocks more than 5 s apart, another walk" in problem
