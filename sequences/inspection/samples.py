@@ -22,6 +22,12 @@ _SET_BACK = 5.0
 _STUCK_S = 1.0
 """A sensor whose values repeat exactly for so long [s] is stuck; recorded ones do for 0.1 s."""
 
+_LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
+"""A sensor whose largest values are smaller is not at its limit: coarse digits repeat as well."""
+
+_OFTEN_AT_LIMIT = 0.005
+"""Share of samples from which on that deserves a word."""
+
 _SHAKEN_M_S2 = 0.5
 _TILTING_RAD_S = 0.1
 """Scatter of the force, and of the rate across it, from which on a device moves."""
@@ -40,7 +46,7 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
     wild = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if wild:
         problems.append(f"{sequence.name}: values that no sensor gives, in {wild} samples")
-    return problems + _stuck_problems(sequence)
+    return problems + _stuck_problems(sequence) + _limit_problems(sequence)
 
 
 def _stuck_problems(sequence: ImuSequence) -> list[str]:
@@ -65,6 +71,30 @@ def _stuck_problems(sequence: ImuSequence) -> list[str]:
                 f"{sequence.name}: {sensor}: its values repeat exactly for "
                 f"{sum(b - a for a, b in stuck):.1f} s while the {other} moves, "
                 f"longest from {start:.1f} to {stop:.1f} s"
+            )
+    return problems
+
+
+def _limit_problems(sequence: ImuSequence) -> list[str]:
+    """Which sensor is at its limit, by the values that repeat at an axis' largest size.
+
+    The rule of streams (`fusion.imu.outliers`), here with all of a recording to look at.
+    """
+    problems = []
+    given = usable(sequence)
+    for sensor, values, unit, large in (
+        ("gyroscope", sequence.gyro[given], "rad/s", _LARGE_RAD_S),
+        ("accelerometer", sequence.accel[given], "m/s^2", _LARGE_M_S2),
+    ):
+        size = np.abs(values)
+        largest = size.max(axis=0, initial=0.0)
+        at_limit = (values[1:] == values[:-1]) & (size[1:] >= largest) & (largest > large)
+        share = float(at_limit.any(axis=1).mean()) if len(at_limit) else 0.0
+        if share >= _OFTEN_AT_LIMIT:
+            limit = float(largest[at_limit.any(axis=0)].max())
+            problems.append(
+                f"{sequence.name}: {sensor}: {share:.1%} of its samples are at its limit of "
+                f"{limit:.3g} {unit}: what it missed nobody knows"
             )
     return problems
 

@@ -259,3 +259,19 @@ def test_no_option_is_named_that_the_file_refuses(walk: ImuSequence) -> None:
         text = refused(spoiled)
         assert "--" not in text
         assert "the one that the file names" in text
+
+
+def test_a_sensor_at_its_limit_is_named_with_its_share() -> None:
+    style = WalkStyle(carry="swinging", preferred_speed=1.6, vigor=1.5)
+    free = simulate_imu(generate_walk(2, 30.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
+    limits = {"gyro": 3.5, "accel": 16.0}
+    for sensor, limit in limits.items():
+        values = getattr(free, sensor)
+        share = float((np.abs(values) > limit).any(axis=1).mean())
+        assert share > 0.02
+        clipped = replace(free, **{sensor: np.clip(values, -limit, limit)})
+        (problem,) = (p for p in inspect_recording(clipped).problems if "limit" in p)
+        assert f"limit of {limit:.3g}" in problem
+        told = float(problem.split("%")[0].split()[-1]) / 100.0
+        assert 0.5 * share < told < share
+    assert not [p for p in inspect_recording(free).problems if "limit" in p]
