@@ -72,8 +72,9 @@ class MagneticFindings:
         spread_uT: its 10th and 90th percentile [uT].
         dip_rad: median angle below the horizontal [rad].
         correlation: between dm/dt and -w x (m - b), None where the device hardly turns.
-        lag_s: by which the samples are stamped late [s], None likewise.
-        hard_iron_uT: b (3,) [uT], None likewise.
+        lag_s: by which the samples are stamped late [s], None likewise and where it is beyond
+            what is looked for.
+        hard_iron_uT: b (3,) [uT], None where the lag is.
         hard_iron_sigma_uT: its deviation (3,) [uT].
         bearing_rms_rad: of the levelled bearing about its line within a minute, median [rad].
         drift_rad_s: that line's slope, median: the gyroscope's drift in yaw [rad/s].
@@ -131,10 +132,9 @@ class MagneticFindings:
             f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, {self.size_uT:.1f} uT "
             f"({low:.1f} to {high:.1f} in 80 %), dips by {math.degrees(self.dip_rad):.0f} deg"
         ]
-        if self.correlation is not None and self.lag_s is not None:
+        if self.correlation is not None:
             lines.append(
-                f"  against the gyroscope: correlation {self.correlation:.3f}, "
-                f"{1e3 * self.lag_s:+.0f} ms late{self._iron_words()}"
+                f"  against the gyroscope: correlation {self.correlation:.3f}, {self._lag_words()}"
             )
         lines.append(
             f"  levelled bearing: steady to {math.degrees(self.bearing_rms_rad):.1f} deg within a "
@@ -147,6 +147,12 @@ class MagneticFindings:
                 "the time: it counts for little there"
             )
         return lines
+
+    def _lag_words(self) -> str:
+        if self.lag_s is None:
+            first, last = (1e3 * lag for lag in (_LAGS_S[0], _LAGS_S[-1]))
+            return f"not within {first:+.0f} to {last:+.0f} ms late; lag and hard iron unknown"
+        return f"{1e3 * self.lag_s:+.0f} ms late{self._iron_words()}"
 
     def _iron_words(self) -> str:
         if self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
@@ -202,8 +208,11 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
 
 def _against_gyro(
     time: FloatArray, gyro: FloatArray, stamps: FloatArray, values: FloatArray
-) -> tuple[float, float, FloatArray, FloatArray] | None:
-    """Correlation, lag [s] and hard iron with its deviation [uT] by dm/dt = -w x (m - b)."""
+) -> tuple[float, float | None, FloatArray | None, FloatArray | None] | None:
+    """Correlation, lag [s] and hard iron with its deviation [uT] by dm/dt = -w x (m - b).
+
+    At the edge of the search the lag is not the best but the last, and iron takes on its error.
+    """
     edge = _SPAN_S + float(np.abs(_LAGS_S).max())
     grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
@@ -231,10 +240,11 @@ def _against_gyro(
 
     scores = np.array([fit(lag)[0] for lag in _LAGS_S])
     best = int(np.argmax(scores))
+    if best in (0, len(scores) - 1):
+        return float(scores[best]), None, None, None
+    a, b, c = scores[best - 1 : best + 2]
     lag = float(_LAGS_S[best])
-    if 0 < best < len(scores) - 1:
-        a, b, c = scores[best - 1 : best + 2]
-        lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
+    lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
 

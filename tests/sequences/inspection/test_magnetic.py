@@ -52,6 +52,19 @@ def test_size_dip_lag_iron_and_drift_come_back() -> None:
     assert "hard iron" in found.problems[0]
 
 
+@pytest.mark.parametrize("lag", [-0.08, 0.2])
+def test_a_lag_beyond_what_is_looked_for_is_not_told_as_measured(lag: float) -> None:
+    inspected = inspect_recording(walk(MagneticField(hard_iron=IRON, lag=lag)))
+    found = inspected.magnetic
+    assert found is not None
+    assert found.lag_s is None
+    assert found.hard_iron_uT is None
+    told = "\n".join(inspected.lines())
+    assert "not within -50 to +150 ms late" in told
+    assert "constant field" not in told
+    assert found.correlation is not None
+
+
 def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
     good = walk(MagneticField())
     assert good.magnetometer is not None
