@@ -229,8 +229,9 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         except InputError as error:
             if not problems:  # wrong units explain it
                 problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+    yaw = None if fit is None else yaw_drift(sequence, fit)
     if fit is not None:
-        problems += fit_problems(sequence.name, fit, " ".join(problems))
+        problems += fit_problems(sequence.name, fit, yaw, " ".join(problems))
     magnetic = _magnetic(sequence)
     problems += magnetic.problems if magnetic else ()
     return Inspection(
@@ -245,7 +246,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         truth=sequence.truth_words(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
-        yaw=None if fit is None else yaw_drift(sequence, fit),
+        yaw=yaw,
     )
 
 

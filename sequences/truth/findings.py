@@ -12,6 +12,9 @@ _TURNED_RAD = math.radians(5.0)
 _LEANING_RAD = math.radians(3.0)
 """Offset, misalignment and tilt from which a truth deserves a word."""
 
+_SCALED = 0.06
+"""Error of the gyroscope's scale that deserves one; of recorded phones it is 0.03 at most."""
+
 
 def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
     """As plain values, units in the names."""
@@ -38,14 +41,17 @@ def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
     ]
     if yaw is not None:
         lines.append(
-            f"  yaw: the gyroscope turns {100 * abs(yaw.scale):.1f} % too "
-            f"{'far' if yaw.scale > 0.0 else 'little'} and drifts by "
+            f"  yaw: the gyroscope {_scale_words(yaw)} and drifts by "
             f"{math.degrees(yaw.bias):+.3f} deg/s; {math.degrees(yaw.left):.1f} deg are left"
         )
     return lines
 
 
-def fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
+def _scale_words(yaw: YawDrift) -> str:
+    return f"turns {100 * abs(yaw.scale):.1f} % too {'far' if yaw.scale > 0.0 else 'little'}"
+
+
+def fit_problems(name: str, fit: TruthFit, yaw: YawDrift | None, known: str) -> list[str]:
     """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
     field = f"{name}: truth"
     if not fit.alike:
@@ -55,6 +61,9 @@ def fit_problems(name: str, fit: TruthFit, known: str) -> list[str]:
             "another walk, or an axis or sign of the gyroscope"
         ]
     problems = []
+    same_frames = fit.misalignment < _TURNED_RAD and fit.tilt < _LEANING_RAD  # else no yaw is told
+    if yaw is not None and abs(yaw.scale) > _SCALED and same_frames:
+        problems.append(f"{name}: gyroscope: {_scale_words(yaw)}, as the truth has it")
     if abs(fit.time_offset) > _LATE_S:
         problems.append(
             f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"

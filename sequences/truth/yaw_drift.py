@@ -24,7 +24,7 @@ from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
 _LEAST_TURNED_RAD = 0.3
-"""Deviation of the yaw from an even turning below which scale and bias cannot be told apart."""
+"""Deviation of the true yaw from an even turning below which scale and bias are not told apart."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     if len(off) < 3:
         return None
     even = np.column_stack([np.ones(len(off)), seconds])
-    turned = yaw - even @ np.linalg.lstsq(even, yaw, rcond=None)[0]
+    # By the truth: a gyroscope that turns a fiftieth of it is told as well.
+    turned = yaw + off - even @ np.linalg.lstsq(even, yaw + off, rcond=None)[0]
     if float(turned.std()) < _LEAST_TURNED_RAD:
         return None
     columns = np.column_stack([even, yaw])

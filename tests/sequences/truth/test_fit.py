@@ -115,5 +115,5 @@ def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
     assert fit.axes() == "-y,x,z"
     other = replace(fit, **{"time_offset": -2.0} | found)
     assert other.axes() is None
-    (problem,) = fit_problems("w", other, "")
+    (problem,) = fit_problems("w", other, None, "")
     assert "clocks more than 5 s apart, another walk" in problem

@@ -54,3 +54,15 @@ def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
     still = replace(truth, attitude_WB=truth.attitude_WB[np.zeros(len(truth.time), dtype=int)])
     unturned = replace(short, truth=still)
     assert yaw_drift(unturned, fit_truth(unturned)) is None
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [(1.3, r"(29|30)\.\d % too far"), (1 / 57.3, r"98\.\d % too little"), (1.04, "")],
+)
+def test_a_scale_that_no_sensor_has_is_a_problem(
+    walk: ImuSequence, scale: float, words: str
+) -> None:
+    told = "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).problems)
+    assert ("gyroscope: turns" in told) is bool(words)
+    assert re.search(words, told)
