@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import ABSURD, MAX_IMU_GAP, BoolArray, FloatArray, ImuSequence
-from stario.sequences.windows import runs
+from stario.sequences.windows import MIN_RATE, runs
 
 _log = logging.getLogger(__name__)
 
@@ -25,8 +25,8 @@ _STUCK_S = 1.0
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
 """A sensor whose largest values are smaller is not at its limit: coarse digits repeat as well."""
 
-_OFTEN_AT_LIMIT = 0.005
-"""Share of samples from which on that deserves a word."""
+_OFTEN_AT_LIMIT, _NO_CHANCE = 0.005, 3
+"""Share of samples from which on that deserves a word, and their least number."""
 
 _SHAKEN_M_S2 = 0.5
 _TILTING_RAD_S = 0.1
@@ -63,6 +63,7 @@ def _stuck_problems(sequence: ImuSequence) -> list[str]:
             (float(time[a] - time[0]), float(time[b] - time[0]))
             for a, b in runs(repeated)
             if time[b] - time[a] >= _STUCK_S
+            and b - a >= MIN_RATE * _STUCK_S  # times in another unit make seconds of two samples
             and moves(time[a : b + 1], gyro[a : b + 1], accel[a : b + 1])
         ]
         if stuck and not (moves is _shaken and repeated.all()):
@@ -89,8 +90,9 @@ def _limit_problems(sequence: ImuSequence) -> list[str]:
         size = np.abs(values)
         largest = size.max(axis=0, initial=0.0)
         at_limit = (values[1:] == values[:-1]) & (size[1:] >= largest) & (largest > large)
-        share = float(at_limit.any(axis=1).mean()) if len(at_limit) else 0.0
-        if share >= _OFTEN_AT_LIMIT:
+        count = int(at_limit.any(axis=1).sum())
+        share = count / max(len(at_limit), 1)
+        if share >= _OFTEN_AT_LIMIT and count >= _NO_CHANCE:
             limit = float(largest[at_limit.any(axis=0)].max())
             problems.append(
                 f"{sequence.name}: {sensor}: {share:.1%} of its samples are at its limit of "

@@ -237,6 +237,9 @@ def test_a_sensor_that_repeats_itself_for_seconds_is_named(walk: ImuSequence, se
     assert {"gyro": "gyroscope", "accel": "accelerometer"}[sensor] + ": its values" in problem
     assert "from 10.0 to 14.0 s" in problem
     assert "for 5.5 s" in problem
+    held = getattr(walk, sensor)[np.arange(len(walk)) // 2 * 2]
+    in_ms = replace(walk, time=1e3 * walk.time, truth=None, **{sensor: held})
+    assert "repeat" not in " ".join(inspect_recording(in_ms).problems)
 
 
 def test_turns_of_a_hand_that_the_accelerometer_does_not_see_are_no_degrees() -> None:
