@@ -12,6 +12,9 @@ _TURNED_RAD = math.radians(5.0)
 _LEANING_RAD = math.radians(3.0)
 """Offset, misalignment and tilt from which a truth deserves a word."""
 
+_LOST = 0.02
+"""Share of gravity that a mount must not take away: it leans by 11 degrees then."""
+
 _SCALED = 0.06
 """Error of the gyroscope's scale that deserves one; of recorded phones it is 0.03 at most."""
 
@@ -69,6 +72,12 @@ def fit_problems(name: str, fit: TruthFit, yaw: YawDrift | None, known: str) -> 
             f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"
         )
     axes, degrees = fit.axes(), math.degrees(fit.misalignment)
+    if fit.misalignment > _TURNED_RAD and fit.accel_against > _LOST:
+        problems.append(
+            f"{name}: gyroscope: its axes or signs are not the accelerometer's, which agrees with "
+            f"the truth ({degrees:.0f} degrees off)"
+        )
+        return problems
     if axes is not None and f"--axes={axes}" not in known:
         problems.append(
             f"{field}: its axes are not the IMU's ({degrees:.0f} degrees): pass `--axes={axes}`"

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import interpolated
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
@@ -50,6 +51,8 @@ class TruthFit:
         tilt: of the truth's world against the vertical [rad].
         agreeing: share of the truth's samples that the gyroscope agrees with.
         jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
+        accel_against: share of the force's mean that `R_TB` takes from the one upright in the truth
+            as it is: where it is large, the accelerometer is on the truth's side.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
     """
@@ -60,6 +63,7 @@ class TruthFit:
     tilt: float
     agreeing: float
     jumps: int
+    accel_against: float
     times: FloatArray
     speed: FloatArray
 
@@ -110,9 +114,23 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
             not ((time[gaps] > before - 1.0) & (time[gaps] < after)).any()
             for (_, before, _), (after, _, _) in pairwise(aligned.mounts)
         ),
+        accel_against=_accel_against(
+            interpolated(grid + aligned.lag, time, accel)[aligned.valid],
+            pose.attitude_WB[aligned.valid],
+            mount,
+        ),
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
     )
+
+
+def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -> float:
+    if not len(force_B):
+        return 0.0
+    upright, turned = (
+        float(attitude_WT.apply(force).mean(axis=0)[2]) for force in (force_B, R_TB.apply(force_B))
+    )
+    return (upright - turned) / max(float(np.linalg.norm(force_B, axis=1).mean()), 1e-9)
 
 
 def middle(sequence: ImuSequence) -> ImuSequence:

@@ -117,3 +117,26 @@ def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
     assert other.axes() is None
     (problem,) = fit_problems("w", other, None, "")
     assert "clocks more than 5 s apart, another walk" in problem
+
+
+@pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
+def test_a_gyroscope_with_wrong_signs_is_not_the_truths_fault(
+    signs: tuple[float, float, float],
+) -> None:
+    style = WalkStyle(carry="pocket")
+    walk = simulate_imu(generate_walk(8, 40.0, style=style), 100.0, seed=2)
+    (problem,) = fit_problems("w", fit_truth(replace(walk, gyro=walk.gyro * signs)), None, "")
+    assert "gyroscope" in problem
+    assert "sign" in problem
+    for right in (walk, with_axes(walk, "y,-x,z"), with_axes(walk, "y,z,x")):
+        assert "sign" not in " ".join(fit_problems("w", fit_truth(right), None, ""))
+
+
+def test_the_accelerometer_says_whether_gyroscope_or_truth_is_turned(walk: ImuSequence) -> None:
+    fit = fit_truth(replace(walk, gyro=walk.gyro @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix().T))
+    (problem,) = fit_problems("w", fit, None, "")
+    assert "gyroscope: its axes or signs are not the accelerometer's" in problem
+    truth = truth_of(walk)
+    turned = replace(truth, attitude_WB=truth.attitude_WB * Rotation.from_rotvec([0.5, 0, 0]))
+    problems = fit_problems("w", fit_truth(replace(walk, truth=turned)), None, "")
+    assert "truth: its axes are" in problems[0]
