@@ -28,9 +28,6 @@ from stario.sequences.time_order import advancing
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _NEEDED = (*_COLUMNS[:3], "sx")
 
-"""A yaw of more than ten turns was not meant in radians; nor was a deviation beyond that of a yaw
-of which nothing is known."""
-
 _UNITS = {"t": ("s",), "kind": ()}
 """That a header may name; of the others metres, metres a second, radians."""
 

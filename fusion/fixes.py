@@ -25,7 +25,7 @@ FixKind = Literal["position", "yaw", "velocity"]
 log = logging.getLogger(__name__)
 
 LARGEST_YAW = 20.0 * math.pi
-"""Beyond this a yaw [rad] is in other units, or no yaw at all."""
+"""A yaw of more than ten turns [rad] is in other units, or no yaw at all."""
 
 KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 """Kinds of fixes and how many numbers each measures."""

@@ -82,6 +82,7 @@ class MapFrameState:
         left: of stretches that were placed before a gap and never turned, what is not known of them
             as soon as the frame has a direction.
         jumps: how often positions have shown that the track was wrong, not they.
+        own: variance of the track's own yaw when it was placed [rad^2].
     """
 
     placed: bool
@@ -95,6 +96,7 @@ class MapFrameState:
     off: tuple[FloatArray, ...] = ()
     left: tuple[FrameTransform, ...] = ()
     jumps: int = 0
+    own: float = 0.0
 
 
 class MapFrame:
@@ -146,13 +148,15 @@ class MapFrame:
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
         now, s = _nav_state(ekf), self.state
-        if not (s.placed or s.oriented) or now.covariance[2, 2] <= KNOWN_YAW**2:
+        lost = now.covariance[2, 2] - (0.0 if s.oriented else s.own)
+        if not (s.placed or s.oriented) or lost <= KNOWN_YAW**2:
             return
+        since = now.time if s.placed else s.since  # what no fix has placed goes along
         left = s.left
         if not s.oriented:
             left = (*left, _unturned(s.pivot, s.since, now.time))
         self.state = MapFrameState(
-            False, False, s.transforms, now.p_W, now.time, left=left, jumps=s.jumps
+            False, False, s.transforms, now.p_W, since, left=left, jumps=s.jumps
         )
 
     def _asks_for_place(self, ekf: StateCloningEkf, fix: Fix) -> bool:
@@ -185,6 +189,7 @@ class MapFrame:
             pivot_variance=float(np.trace(fix.covariance[:2, :2])),
             seen=SeenPositions(),
             apart=0,
+            own=float(now.covariance[2, 2]),
         )
         self._remember(ekf, fix)
         return transform

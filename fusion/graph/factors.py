@@ -293,9 +293,6 @@ class GyroBias:
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
 
 
-"""Every kind of term."""
-
-
 def turn_at(values: Any, k: int) -> float:
     """The network's turn at a keyframe [rad]."""
     return float(values.atVector(T(k))[0])

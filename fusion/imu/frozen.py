@@ -1,7 +1,8 @@
 """A sensor that hands out one sample again and again, or nothing but zeros.
 
 No real sensor measures the same six numbers for long: its noise changes the last digits. One that
-does has stopped, and what it says is as unknown as what happens in a gap.
+does has stopped, and what it says is as unknown as what happens in a gap. What has never changed
+yet is left to the checks of a stream's first second, and may be simulated without noise.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import math
 _SECONDS = 0.1
 """One sample for so long [s] is none: loggers that repeat slow ones do so for a few hundredths."""
 
-_TURNING, _FORCE = 0.05, 0.5
-"""Without noise, as simulated, a device at rest reads one sample as well: no faster turn [rad/s],
-and gravity to within this [m/s^2]."""
+_TURNING, _FORCE = 0.05, 1.5
+"""A coarse sensor at rest reads one sample as well: no faster turn [rad/s], and gravity to within
+this [m/s^2]."""
 
 
 class FrozenWatch:
@@ -27,14 +28,16 @@ class FrozenWatch:
         self._gravity = gravity
         self._values: tuple[float, ...] = ()
         self._since = math.inf
+        self._changed = False
 
     def look(self, sample: tuple[float, ...]) -> bool:
         """Whether a sample (time, gyro, accel) is only the one before it, held for too long."""
         time, values = sample[0], sample[1:]
         if values != self._values:
+            self._changed = bool(self._values)
             self._values, self._since = values, time
             return False
-        return time - self._since > _SECONDS and not self._looks_at_rest()
+        return self._changed and time - self._since > _SECONDS and not self._looks_at_rest()
 
     def _looks_at_rest(self) -> bool:
         gyro, accel = self._values[:3], self._values[3:]

@@ -441,3 +441,13 @@ def test_a_sensor_at_rest_may_read_the_same(still_model: Any) -> None:
     )
     health = Navigator(still_model).run(still).health
     assert health.samples["frozen"] == 0
+
+
+@pytest.mark.parametrize("accel", [0.0, 1.0])
+def test_a_stream_that_never_changes_is_told_by_its_force(still_model: Any, accel: float) -> None:
+    n = 300
+    silent = ImuSequence(
+        "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
+    )
+    with pytest.raises(InputError, match="accel"):
+        stream(Navigator(still_model), silent)

@@ -57,6 +57,42 @@ def test_a_position_before_a_gap_turns_nothing_behind_it(
     assert backend == "graph" or position_nees(track, walk, early) < 20.0
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_short_gaps_behind_a_long_one_lose_no_place(
+    make_walk: Make, make_oracle: Make, without: Make, seed: int
+) -> None:
+    """The yaw that was lost once is not lost again by a turn of a tenth of a radian."""
+    walk = make_walk(seed, 60.0)
+    gone = (walk.time > 12.0) & (walk.time < 16.0)
+    gone |= (walk.time > 18.0) & (walk.time % 4.0 < 0.3)
+    holed = without(walk, gone)
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    track = Navigator(oracle, CONFIG).run(holed, fixes=true_fixes(walk.truth, 5.0, 0.5, 0))
+    late = (track.time > 40.0) & (track.time < walk.time[-1])
+    off = track.trajectory.position_W[late] - walk.truth.at(track.time[late]).position_W
+    assert np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))) < 1.0
+    assert np.abs(yaw_error(track, walk, late)).max() < 0.5  # each short gap adds 0.15 rad
+
+
+def test_what_had_a_direction_but_no_place_goes_along(
+    make_walk: Make, make_oracle: Make, without: Make
+) -> None:
+    walk = make_walk(4, 60.0)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 23.0))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    shift = np.array([100.0, 50.0, 0.0])
+    fixes = [yaw_fix(5.0, yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0], 0.02)]
+    for fix in true_fixes(walk.truth, 3.0, 0.3, 0):
+        if fix.time > 35.0:
+            fixes.append(position_fix(fix.time, fix.value + shift, fix.covariance))
+    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    early = int(np.searchsorted(track.time, 2.0))
+    truth = walk.truth.at(track.time[early : early + 1]).position_W[0] + shift
+    error = track.trajectory.position_W[early] - truth
+    P = track.covariance[early, 6:8, 6:8]
+    assert error[:2] @ np.linalg.solve(P, error[:2]) < 12.0
+
+
 @pytest.mark.parametrize("seed", [1, 2, 4])
 def test_what_was_before_a_gap_is_not_known_by_what_is_told_behind_it(
     make_walk: Make, make_oracle: Make, without: Make, seed: int
