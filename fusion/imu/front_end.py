@@ -99,7 +99,8 @@ class FrontEnd:
             self.counts.duplicate += 1
         elif time < newest:
             self.counts.out_of_order += 1
-            self._late.late(time, newest)
+            late = self._late.late(time, newest)
+            self.counts.longest_late = max(self.counts.longest_late, late)
         elif self._ahead or time - newest > MAX_IMU_GAP:
             return self._confirm(sample)
         else:

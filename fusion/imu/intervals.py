@@ -95,6 +95,9 @@ GAPS_LISTED = 100
 """How many gaps are kept one by one: an endless stream may have any number."""
 
 
+LATE_SECONDS = 0.5
+"""From so long a row of late samples on health says so [s]."""
+
 UNFAMILIAR_SHARE = 0.3
 """From this share of unfamiliar windows on health says so; of training windows 0.05 are."""
 
@@ -109,6 +112,7 @@ class SampleCounts:
         frozen: dropped for repeating all values of those before, though not at rest.
         duplicate: dropped for repeating the newest time.
         out_of_order: dropped for a time before the newest.
+        longest_late: for how long samples came out of order in a row, at most [s].
         future: dropped for a time ahead of those that followed.
         spike: used, but replaced for standing off its neighbours.
         saturated: used, but at the sensor's limit.
@@ -126,6 +130,7 @@ class SampleCounts:
     frozen: int = 0
     duplicate: int = 0
     out_of_order: int = 0
+    longest_late: float = 0.0
     future: int = 0
     spike: int = 0
     saturated: int = 0
@@ -160,6 +165,11 @@ class SampleCounts:
         if self.set_back:
             notes.append(
                 f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
+            )
+        elif self.longest_late > LATE_SECONDS:
+            notes.append(
+                f"samples came late for {self.longest_late:.1f} s in a row: twice, or from a clock "
+                "that was set back; then as much time is missing, which no sigma knows"
             )
         if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
             share = self.unfamiliar / self.windows

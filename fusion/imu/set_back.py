@@ -42,8 +42,11 @@ class SetBackWatch:
         """A sample was not late."""
         self._running = False
 
-    def late(self, time: float, newest: float) -> None:
+    def late(self, time: float, newest: float) -> float:
         """A sample at `time` came after one at `newest` [s].
+
+        Returns:
+            For how long such samples have come in a row by now [s].
 
         Raises:
             ClockSetBackError: the late samples are of another clock.
@@ -53,3 +56,4 @@ class SetBackWatch:
         self._running, self._last = True, time
         if time - self._first >= SET_BACK_SECONDS:
             raise ClockSetBackError(newest - self._first)
+        return time - self._first

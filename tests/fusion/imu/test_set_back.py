@@ -92,3 +92,11 @@ def test_values_that_no_sensor_gives_are_named_and_leave_the_means_alone(make_wa
     found = inspect_recording(replace(walk, gyro=gyro))
     assert any("no sensor" in problem for problem in found.problems)
     assert found.gyro_norm < 10.0
+
+
+def test_a_clock_that_is_set_back_by_little_is_told(make_walk: Make, still_model: Any) -> None:
+    walk = make_walk(3, 16.0)
+    track = Navigator(still_model).run(set_back(walk, 3.0))
+    (words,) = (note for note in track.health.notes if "late" in note)
+    assert "for 3.0 s in a row" in words
+    assert not [note for note in Navigator(still_model).run(walk).health.notes if "late" in note]
