@@ -74,10 +74,8 @@ class FrameTransform:
             covariance: (3, 3) before.
             own: variance of the yaw there, in the track's own frame [rad^2].
         """
-        arm = p_W - self.pivot
-        across, along, _ = _moments(self.turn_variance(own))
-        covariance = self.R @ covariance @ self.R.T
-        covariance = covariance + across * _outer(_ACROSS @ arm) + along * _outer(_LEVEL @ arm)
+        turned = _turned(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
+        covariance = self.R @ covariance @ self.R.T + turned[6:9, 6:9]
         return (
             covariance
             if self.position_covariance is None
@@ -130,10 +128,6 @@ def _turned(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
     covariance[2] += both * level[:, 0]
     covariance[:, 2] += both * level[:, 0]
     return covariance
-
-
-def _outer(vector: FloatArray) -> FloatArray:
-    return np.outer(vector, vector)
 
 
 def in_last_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:

@@ -200,18 +200,20 @@ class GraphBuilder:
         self._joints[0] = k
 
     def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
-        R, _, _, b_g, b_a = self.graph.pose(self.graph.last)
-        if interval.gap:
-            ends, turned = (
-                (interval.start, interval.stop),
-                turned_in_gap(interval.stop - interval.start),
-            )
-            segment = unseen(*ends, R, b_g, b_a, self._config, turned)
-            self._gaps.append(self.graph.last)
-        elif segment is None:
-            segment = segment_of(interval, R, b_g, b_a, self._config)
+        if segment is None or interval.gap:
+            segment = self._segment_of(interval)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
+
+    def _segment_of(self, interval: ImuInterval) -> Segment:
+        """With the turn of a walker in a gap, which the filter adds to its state itself."""
+        last = self.graph.last
+        R, _, _, b_g, b_a = self.graph.pose(last)
+        if not interval.gap:
+            return segment_of(interval, R, b_g, b_a, self._config)
+        self._gaps.append(last)
+        turned = turned_in_gap(interval.stop - interval.start)
+        return unseen(interval.start, interval.stop, R, b_g, b_a, self._config, turned)
 
     def _add_displacement(
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray

@@ -416,38 +416,3 @@ def test_a_tenth_of_a_second_without_samples_hardly_moves_the_end(
         assert off < 0.02 * walk.truth.path_length()
         turned = ended.attitude_WB[-1] * whole.attitude_WB[-1].inv()
         assert abs(np.degrees(turned.as_rotvec()[2])) < 3.0
-
-
-@pytest.mark.parametrize("held", ["last", "zeros"])
-def test_a_sensor_that_stops_is_a_gap(walk: ImuSequence, make_oracle: Make, held: str) -> None:
-    gyro, accel, time = walk.gyro.copy(), walk.accel.copy(), walk.time
-    dead = (time > time[0] + 8.0) & (time < time[0] + 11.0)
-    last = np.argmax(dead) - 1
-    gyro[dead], accel[dead] = (gyro[last], accel[last]) if held == "last" else (0.0, 0.0)
-    stopped = replace(walk, gyro=gyro, accel=accel)
-    found = Navigator(make_oracle(stopped, walk.truth, CONFIG)).run(stopped)
-    assert found.health.samples["frozen"] > 0.9 * dead.sum()
-    assert found.health.gap_count == 1
-    ((start, length),) = found.health.gaps
-    assert start == pytest.approx(time[dead][0], abs=0.15)
-    assert length == pytest.approx(3.0, abs=0.2)
-
-
-def test_a_sensor_at_rest_may_read_the_same(still_model: Any) -> None:
-    """Simulated without noise, or so coarse that its noise does not show."""
-    n = 1000
-    still = ImuSequence(
-        "still", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1))
-    )
-    health = Navigator(still_model).run(still).health
-    assert health.samples["frozen"] == 0
-
-
-@pytest.mark.parametrize("accel", [0.0, 1.0])
-def test_a_stream_that_never_changes_is_told_by_its_force(still_model: Any, accel: float) -> None:
-    n = 300
-    silent = ImuSequence(
-        "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
-    )
-    with pytest.raises(InputError, match="accel"):
-        stream(Navigator(still_model), silent)
