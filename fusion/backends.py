@@ -110,7 +110,7 @@ class EkfBackend:
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """The filter's states."""
-        transforms = filtered.estimator.frames.transforms
+        transforms = filtered.estimator.map_frame_state.transforms
         states = in_last_frame(nav_states(filtered.estimates), transforms)
         smoothed = smoothed_track(smoothed_poses(filtered.clones), transforms)
         return Solution(states, smoothed, [])
@@ -128,7 +128,7 @@ class GraphBackend:
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """The whole optimised at once; the filter's states where that is not determined."""
         estimator = filtered.estimator
-        transforms, states = estimator.frames.transforms, nav_states(filtered.estimates)
+        transforms, states = estimator.map_frame_state.transforms, nav_states(filtered.estimates)
         end, seen = states[-1], estimator.ekf.state.field is not None
         bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
         own = in_last_frame(states, transforms)
@@ -190,7 +190,7 @@ def _filtered(
         taken = estimator.step(interval, displacement, queue.due(interval.stop))
         filtered.measurements.append(taken)
         filtered.estimates.append(estimator.estimate())
-        clone = estimator.oldest
+        clone = estimator.released
         if clone is not None and clone not in filtered.clones[-1:]:
             filtered.clones.append(clone)
         if k % 500 == 0:

@@ -22,9 +22,9 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.set_back import ClockSetBackError
 from stario.fusion.imu.stateful import Predictor as Predictor
 from stario.fusion.imu.stateful import StatefulInference, displacements_of
+from stario.fusion.imu.stream_checks import ClockSetBackError
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
 from stario.fusion.recording import Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
@@ -331,7 +331,7 @@ class Navigator:
 
     def _check_gyro(self, interval: ImuInterval) -> None:
         try:
-            self._front_end.gyro_unit.look(interval)
+            self._front_end.gyro_unit.check(interval)
         except InputError:
             self._begin_stream()
             raise

@@ -36,21 +36,18 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 14
+FORMAT, VERSION = "stario snapshot", 15
 
 
 _HOLDS = """
-fusion.config fusion.continuous fusion.fixes
-fusion.filter.accelerometer fusion.filter.ekf_state fusion.filter.estimator_state
-fusion.filter.frame_transform fusion.filter.gyro_bias fusion.filter.initial
-fusion.filter.innovations fusion.filter.magnetic fusion.filter.map_frame fusion.filter.sceptic
-fusion.filter.seen_positions fusion.filter.zero_velocity
+fusion.config fusion.continuous fusion.filter.accel_noise fusion.filter.alternative
+fusion.filter.ekf_state fusion.filter.estimator_state fusion.filter.frame_transform
+fusion.filter.gyro_bias fusion.filter.initial fusion.filter.innovations fusion.filter.magnetic
+fusion.filter.map_frame fusion.filter.planar_alignment fusion.filter.zero_velocity fusion.fixes
 fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
-fusion.graph.keyframes fusion.graph.whitening
-fusion.imu.field_buffer fusion.imu.frozen fusion.imu.front_end fusion.imu.gyro_unit
-fusion.imu.intervals fusion.imu.outliers fusion.imu.preintegration fusion.imu.set_back
-fusion.imu.window_buffer
-sequences.noise sequences.attitude.levelling
+fusion.graph.keyframes fusion.graph.whitening fusion.imu.buffers fusion.imu.front_end
+fusion.imu.intervals fusion.imu.outliers fusion.imu.preintegration fusion.imu.stream_checks
+sequences.attitude.levelling sequences.noise
 """
 """Modules whose classes a snapshot may hold: plain data, made anew from their attributes."""
 

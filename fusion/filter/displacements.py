@@ -7,13 +7,13 @@ from functools import partial
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.accel_noise import AccelNoiseScale
+from stario.fusion.filter.alternative import GATE as ALTERNATIVE_GATE
+from stario.fusion.filter.alternative import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.innovations import is_gated
-from stario.fusion.filter.network_turn import wandered
-from stario.fusion.filter.sceptic import GATE as SCEPTIC_GATE
-from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
+from stario.fusion.filter.network_turn import propagated_turn
 from stario.fusion.lie import yaw_rotation
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
@@ -39,9 +39,9 @@ class DisplacementUpdates:
 
     def __init__(self, ekf: StateCloningEkf, config: FilterConfig) -> None:
         self._ekf, self._config = ekf, config
-        self.opinion = SecondOpinion(ekf)
+        self.hypotheses = HypothesisPair(ekf)
         self.outlier_share = 0.5  # trust is to be earned
-        self.accelerometer = AccelerometerWorth()
+        self.accel_noise = AccelNoiseScale()
 
     def update(
         self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
@@ -62,11 +62,11 @@ class DisplacementUpdates:
         late = 1.0 / (f.update_rate * _SHARE_SECONDS)
         self.outlier_share += late * (gated - self.outlier_share)
         if f.adaptive:
-            self.accelerometer = self.accelerometer.seen(result)
-        if self.opinion.sceptic is None and rare and gated:
-            self.opinion.sceptic = Sceptic(before, before.time)
+            self.accel_noise = self.accel_noise.updated(result)
+        if self.hypotheses.alternative is None and rare and gated:
+            self.hypotheses.alternative = AlternativeHypothesis(before, before.time)
         elif result.accepted:
-            self.opinion.ask(lambda: update(SCEPTIC_GATE, "reject").accepted, not gated)
+            self.hypotheses.compare(lambda: update(ALTERNATIVE_GATE, "reject").accepted, not gated)
         return result
 
     def _update(
@@ -81,7 +81,9 @@ class DisplacementUpdates:
     ) -> UpdateResult:
         """Of the filter as it stands."""
         f = self._config
-        self._ekf.state = wandered(self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma)
+        self._ekf.state = propagated_turn(
+            self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
+        )
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # What is not finite is the filter's to refuse and count.
         with np.errstate(invalid="ignore"):

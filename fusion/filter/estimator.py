@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.accel_noise import AccelNoiseScale
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
@@ -23,7 +23,7 @@ from stario.fusion.filter.estimator_state import (
     IntervalMeasurements,
     Step,
 )
-from stario.fusion.filter.gyro_bias import FollowedBiasPrior, GyroBiasPrior
+from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
@@ -37,7 +37,7 @@ from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocit
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.cutting import parts
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.preintegration import Segment, segment_of, turned_in_gap
+from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -60,7 +60,7 @@ class Estimator:
 
     Attributes:
         ekf: the filter.
-        oldest: the newest pose that left the window, corrected by all of it; None at first.
+        released: the newest pose that left the window, corrected by all of it; None at first.
         in_gap: whether the last interval had no samples.
     """
 
@@ -82,14 +82,14 @@ class Estimator:
         )
         self._magnetic = MagneticReference()
         self._displacements = DisplacementUpdates(self.ekf, f)
-        self._opinion = self._displacements.opinion
-        self._bias = FollowedBiasPrior(self._opinion, config, start.time)
+        self._hypotheses = self._displacements.hypotheses
+        self._bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
         self.in_gap = False
         self._history: tuple[Step, ...] = ()
-        self.oldest: Estimate | None = None
+        self.released: Estimate | None = None
         initialise(self.ekf, start, prior, config)
         self._bias.begin()
         self._clone()
@@ -106,12 +106,12 @@ class Estimator:
             displacement: None where no window ends, or nothing is known of it.
             fixes: with times up to the interval's end that were not given before, in order.
         """
-        factor = self._displacements.accelerometer.factor
+        factor = self._displacements.accel_noise.factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
         self._remember(interval, displacement, fixes)
         if interval.gap or fixes:
-            self._opinion.sceptic = None
+            self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
         at_rest = self._update_zero_velocity(interval)
         # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
@@ -119,7 +119,7 @@ class Estimator:
         taken = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
-        self._bias.follow(interval)
+        self._bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(interval, offered, taken, bearing, at_rest, accepted, segment)
@@ -163,13 +163,13 @@ class Estimator:
         self.in_gap = interval.gap
         if interval.gap:
             self._forget_window()
-        if interval.anew is not None:
+        if interval.restart is not None:
             # Fixes within a long gap are of no use: nothing ties their time to what is behind it.
             for _ in fixes:
                 self._counts = changed(
                     self._counts, fixes=counted(self._counts.fixes, "in a long gap")
                 )
-            reinitialise(self.ekf, interval, interval.anew, self._config)
+            reinitialise(self.ekf, interval, interval.restart, self._config)
             self._map_frame.lose_yaw(self.ekf)
             return None, []
         if not fixes:
@@ -184,10 +184,10 @@ class Estimator:
     def _propagate_piece(self, interval: ImuInterval, began: float) -> Segment:
         """A piece of the interval that began at a time [s]."""
         before = self.ekf.state.p_W
-        segment = self._opinion.both(lambda: self._propagate_samples(interval))
+        segment = self._hypotheses.apply_to_both(lambda: self._propagate_samples(interval))
         if interval.gap:
             sigma = math.sqrt(
-                turned_in_gap(interval.stop - began) - turned_in_gap(interval.start - began)
+                gap_yaw_variance(interval.stop - began) - gap_yaw_variance(interval.start - began)
             )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
@@ -206,20 +206,20 @@ class Estimator:
 
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
         if not self._stillness.is_still(interval):
-            self._bias.refused_rest(0.0)
+            self._bias.note_refused_rest(0.0)
             return None
         measured = zero_velocity(self._stillness)
-        before = self.ekf.state, self._bias.prior, self._opinion.sceptic
+        before = self.ekf.state, self._bias.prior, self._hypotheses.alternative
         self._bias.widen_for_rest()
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
         self._counts = self._counts.add_zero_velocity(result)
         if not result.accepted:
-            self.ekf.state, self._bias.prior, self._opinion.sceptic = before
-            self._bias.refused_rest(interval.stop - interval.start)
+            self.ekf.state, self._bias.prior, self._hypotheses.alternative = before
+            self._bias.note_refused_rest(interval.stop - interval.start)
             return None
-        self._bias.refused_rest(0.0)
-        self._opinion.sceptic = None
+        self._bias.note_refused_rest(0.0)
+        self._hypotheses.alternative = None
         return measured
 
     def _update_displacement(
@@ -247,15 +247,15 @@ class Estimator:
         if not result.accepted:
             return []
         self._counts = self._counts.add_north()
-        self._opinion.sceptic = None  # its frame is no more
+        self._hypotheses.alternative = None  # its frame is no more
         return [Accepted(fix, result.scale)]
 
     def _update_bearing(self, interval: ImuInterval) -> tuple[EkfState, EkfState] | None:
         """Returns the filter before and after, of a stream."""
-        if interval.field_B is None or not self._magnetic.due(interval.stop):
+        if interval.field_B is None or not self._magnetic.is_due(interval.stop):
             return None
         field_B, before = interval.field_B, self.ekf.state
-        result, self._magnetic = self._opinion.both(
+        result, self._magnetic = self._hypotheses.apply_to_both(
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
         self._counts = self._counts.add_bearing(result)
@@ -263,11 +263,14 @@ class Estimator:
 
     def _clone(self) -> None:
         if len(self._clones) < self.ekf.slots:
-            self._clones = (*self._clones, self._opinion.both(self.ekf.clone))
+            self._clones = (*self._clones, self._hypotheses.apply_to_both(self.ekf.clone))
             return
         slot, *later = self._clones
-        self.oldest = self.ekf.state.clone_estimate(slot, self.map_frame)
-        self._clones = (*later, self._opinion.both(lambda: self.ekf.clone(instead_of=slot)))
+        self.released = self.ekf.state.clone_estimate(slot, self.map_frame)
+        self._clones = (
+            *later,
+            self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
+        )
 
     def _forget_window(self) -> None:
         """No displacement spans a gap: its clones are of no more use."""
@@ -288,11 +291,11 @@ class Estimator:
             self._magnetic,
             self._displacements.outlier_share,
             self._bias.prior,
-            self._displacements.accelerometer,
-            self._opinion.sceptic,
+            self._displacements.accel_noise,
+            self._hypotheses.alternative,
             self._counts,
             self.in_gap,
-            self.oldest,
+            self.released,
             self._history,
         )
 
@@ -302,14 +305,14 @@ class Estimator:
         self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
         self._magnetic, self._bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
         self._displacements.outlier_share = s.outlier_share
-        self._displacements.accelerometer = s.accelerometer
-        self._opinion.sceptic = s.sceptic
-        self.in_gap, self.oldest, self._history = s.in_gap, s.oldest, s.history
+        self._displacements.accel_noise = s.accel_noise
+        self._hypotheses.alternative = s.alternative
+        self.in_gap, self.released, self._history = s.in_gap, s.released, s.history
 
     @property
-    def accelerometer(self) -> AccelerometerWorth:
+    def accel_noise(self) -> AccelNoiseScale:
         """What it is worth, as the innovations tell."""
-        return self._displacements.accelerometer
+        return self._displacements.accel_noise
 
     @property
     def bias_prior(self) -> GyroBiasPrior:
@@ -327,19 +330,19 @@ class Estimator:
         return len(self._map_frame.state.transforms)
 
     @property
-    def frames(self) -> MapFrameState:
+    def map_frame_state(self) -> MapFrameState:
         """The transforms there were so far."""
         return self._map_frame.state
 
     @property
-    def judged(self) -> object:
+    def gating_counts(self) -> object:
         """What became of displacements and rest so far: a late fix may change it."""
         return self._counts.gated, self._counts.refused, self._counts.zero_velocity
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """`oldest` as callers get it."""
-        return smoothed_poses([self.oldest])[0] if self.oldest else None
+        """`released` as callers get it."""
+        return smoothed_poses([self.released])[0] if self.released else None
 
     def estimate(self) -> Estimate:
         """The filter's newest state."""
@@ -359,4 +362,4 @@ class Estimator:
         if self._config.filter.declination is not None and not self._map_frame.state.oriented:
             note = "nothing told where north is: the track begins with yaw zero"
             health = changed(health, notes=[*health.notes, note])
-        return changed(health, accel_noise_factor=self._displacements.accelerometer.factor)
+        return changed(health, accel_noise_factor=self._displacements.accel_noise.factor)

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.accel_noise import AccelNoiseScale
+from stario.fusion.filter.alternative import AlternativeHypothesis
 from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.map_frame import MapFrameState
-from stario.fusion.filter.sceptic import Sceptic
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval
@@ -66,7 +66,7 @@ class EstimatorState:
         sceptic: the filter without the outliers of the last seconds, where there were some.
         counts: what became of the updates.
         in_gap: whether the last interval had no samples.
-        oldest: the newest pose that left the window, corrected by all of it.
+        released: the newest pose that left the window, corrected by all of it.
         history: the steps of the last second of a stream.
     """
 
@@ -77,9 +77,9 @@ class EstimatorState:
     magnetic: MagneticReference
     outlier_share: float
     bias_prior: GyroBiasPrior
-    accelerometer: AccelerometerWorth
-    sceptic: Sceptic | None
+    accel_noise: AccelNoiseScale
+    alternative: AlternativeHypothesis | None
     counts: UpdateCounts
     in_gap: bool
-    oldest: Estimate | None
+    released: Estimate | None
     history: tuple[Step, ...] = ()

@@ -16,8 +16,8 @@ import numpy as np
 
 from stario.fusion.changed import changed
 from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.filter.alternative import HypothesisPair
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
-from stario.fusion.filter.sceptic import SecondOpinion
 from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
@@ -25,11 +25,11 @@ from stario.sequences.sequence import FloatArray
 _CORRECTED = 0.01
 """Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
 
-_ALIKE = 0.4
+_SHARED = 0.4
 """What is not known yet about the level axes counts by this share: what is known of them tells of
 the vertical one as well, since a device corrects all or none."""
 
-_CLEARLY = 3.0
+_SIGNIFICANT = 3.0
 """Deviations of what the data say, about any axis, within which the prior is left alone."""
 
 _PRECISE = 5e-3
@@ -67,20 +67,20 @@ class GyroBiasPrior:
 
     sigma: float
     variance: float
-    raw: float = 0.0
-    evident: float = 0.0
-    refused: float = 0.0
+    uncorrected: float = 0.0
+    evidence: float = 0.0
+    refused_seconds: float = 0.0
 
     @classmethod
     def first(cls, sigma: float) -> GyroBiasPrior:
         """Before anything is known."""
         return cls(sigma, sigma**2)
 
-    def before_gravity_tells(self) -> GyroBiasPrior:
+    def before_levelling(self) -> GyroBiasPrior:
         """As wide as while levelling knows nothing of the bias."""
-        return changed(self, variance=self.sigma**2 + (_ALIKE * BIAS_SIGMA) ** 2)
+        return changed(self, variance=self.sigma**2 + (_SHARED * BIAS_SIGMA) ** 2)
 
-    def wanted(
+    def updated(
         self,
         levelled: float,
         levelled_sigma: float,
@@ -97,12 +97,14 @@ class GyroBiasPrior:
             P: (3, 3) its covariance.
             wander: variance by which it may have changed since the start [rad^2/s^2].
         """
-        raw = max(self.raw, levelled - _CORRECTED)
-        evident = max(self.evident, min(self._asked(b_g, P, wander), _WIDEST**2))
-        known = self.sigma**2 + (_ALIKE * levelled_sigma) ** 2 + raw**2
-        return changed(self, variance=max(known, evident), raw=raw, evident=evident)
+        uncorrected = max(self.uncorrected, levelled - _CORRECTED)
+        evidence = max(self.evidence, min(self._variance_from_data(b_g, P, wander), _WIDEST**2))
+        known = self.sigma**2 + (_SHARED * levelled_sigma) ** 2 + uncorrected**2
+        return changed(
+            self, variance=max(known, evidence), uncorrected=uncorrected, evidence=evidence
+        )
 
-    def _asked(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
+    def _variance_from_data(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
         """The variance that the data ask for.
 
         With prior variance s^2, wander w included, and posterior b, P they alone say y with
@@ -117,10 +119,10 @@ class GyroBiasPrior:
             return 0.0
         e = p[precise] * prior / (prior - p[precise])  # squares
         y = (axes.T @ b_g)[precise] * e / p[precise]
-        return float(np.max(y**2 - _CLEARLY**2 * e)) - wander
+        return float(np.max(y**2 - _SIGNIFICANT**2 * e)) - wander
 
 
-class FollowedBiasPrior:
+class AdaptiveBiasPrior:
     """The prior in a filter, and in the sceptic beside it, as what is known asks for it.
 
     Args:
@@ -132,55 +134,61 @@ class FollowedBiasPrior:
         prior: as it stands in the filter.
     """
 
-    def __init__(self, opinion: SecondOpinion, config: NavigatorConfig, start: float) -> None:
-        self._opinion, self._config, self._start = opinion, config, start
+    def __init__(self, hypotheses: HypothesisPair, config: NavigatorConfig, start: float) -> None:
+        self._hypotheses, self._config, self._start = hypotheses, config, start
         self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, SMALLEST_SIGMA))
 
     def begin(self) -> None:
         """Before gravity has told anything."""
         if self._config.filter.adaptive:
-            self._exchange(self.prior.before_gravity_tells())
+            self._exchange(self.prior.before_levelling())
 
-    def follow(self, interval: ImuInterval) -> None:
+    def update(self, interval: ImuInterval) -> None:
         """Behind an interval, by what gravity and the data tell of the bias by now."""
         if not self._config.filter.adaptive:
             return
-        if not interval.gap and self._halves(interval.stop) == self._halves(interval.start):
+        if not interval.gap and self._half_seconds(interval.stop) == self._half_seconds(
+            interval.start
+        ):
             return
         levelled = interval.levelled_bias, interval.levelled_bias_sigma
-        s = self._opinion.ekf.state
-        self._exchange(self.prior.wanted(*levelled, s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander))
+        s = self._hypotheses.ekf.state
+        self._exchange(
+            self.prior.updated(*levelled, s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander)
+        )
 
     def widen_for_rest(self) -> None:
         """Rest tells the bias, be it what it may."""
-        sigma = _AT_REST if self.prior.refused < _PATIENCE else _RAW
+        sigma = _AT_REST if self.prior.refused_seconds < _PATIENCE else _RAW
         self._exchange(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
 
-    def refused_rest(self, seconds: float) -> None:
+    def note_refused_rest(self, seconds: float) -> None:
         """What looked like rest was refused for so long again; 0 where it was not, or moves [s]."""
-        refused = self.prior.refused + seconds if seconds else 0.0
-        if refused != self.prior.refused:
-            self.prior = changed(self.prior, refused=refused)
+        refused_seconds = self.prior.refused_seconds + seconds if seconds else 0.0
+        if refused_seconds != self.prior.refused_seconds:
+            self.prior = changed(self.prior, refused_seconds=refused_seconds)
 
-    def _exchange(self, wanted: GyroBiasPrior) -> None:
+    def _exchange(self, updated: GyroBiasPrior) -> None:
         """Everything as if it had been the prior from the start."""
-        old, new = self.prior.variance + self._wander, wanted.variance + self._wander
-        ekf = self._opinion.ekf
-        self._opinion.both(lambda: ekf.exchange_gyro_bias_prior(old, new))
-        self.prior = wanted
+        old, new = self.prior.variance + self._wander, updated.variance + self._wander
+        ekf = self._hypotheses.ekf
+        self._hypotheses.apply_to_both(lambda: ekf.exchange_gyro_bias_prior(old, new))
+        self.prior = updated
 
-    def _halves(self, time: float) -> int:
+    def _half_seconds(self, time: float) -> int:
         """Whole half seconds since the start: what is known of a bias changes no faster."""
         return math.floor(2.0 * (time - self._start) + _ROUNDING)
 
     @property
     def _wander(self) -> float:
         """Variance by which the bias may have changed since the start."""
-        seconds = max(0.0, self._opinion.ekf.state.time - self._start)
+        seconds = max(0.0, self._hypotheses.ekf.state.time - self._start)
         return float(self._config.noise.gyro_walk**2 * seconds)
 
 
-def told_of_bias(before: EkfState, after: EkfState) -> tuple[FloatArray, FloatArray] | None:
+def gained_bias_information(
+    before: EkfState, after: EkfState
+) -> tuple[FloatArray, FloatArray] | None:
     """What an update told of the gyroscope's bias, whatever it measured.
 
     The information that the bias alone has gained by it: E^-1 = P+^-1 - P-^-1 with the mean

@@ -105,7 +105,7 @@ class MagneticReference:
     size: float = 0.0
     dip: float = 0.0
     spread: float = _FIRST_SPREAD
-    walked: int = 0
+    moving_count: int = 0
     measured: float = 0.0
 
     @property
@@ -122,18 +122,18 @@ class MagneticReference:
         """Whether a field of this size [uT] is the last one, carried on by the device itself."""
         return abs(measured - self.measured) < HELD_CHANGE * measured
 
-    def due(self, time: float) -> bool:
+    def is_due(self, time: float) -> bool:
         """Whether a bearing may be taken in."""
         return time - self.time > PERIOD - 1e-6
 
-    def seen(self, time: float, size: float, dip: float, news: bool) -> MagneticReference:
+    def updated(self, time: float, size: float, dip: float, new_place: bool) -> MagneticReference:
         """With one more bearing: means of what is clipped to near them, as robust as medians.
 
         Args:
             time: of the bearing [s].
             size: of the field [uT].
             dip: angle below the horizontal [rad].
-            news: whether it tells of another place than the last: measured anew, while walking.
+            new_place: whether the field was newly measured, and while moving.
         """
         count = self.count + 1
         if count == 1:
@@ -144,12 +144,14 @@ class MagneticReference:
         off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
         usual_dip = self.dip + share * off
         found = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
-        if not news:
+        if not new_place:
             return found
         distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
-        walked = self.walked + 1
-        late = 1.0 / min(walked + _FIRST_COUNT, _MEMORY)
-        return changed(found, spread=self.spread + late * (distance - self.spread), walked=walked)
+        moving_count = self.moving_count + 1
+        late = 1.0 / min(moving_count + _FIRST_COUNT, _MEMORY)
+        return changed(
+            found, spread=self.spread + late * (distance - self.spread), moving_count=moving_count
+        )
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -182,7 +184,7 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
     return changed(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
-def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
+def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """The state after the azimuth has wandered for a time [s] at the speed of now.
 
     Args:
@@ -209,7 +211,7 @@ def update_bearing(
     if ekf.state.field is None:
         ekf.state = first_field(ekf.state, m_B)
     elif math.isfinite(reference.time):
-        ekf.state = wandered(ekf.state, now - reference.time, reference.wander_sigma)
+        ekf.state = propagated_field(ekf.state, now - reference.time, reference.wander_sigma)
     s = ekf.state
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
@@ -220,8 +222,8 @@ def update_bearing(
             reference, time=now
         )
     held = reference.is_held(measured)
-    news = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
-    reference = changed(reference.seen(now, size, dip, news), measured=measured)
+    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
+    reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
     )

@@ -29,8 +29,8 @@ from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.innovations import is_gated
-from stario.fusion.filter.network_turn import begun
-from stario.fusion.filter.seen_positions import SeenPositions
+from stario.fusion.filter.network_turn import with_turn
+from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
 from stario.fusion.state import NavState
@@ -49,15 +49,15 @@ FAR_ENOUGH = 0.3
 """Two positions tell the yaw when it is then known to this [rad]; half its square, what the
 linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
-_CONVINCING, _ALIKE = 3, 0.8
+_OUTLIERS_IN_A_ROW, _SAME_DIRECTION = 3, 0.8
 """Positions in a row taken for outliers whose residuals point the same way (cosine above this) are
 right, and the track is not; so are those in a row that are not as far from the pivot as the track
 has led from it: then the pivot was wrong."""
 
-_BETTER = 2.0
+_SIGMA_RATIO = 2.0
 """A position that is so many times surer than the one that placed the track places it anew."""
 
-_AWRY = 0.5
+_LENGTH_TOLERANCE = 0.5
 """Share of the shorter one by which a network's way and the true one may differ in length."""
 
 _MUCH_LARGER, _LARGEST = 1e3, 1e5
@@ -76,13 +76,14 @@ class MapFrameState:
         pivot: (3,) about which the track may be turned [m].
         since: time from which on the track is placed and turned anew [s].
         pivot_variance: of the position that placed it, over the plane's axes [m^2].
-        seen: positions since it was placed, from the pivot, while its yaw is not known.
-        apart: how many of the last positions lay at another distance from the pivot than the track.
-        off: (3,) residuals of the last positions, if they were outliers [m].
-        left: of stretches that were placed before a gap and never turned, what is not known of them
-            as soon as the frame has a direction.
+        alignment: of the positions since it was placed, from the pivot, while its yaw is not known.
+        distance_mismatches: number of latest positions in a row whose distance from the pivot
+            differs from the track's.
+        outlier_residuals: (3,) residuals of the last positions, if they were outliers [m].
+        unoriented: uncertainty of stretches that were placed before a gap and never oriented,
+            applied once the frame is oriented.
         jumps: how often positions have shown that the track was wrong, not they.
-        own: variance of the track's own yaw when it was placed [rad^2].
+        yaw_variance: of the track's own yaw when it was placed [rad^2].
     """
 
     placed: bool
@@ -91,12 +92,12 @@ class MapFrameState:
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
     pivot_variance: float = math.inf
-    seen: SeenPositions = field(default_factory=SeenPositions)
-    apart: int = 0
-    off: tuple[FloatArray, ...] = ()
-    left: tuple[FrameTransform, ...] = ()
+    alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
+    distance_mismatches: int = 0
+    outlier_residuals: tuple[FloatArray, ...] = ()
+    unoriented: tuple[FrameTransform, ...] = ()
     jumps: int = 0
-    own: float = 0.0
+    yaw_variance: float = 0.0
 
 
 class MapFrame:
@@ -130,13 +131,13 @@ class MapFrame:
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         """Take in a fix at the filter's time."""
-        if fix.kind == "position" and self._asks_for_place(ekf, fix):
+        if fix.kind == "position" and self._needs_placing(ekf, fix):
             transform: FrameTransform | None = self._place(ekf, fix)
         elif self.state.oriented:
             return self._update(ekf, fix)
         else:
-            apart = fix.kind == "position" and self.state.apart
-            transform = None if apart else self._orient(ekf, fix)
+            doubtful = fix.kind == "position" and self.state.distance_mismatches > 0
+            transform = None if doubtful else self._orient(ekf, fix)
         if transform is None:
             reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
             return UpdateResult(math.nan, len(fix.value), False, reason=reason)
@@ -148,18 +149,18 @@ class MapFrame:
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
         now, s = _nav_state(ekf), self.state
-        lost = now.covariance[2, 2] - (0.0 if s.oriented else s.own)
+        lost = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
         if not (s.placed or s.oriented) or lost <= KNOWN_YAW**2:
             return
         since = now.time if s.placed else s.since  # what no fix has placed goes along
-        left = s.left
+        left = s.unoriented
         if not s.oriented:
-            left = (*left, _unturned(s.pivot, s.since, now.time))
+            left = (*left, _unoriented_stretch(s.pivot, s.since, now.time))
         self.state = MapFrameState(
-            False, False, s.transforms, now.p_W, since, left=left, jumps=s.jumps
+            False, False, s.transforms, now.p_W, since, unoriented=left, jumps=s.jumps
         )
 
-    def _asks_for_place(self, ekf: StateCloningEkf, fix: Fix) -> bool:
+    def _needs_placing(self, ekf: StateCloningEkf, fix: Fix) -> bool:
         """Whether a position is to place the track: the first, and later a much better one.
 
         While the yaw is not known a position further on says little of where the track is; but the
@@ -167,13 +168,17 @@ class MapFrame:
         """
         if not self.state.placed or self.state.oriented:
             return not self.state.placed
-        if _BETTER**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
+        if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
         seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-        apart = abs(seen - ours) > 3.0 * _across(now, 6, fix) + _AWRY * min(seen, ours)
-        self.state = changed(self.state, apart=self.state.apart + 1 if apart else 0)
-        return self.state.apart >= _CONVINCING
+        apart = abs(seen - ours) > 3.0 * _plane_sigma(now, 6, fix) + _LENGTH_TOLERANCE * min(
+            seen, ours
+        )
+        self.state = changed(
+            self.state, distance_mismatches=self.state.distance_mismatches + 1 if apart else 0
+        )
+        return self.state.distance_mismatches >= _OUTLIERS_IN_A_ROW
 
     def _place(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform:
         now, since = _nav_state(ekf), self.state.since
@@ -187,9 +192,9 @@ class MapFrame:
             placed=True,
             pivot=fix.value,
             pivot_variance=float(np.trace(fix.covariance[:2, :2])),
-            seen=SeenPositions(),
-            apart=0,
-            own=float(now.covariance[2, 2]),
+            alignment=PlanarAlignment(),
+            distance_mismatches=0,
+            yaw_variance=float(now.covariance[2, 2]),
         )
         self._remember(ekf, fix)
         return transform
@@ -198,14 +203,14 @@ class MapFrame:
         """None where the fix does not tell the direction."""
         pivot, since = self.state.pivot, self.state.since
         now = _nav_state(ekf)
-        turn, sigma = _turn(now, pivot, fix)
+        turn, sigma = _turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
         if not (
             math.isfinite(turn) and sigma <= (COARSEST_YAW if fix.kind == "yaw" else FAR_ENOUGH)
         ):
             if fix.kind != "position":
                 return None
-            turn, inflation = self.state.seen.turn
+            turn, inflation = self.state.alignment.turn
             if inflation > FAR_ENOUGH:
                 self._remember(ekf, fix)
                 return None
@@ -214,10 +219,14 @@ class MapFrame:
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
         moved = ekf.state.transformed(transform.R, transform.shift)
         ekf.state = moved.with_yaw_inflated(pivot, inflation)
-        left = (changed(stretch, time=fix.time) for stretch in self.state.left)
+        left = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
         transforms = (*self.state.transforms, *left)
         self.state = changed(
-            self.state, oriented=True, transforms=transforms, seen=SeenPositions(), left=()
+            self.state,
+            oriented=True,
+            transforms=transforms,
+            alignment=PlanarAlignment(),
+            unoriented=(),
         )
         return transform
 
@@ -227,8 +236,8 @@ class MapFrame:
         track, seen = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
         drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
-        seen_now = self.state.seen.and_one(track, seen, variance, drift)
-        self.state = changed(self.state, seen=seen_now)
+        alignment = self.state.alignment.with_position(track, seen, variance, drift)
+        self.state = changed(self.state, alignment=alignment)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
         """A transform with what is not known of it, by the state behind it."""
@@ -241,7 +250,7 @@ class MapFrame:
 
     def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
         if self.state.oriented:
-            ekf.state = begun(ekf.state, self._turn_sigma)
+            ekf.state = with_turn(ekf.state, self._turn_sigma)
         gate = chi2_quantile(self._gate, len(fix.value))
         if fix.kind == "position":
             return self._update_position(ekf, fix, gate)
@@ -255,18 +264,22 @@ class MapFrame:
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
         off = result.residual
         if off is None or not is_gated(result):
-            self.state = changed(self.state, off=())
+            self.state = changed(self.state, outlier_residuals=())
             return result
-        alike = tuple(r for r in self.state.off if r @ off > _ALIKE * norm(r) * norm(off))
-        self.state = changed(self.state, off=(*alike, off))
-        if len(self.state.off) < _CONVINCING:
+        alike = tuple(
+            r
+            for r in self.state.outlier_residuals
+            if r @ off > _SAME_DIRECTION * norm(r) * norm(off)
+        )
+        self.state = changed(self.state, outlier_residuals=(*alike, off))
+        if len(self.state.outlier_residuals) < _OUTLIERS_IN_A_ROW:
             return result
-        self.state = changed(self.state, off=(), jumps=self.state.jumps + 1)
+        self.state = changed(self.state, outlier_residuals=(), jumps=self.state.jumps + 1)
         ekf.state = before.with_position_inflated(float(norm(off)))
         return ekf.update_position_W(fix.value, fix.covariance, gate)
 
 
-def _unturned(pivot: FloatArray, since: float, until: float) -> FrameTransform:
+def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
     """Of a stretch about its pivot: stays where it is, its direction is not known."""
     zero = np.zeros(3)
     return FrameTransform(
@@ -278,7 +291,7 @@ def _nav_state(ekf: StateCloningEkf) -> NavState:
     return nav_states([ekf.state.estimate()])[0]
 
 
-def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
+def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
     """Turn of the frame about a point that a fix asks for, and how well it tells it [rad]."""
     if fix.kind == "yaw":
         turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
@@ -288,10 +301,10 @@ def _turn(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
         first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
     arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
     turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
-    return turn, _across(state, first, fix) / arm if arm > 0.0 else math.inf
+    return turn, _plane_sigma(state, first, fix) / arm if arm > 0.0 else math.inf
 
 
-def _across(state: NavState, first: int, fix: Fix) -> float:
+def _plane_sigma(state: NavState, first: int, fix: Fix) -> float:
     """Largest deviation in the plane between a fix and two rows of the state, yaw's part apart."""
     P = _without_yaw(state.covariance, first) + fix.covariance[:2, :2]
     return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))

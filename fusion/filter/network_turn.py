@@ -22,7 +22,7 @@ SECONDS = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class KnownTurn:
+class TurnEstimate:
     """What a filter knows of the turn, for a graph that begins from its state.
 
     Attributes:
@@ -35,16 +35,16 @@ class KnownTurn:
     covariance: FloatArray
 
 
-def known_turn(s: EkfState) -> KnownTurn | None:
+def turn_estimate(s: EkfState) -> TurnEstimate | None:
     """What a filter knows of it; None where no turn has begun."""
     if not s.has_turn:
         return None
     rows = [*range(CORE), s.turn_row]
     P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
-    return KnownTurn(s.network_turn, P[CORE])
+    return TurnEstimate(s.network_turn, P[CORE])
 
 
-def begun(s: EkfState, sigma: float) -> EkfState:
+def with_turn(s: EkfState, sigma: float) -> EkfState:
     """The state with a turn of which no more is known than its deviation [rad]."""
     if s.has_turn or sigma == 0.0:
         return s
@@ -53,7 +53,7 @@ def begun(s: EkfState, sigma: float) -> EkfState:
     return changed(s, P=P)
 
 
-def wandered(s: EkfState, seconds: float, sigma: float) -> EkfState:
+def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """The state after a time [s]; as it is where no turn has begun."""
     if not s.has_turn:
         return s

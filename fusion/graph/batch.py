@@ -85,7 +85,7 @@ def smooth(
     ]
     note = (
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
-        f"{solution.weighed_down} measurements weighed down"
+        f"{solution.down_weighted} measurements weighed down"
     )
     return Smoothed(states, note)
 

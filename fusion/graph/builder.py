@@ -11,7 +11,7 @@ from scipy.linalg.lapack import dpotrf
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import Displacement as Measured
 from stario.fusion.filter.network_turn import SECONDS as TURN_SECONDS
-from stario.fusion.filter.network_turn import KnownTurn
+from stario.fusion.filter.network_turn import TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
@@ -19,10 +19,10 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import (
     Segment,
+    gap_segment,
+    gap_yaw_variance,
     segment_of,
     segment_of_all,
-    turned_in_gap,
-    unseen,
 )
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
@@ -69,7 +69,7 @@ class GraphBuilder:
         first: NavState,
         count: int = 0,
         turn_sigma: float = 0.0,
-        turn: KnownTurn | None = None,
+        turn: TurnEstimate | None = None,
         streaming: bool = False,
     ) -> None:
         self._config, self._turn_sigma = config, turn_sigma
@@ -80,7 +80,7 @@ class GraphBuilder:
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
         # The filter weighs every window of a second, the graph one or two of them.
-        self._judged = streaming and f.update_rate == self._overlap
+        self._gated_by_filter = streaming and f.update_rate == self._overlap
         self._window = round(f.output_rate * WINDOW_SECONDS)  # intervals
         self._spacing = self._window // self._overlap  # intervals
         self._pending: list[ImuInterval] = []
@@ -89,7 +89,7 @@ class GraphBuilder:
         self._gaps: list[int] = []  # keyframes that a gap follows
 
     @property
-    def knows_turn(self) -> bool:
+    def estimates_turn(self) -> bool:
         """Whether the network's turn is a state."""
         return self._turn_sigma > 0.0
 
@@ -124,15 +124,15 @@ class GraphBuilder:
         if interval.gap:
             self.close()
             self._joints.clear()
-        if interval.anew is not None and guess is not None:
-            self._begin_apart(guess)
+        if interval.restart is not None and guess is not None:
+            self._begin_disconnected(guess)
             return True
         self.count = 0 if interval.gap else self.count + 1
         self._append(interval, segment)
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
-            if self.knows_turn:
+            if self.estimates_turn:
                 self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
             began = self._joints.get(self.count - self._window)
             if displacement is not None and began is not None:
@@ -156,7 +156,7 @@ class GraphBuilder:
             whole = segment_of_all(self._pending, b_g, b_a, self._config)
         if guess is None:
             _, _, _, b_g, b_a = graph.pose(graph.last)
-            guess = NavState(whole.stop, *self.reckoned(graph.last), b_g, b_a, np.empty(0))
+            guess = NavState(whole.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
         self._pending = []
         self.segments[graph.add_keyframe(whole, guess)] = []
 
@@ -181,7 +181,7 @@ class GraphBuilder:
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
         self._gaps = [k for k in self._gaps if k >= first]
 
-    def reckoned(self, k: int, time: float = math.inf) -> Pose:
+    def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
         R, v, p, b_g, b_a = self.graph.pose(k)
         for segment in self.segments[k]:
@@ -192,10 +192,10 @@ class GraphBuilder:
             R, v, p = ahead
         return R, v, p
 
-    def _begin_apart(self, state: NavState) -> None:
+    def _begin_disconnected(self, state: NavState) -> None:
         """Behind a gap too long to be bridged: from the filter's new start."""
         self.count = 0
-        k = self.graph.add_apart(state)
+        k = self.graph.add_disconnected(state)
         self.segments[k] = []
         self._joints[0] = k
 
@@ -212,8 +212,8 @@ class GraphBuilder:
         if not interval.gap:
             return segment_of(interval, R, b_g, b_a, self._config)
         self._gaps.append(last)
-        turned = turned_in_gap(interval.stop - interval.start)
-        return unseen(interval.start, interval.stop, R, b_g, b_a, self._config, turned)
+        turned = gap_yaw_variance(interval.stop - interval.start)
+        return gap_segment(interval.start, interval.stop, R, b_g, b_a, self._config, turned)
 
     def _add_displacement(
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
@@ -223,8 +223,8 @@ class GraphBuilder:
             return
         assert interval.R_NB_window is not None  # a window always comes with its first attitude
         j, R_NB = self.graph.last, interval.R_NB_window
-        term = Displacement(i, j, d_N, R_NB, covariance, self.knows_turn)
-        self.graph.add(term, gated=not self._judged)
+        term = Displacement(i, j, d_N, R_NB, covariance, self.estimates_turn)
+        self.graph.add(term, gated=not self._gated_by_filter)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:
         zero, k = np.zeros(3), self.graph.last
@@ -237,11 +237,11 @@ class GraphBuilder:
         graph = self.graph
         dt = fix.time - graph.time(k)
         R_k, v_k, p_k, _, _ = graph.pose(k)
-        R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.reckoned(k, fix.time)
+        R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
         # What the IMU adds, or what happens unseen.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
-        turned = f.gap_gyro_noise**2 * dt + turned_in_gap(dt) if k in self._gaps else 0.0
+        turned = f.gap_gyro_noise**2 * dt + gap_yaw_variance(dt) if k in self._gaps else 0.0
         drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift

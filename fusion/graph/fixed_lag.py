@@ -18,9 +18,9 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
-from stario.fusion.filter.gyro_bias import told_of_bias
+from stario.fusion.filter.gyro_bias import gained_bias_information
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.network_turn import known_turn
+from stario.fusion.filter.network_turn import turn_estimate
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
@@ -94,11 +94,11 @@ class FixedLagEstimator:
         """Move to the interval's end and take in what was measured; as `Estimator.step`."""
         taken = self._filter.step(interval, displacement, fixes)
         self._narrow_bias_prior()
-        if self._stale or interval.anew is not None:
+        if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bearing and (told := told_of_bias(*taken.bearing)):
-            self._tell_gyro_bias(*told)
+        if taken.bearing and (told := gained_bias_information(*taken.bearing)):
+            self._add_bias_information(*told)
         near = [self._near(accepted) for accepted in taken.fixes]
         if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
             self._solve()
@@ -107,11 +107,11 @@ class FixedLagEstimator:
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Take in a fix at a time before now; as `Estimator.late_fix`."""
-        judged = self._filter.judged
+        gating_counts = self._filter.gating_counts
         accepted = self._filter.late_fix(fix)
         if accepted is None:
             return None
-        if self._stale or self._filter.judged != judged:
+        if self._stale or self._filter.gating_counts != gating_counts:
             self._begin(self._builder.count)
             return accepted
         for taken in accepted:
@@ -162,8 +162,8 @@ class FixedLagEstimator:
     def _stale(self) -> bool:
         """Whether the filter knows by now that the graph began from something else."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
-        turned = self._filter.ekf.state.has_turn and not self._builder.knows_turn
-        jumped = self._filter.frames.jumps != self._jumps
+        turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
+        jumped = self._filter.map_frame_state.jumps != self._jumps
         return wider or turned or jumped or self._filter.map_frame != self._map_frame
 
     def _narrow_bias_prior(self) -> None:
@@ -171,10 +171,10 @@ class FixedLagEstimator:
         variance = self._filter.bias_prior.variance
         if variance < _NARROWER * self._bias_prior:
             more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
-            self._tell_gyro_bias(np.zeros(3), more * np.eye(3))
+            self._add_bias_information(np.zeros(3), more * np.eye(3))
             self._bias_prior = variance
 
-    def _tell_gyro_bias(self, b_g: FloatArray, covariance: FloatArray) -> None:
+    def _add_bias_information(self, b_g: FloatArray, covariance: FloatArray) -> None:
         graph = self._builder.graph
         graph.add(GyroBias(graph.last, b_g, covariance), gated=False)
 
@@ -186,10 +186,10 @@ class FixedLagEstimator:
         """A new graph from the filter's state."""
         first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
-        self._jumps = self._filter.frames.jumps
+        self._jumps = self._filter.map_frame_state.jumps
         self._bias_prior = self._filter.bias_prior.variance
         first = first.shifted(-self._origin_W)
-        turn = known_turn(self._filter.ekf.state)
+        turn = turn_estimate(self._filter.ekf.state)
         sigma = 0.0 if turn is None else self._config.filter.network_turn_sigma
         self._builder = GraphBuilder(self._config, first, count, sigma, turn, streaming=True)
         self._restart_from(first)

@@ -21,7 +21,7 @@ from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import CORE, plain_covariance
-from stario.fusion.filter.network_turn import KnownTurn
+from stario.fusion.filter.network_turn import TurnEstimate
 from stario.fusion.graph.factors import Prior, Term, TurnWander, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
@@ -49,11 +49,11 @@ class Solution:
 
     Attributes:
         rounds: linearisations of the measurements until nothing moved.
-        weighed_down: measurements that counted less than their covariance says.
+        down_weighted: measurements that counted less than their covariance says.
     """
 
     rounds: int
-    weighed_down: int
+    down_weighted: int
 
 
 class KeyframeGraph:
@@ -66,7 +66,7 @@ class KeyframeGraph:
         turn: what is known of the network's turn at it, where that is a state.
     """
 
-    def __init__(self, first: NavState, gate: float, turn: KnownTurn | None = None) -> None:
+    def __init__(self, first: NavState, gate: float, turn: TurnEstimate | None = None) -> None:
         self._gate = gate
         self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
@@ -99,7 +99,7 @@ class KeyframeGraph:
         self._insert(guess)
         return self.last
 
-    def add_apart(self, state: NavState) -> int:
+    def add_disconnected(self, state: NavState) -> int:
         """A new keyframe that nothing binds to the last one; its covariance is its prior."""
         self._insert(state)
         self.add(_prior(self.last, state), gated=False)
@@ -143,12 +143,14 @@ class KeyframeGraph:
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
-            light = sum(term.weigh(values)[2] < 1.0 for term in self._terms)
+            light = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
             (self._states, self._turns), self._tree = start, None
             if isinstance(error, IndeterminateError):
                 raise
-            raise IndeterminateError(self._named(str(error))) from error  # gtsam's way to tell
+            raise IndeterminateError(
+                self._state_named(str(error))
+            ) from error  # gtsam's way to tell
         return Solution(rounds, light)
 
     def pose(self, k: int) -> KeyframeState:
@@ -182,7 +184,7 @@ class KeyframeGraph:
         try:
             _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
-            raise IndeterminateError(self._named(str(error))) from error
+            raise IndeterminateError(self._state_named(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
         self.add(self._marginal(range(before, max(reached) + 1), rest), gated=False)
         for k in old:
@@ -212,7 +214,7 @@ class KeyframeGraph:
         """What elimination left of the keyframes that it reached."""
         turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
         for k in reached:  # a window may reach a pose alone: columns of the rest as well
-            rest.push_back(_says_nothing(k, k in self._turns))
+            rest.push_back(_uninformative_factor(k, k in self._turns))
         keys = [key(k) for k in reached for key in (X, V, B)]
         A, b = rest.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
@@ -268,7 +270,7 @@ class KeyframeGraph:
                 worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
                 raise IndeterminateError(f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s")
 
-    def _named(self, message: str) -> str:
+    def _state_named(self, message: str) -> str:
         """The state that gtsam's message is about."""
         found = re.search(r"Symbol: ([xvbt])(\d+)", message)
         if found is None:
@@ -276,7 +278,7 @@ class KeyframeGraph:
         return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
 
 
-def _prior(k: int, state: NavState, turn: KnownTurn | None = None) -> Prior:
+def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
     """A state's covariance, and that of the network's turn, as what is known of a keyframe."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     covariance: FloatArray = state.covariance
@@ -297,7 +299,7 @@ def _root_information(covariance: FloatArray) -> FloatArray:
     return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
-def _says_nothing(k: int, turned: bool) -> Any:
+def _uninformative_factor(k: int, turned: bool) -> Any:
     """A factor without information on a keyframe, and on the network's turn there."""
     blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
     if turned:

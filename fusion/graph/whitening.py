@@ -40,7 +40,7 @@ class Whitened:
         """The first keyframe it touches."""
         return self.term.keyframes[0]
 
-    def weigh(self, values: Any) -> tuple[FloatArray, list[tuple[int, FloatArray]], float]:
+    def weighted(self, values: Any) -> tuple[FloatArray, list[tuple[int, FloatArray]], float]:
         """Residual, Jacobian blocks and weight at gtsam `Values`."""
         residual, blocks = self.term.linearise(values)
         white = self.whitener @ residual
@@ -55,7 +55,7 @@ class Whitened:
 
     def factor(self, values: Any) -> Any:
         """The linear factor, linearised and weighed at `Values`."""
-        residual, blocks, weight = self.weigh(values)
+        residual, blocks, weight = self.weighted(values)
         scaled = weight * self.whitener
         return linear_factor([(key, scaled @ H) for key, H in blocks], scaled @ residual)
 

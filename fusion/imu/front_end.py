@@ -23,13 +23,15 @@ import numpy as np
 
 from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.field_buffer import FieldBuffer
-from stario.fusion.imu.frozen import FrozenWatch
-from stario.fusion.imu.gyro_unit import GyroUnitWatch
+from stario.fusion.imu.buffers import FieldBuffer, WindowBuffer
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.outliers import Flags, OutlierDetector
-from stario.fusion.imu.set_back import ClockSetBackError, SetBackWatch
-from stario.fusion.imu.window_buffer import WindowBuffer
+from stario.fusion.imu.stream_checks import (
+    ClockSetBackDetector,
+    ClockSetBackError,
+    FrozenSensorDetector,
+    GyroUnitCheck,
+)
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ABSURD, FloatArray, ImuSequence
@@ -71,10 +73,10 @@ class FrontEnd:
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
         self._fields = FieldBuffer()
-        self._late = SetBackWatch()
-        self._frozen = FrozenWatch(config.gravity)
+        self._late = ClockSetBackDetector()
+        self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
-        self.gyro_unit = GyroUnitWatch()  # for streams, that nobody can check as a whole
+        self.gyro_unit = GyroUnitCheck()  # for streams, that nobody can check as a whole
         self.counts = SampleCounts()
         self.start: Start | None = None
 
@@ -89,7 +91,7 @@ class FrontEnd:
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < ABSURD):
             self.counts.not_finite += 1
             return []
-        if self._frozen.look(sample):
+        if self._frozen.is_frozen(sample):
             self.counts.frozen += 1
             return []
         if self._ahead and time > self._newest:
@@ -176,7 +178,7 @@ class FrontEnd:
             self.start = start
         elif self._before_long_gap is not None:
             ends = np.array([self._before_long_gap, self._samples[0]])
-            intervals.append(changed(_interval(ends, self._attitude, gap=True), anew=start))
+            intervals.append(changed(_interval(ends, self._attitude, gap=True), restart=start))
             self._before_long_gap = None
         return intervals + self._complete()
 
@@ -242,7 +244,7 @@ class FrontEnd:
         return table, flags
 
     def _flag_outliers(self, table: FloatArray) -> Flags:
-        flags = self._outliers.look(table)
+        flags = self._outliers.detect(table)
         self.counts.spike += flags.spikes
         self.counts.saturated += flags.saturated
         return flags

@@ -70,7 +70,7 @@ class ImuInterval:
     levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
     accel_factor: float = 1.0
-    anew: Start | None = None
+    restart: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False
 

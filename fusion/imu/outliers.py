@@ -48,7 +48,7 @@ class OutlierDetector:
         self.largest = np.zeros(6)
         self._repeats = np.zeros(6)  # of each axis at the size that is its largest now
 
-    def look(self, table: FloatArray) -> Flags:
+    def detect(self, table: FloatArray) -> Flags:
         """Mend spikes in place and say what is wrong.
 
         Args:

@@ -37,7 +37,7 @@ _LEAST_WALK = 1e-7
 
 _GAP_STEPS = 10
 
-GAP_TURN = 0.5
+GAP_YAW_RATE = 0.5
 """How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
 second and 0.36 to 0.7 per second over three in the training and validation recordings."""
 
@@ -113,19 +113,19 @@ def segment_of(
         config: noise and gravity.
     """
     if interval.gap:
-        return unseen(interval.start, interval.stop, R_WB, b_g, b_a, config)
+        return gap_segment(interval.start, interval.stop, R_WB, b_g, b_a, config)
     noise = _noise(interval, config)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
     )
 
 
-def turned_in_gap(seconds: float) -> float:
+def gap_yaw_variance(seconds: float) -> float:
     """Variance of a walker's turn since a gap began [rad^2]: as of one rate all through it."""
-    return min(GAP_TURN * seconds, UNKNOWN_YAW) ** 2
+    return min(GAP_YAW_RATE * seconds, UNKNOWN_YAW) ** 2
 
 
-def unseen(
+def gap_segment(
     start: float,
     stop: float,
     R_WB: FloatArray,

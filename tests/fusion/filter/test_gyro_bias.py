@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.gyro_bias import GyroBiasPrior, told_of_bias
+from stario.fusion.filter.gyro_bias import GyroBiasPrior, gained_bias_information
 from stario.fusion.state import NavState
 
 
@@ -47,15 +47,15 @@ def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_covariance() -> None:
     assert (np.diag(ekf.P)[9:12] > np.diag(P)[9:12]).all()
 
 
-def wanted(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0) -> GyroBiasPrior:
+def updated(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0) -> GyroBiasPrior:
     P = np.diag([prior.variance, prior.variance, sigma**2])
-    return prior.wanted(levelled, 0.0, np.array([0.0, 0.0, b]), P, wander=0.0)
+    return prior.updated(levelled, 0.0, np.array([0.0, 0.0, b]), P, wander=0.0)
 
 
 def test_a_bias_that_the_data_tell_clearly_widens_it() -> None:
     prior = GyroBiasPrior(1e-3, 1e-6)
     # Posterior of a measured 8e-3 +- 1e-3: half of it, the prior being as sure.
-    wider = wanted(prior, 4e-3, 1e-3 / np.sqrt(2.0))
+    wider = updated(prior, 4e-3, 1e-3 / np.sqrt(2.0))
     assert wider.variance == pytest.approx(8e-3**2 - 3e-3**2)
 
 
@@ -63,18 +63,18 @@ def test_a_bias_that_the_data_tell_clearly_widens_it() -> None:
 def test_what_is_vague_or_fits_leaves_it_alone(b: float, e: float) -> None:
     """The network's displacements alone tell 2e-2 rad/s: their slow errors look like a bias."""
     prior, share = GyroBiasPrior(1e-3, 1e-6), 1e-6 / (1e-6 + e**2)
-    assert wanted(prior, share * b, np.sqrt(share) * e).variance == pytest.approx(1e-6)
+    assert updated(prior, share * b, np.sqrt(share) * e).variance == pytest.approx(1e-6)
 
 
 def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> None:
     first = GyroBiasPrior.first(1e-3)
     nothing = np.zeros(3), first.variance * np.eye(3), 0.0
-    early = first.wanted(0.0, 1e-2, *nothing)
-    late = early.wanted(0.0, 1e-3, *nothing)
+    early = first.updated(0.0, 1e-2, *nothing)
+    late = early.updated(0.0, 1e-3, *nothing)
     assert 3e-3 < np.sqrt(early.variance) < 6e-3
     assert np.sqrt(late.variance) < 1.2e-3
-    raw = late.wanted(0.05, 1e-3, *nothing).wanted(0.02, 1e-3, *nothing)
-    assert np.sqrt(raw.variance) > 0.03
+    uncorrected = late.updated(0.05, 1e-3, *nothing).updated(0.02, 1e-3, *nothing)
+    assert np.sqrt(uncorrected.variance) > 0.03
 
 
 def test_what_a_measurement_of_the_bias_told_is_that_measurement() -> None:
@@ -82,7 +82,7 @@ def test_what_a_measurement_of_the_bias_told_is_that_measurement() -> None:
     before, axis, sigma = ekf.state, np.array([[0.6, 0.0, 0.8]]), 3e-4
     off = np.array([5e-3]) - axis @ before.b_g
     ekf.update_linear(off, [(9, axis)], np.array([[sigma**2]]))
-    told = told_of_bias(before, ekf.state)
+    told = gained_bias_information(before, ekf.state)
     assert told is not None
     mean, covariance = told
     np.testing.assert_allclose(mean, 5e-3 * axis[0], rtol=1e-6, atol=1e-9)
@@ -95,4 +95,4 @@ def test_what_says_nothing_of_the_bias_tells_nothing() -> None:
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))
     before = ekf.state
     ekf.update_position_W(np.ones(3), 0.01 * np.eye(3))
-    assert told_of_bias(before, ekf.state) is None
+    assert gained_bias_information(before, ekf.state) is None

@@ -100,7 +100,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
 def test_a_field_of_another_size_counts_for_less() -> None:
     reference = MagneticReference()
     for k in range(20):
-        reference = reference.seen(0.5 * k, 45.0, 1.0, news=True)
+        reference = reference.updated(0.5 * k, 45.0, 1.0, new_place=True)
     gains = []
     for scale in (1.0, 1.5):
         ekf = StateCloningEkf(2)
@@ -114,7 +114,7 @@ def test_a_field_of_another_size_counts_for_less() -> None:
 def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> None:
     rng = np.random.default_rng(1)
     wander = {}
-    for place, spread, news in (
+    for place, spread, new_place in (
         ("quiet", 0.01, True),
         ("steel", 0.4, True),
         ("table", 0.01, False),
@@ -122,7 +122,7 @@ def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> No
         reference = MagneticReference()
         for k in range(120):
             size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
-            reference = reference.seen(0.5 * k, size, dip, news)
+            reference = reference.updated(0.5 * k, size, dip, new_place)
         wander[place] = reference.wander_sigma
     assert wander["quiet"] < 0.15
     assert wander["steel"] == wander["table"] == 0.4  # one spot says nothing of the others

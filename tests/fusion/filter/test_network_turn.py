@@ -15,7 +15,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fixed import fixed_track, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
-from stario.fusion.filter.seen_positions import SeenPositions
+from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.fusion.lie import yaw_twist
 from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.attitude.so3 import exp_so3
@@ -130,15 +130,15 @@ def test_positions_too_near_for_one_to_tell_the_direction_tell_it_together(
 # --- the fit -------------------------------------------------------------------------------------
 
 
-def seen(rng: np.random.Generator, turn: float, count: int, sigma: float) -> SeenPositions:
+def seen(rng: np.random.Generator, turn: float, count: int, sigma: float) -> PlanarAlignment:
     """Of a walk in a room; every position's own noise in the fix."""
     z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
     noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)
     fixed = np.exp(1j * turn) * z + (3.0 - 1.0j) + noise
-    positions = SeenPositions()
+    positions = PlanarAlignment()
     for a, b in zip(z, fixed, strict=True):
         pair = np.array([a.real, a.imag]), np.array([b.real, b.imag])
-        positions = positions.and_one(*pair, sigma**2, 0.0)
+        positions = positions.with_position(*pair, sigma**2, 0.0)
     return positions
 
 
@@ -152,15 +152,15 @@ def test_the_fit_is_as_good_as_it_says(count: int) -> None:
 
 
 def test_nothing_and_one_place_tell_no_direction() -> None:
-    assert SeenPositions().turn[1] == np.inf
-    here = SeenPositions()
+    assert PlanarAlignment().turn[1] == np.inf
+    here = PlanarAlignment()
     for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
-        here = here.and_one(np.zeros(2), fix, 1.0, 0.0)
+        here = here.with_position(np.zeros(2), fix, 1.0, 0.0)
     assert here.turn[1] > 10.0
 
 
 def test_a_track_that_drifted_since_counts_for_less() -> None:
     steady = seen(np.random.default_rng(2), 0.5, 8, 0.3)
     last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
-    kept, drifted = (steady.and_one(*last, 0.09, drift) for drift in (0.0, 5.0))
+    kept, drifted = (steady.with_position(*last, 0.09, drift) for drift in (0.0, 5.0))
     assert drifted.turn[1] > 2.0 * kept.turn[1]

@@ -178,7 +178,7 @@ def test_measurements_without_meaning_are_refused_and_counted(
     assert ate(track, walk) < 0.5
 
 
-def test_outliers_are_weighed_down(walk: ImuSequence, make_oracle: Make) -> None:
+def test_outliers_are_down_weighted(walk: ImuSequence, make_oracle: Make) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG, sigma=0.05), 2.0, 0.05**2)
     track = graph(model).run(walk)
     assert "weighed down" in track.health.notes[0]

@@ -16,7 +16,7 @@ def saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     """Samples flagged in a stream that is looked at interval by interval."""
     detector, rows = OutlierDetector(), table(gyro_x)
     found = [
-        detector.look(rows[k : k + size].copy()).saturated
+        detector.detect(rows[k : k + size].copy()).saturated
         for k in range(0, len(rows) - 1, size - 1)
     ]
     return sum(found)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, PriorPose
-from stario.fusion.imu.set_back import ClockSetBackError, SetBackWatch
+from stario.fusion.imu.stream_checks import ClockSetBackDetector, ClockSetBackError
 from stario.fusion.report.health import told
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
@@ -55,7 +55,7 @@ def test_a_recordings_track_ends_there_and_its_health_says_why(
 
 
 def test_late_samples_and_bursts_are_no_other_clock() -> None:
-    watch = SetBackWatch()
+    watch = ClockSetBackDetector()
     for k in range(300):  # two sensors in turn, one half a second behind
         watch.on_time()
         watch.late(0.01 * k - 0.5, 0.01 * k)

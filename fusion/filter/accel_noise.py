@@ -15,14 +15,14 @@ from dataclasses import dataclass
 
 from stario.fusion.filter.engine import UpdateResult
 
-TYPICAL = 0.3
+TARGET_NIS = 0.3
 """NIS per degree of freedom that is aimed at, its median: the network's errors are alike for
 seconds, so that honest innovations are smaller than single errors."""
 
 GAIN, FIRST_GAIN = 0.05, 0.2
 """Of the logarithm, per displacement: in the long run, and at first, when nothing is known."""
 
-LARGEST = 30.0
+MAX_FACTOR = 30.0
 """Factor at most: the accelerometer then says no more than that nobody jumps."""
 
 _STEPS = 4
@@ -30,7 +30,7 @@ _STEPS = 4
 
 
 @dataclass(frozen=True)
-class AccelerometerWorth:
+class AccelNoiseScale:
     """How much noisier the accelerometer acts than the configuration says.
 
     Attributes:
@@ -46,12 +46,12 @@ class AccelerometerWorth:
         """On the noise density, in steps."""
         return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
 
-    def seen(self, result: UpdateResult) -> AccelerometerWorth:
+    def updated(self, result: UpdateResult) -> AccelNoiseScale:
         """With what one displacement's innovation tells; nothing where there is none."""
         if not math.isfinite(result.nis):
             return self
-        ratio = (result.nis / (TYPICAL * result.dof)) ** 2
+        ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
         moved = self.log_factor + self.gain * excess
         gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
-        return AccelerometerWorth(min(max(moved, 0.0), math.log(LARGEST)), gain)
+        return AccelNoiseScale(min(max(moved, 0.0), math.log(MAX_FACTOR)), gain)

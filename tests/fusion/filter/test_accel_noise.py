@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.accelerometer import AccelerometerWorth
+from stario.fusion.filter.accel_noise import AccelNoiseScale
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
 from stario.sequences.sequence import ImuSequence
@@ -29,7 +29,7 @@ def factor_at_the_end(
         if measured is not None and k in false:
             measured = (measured[0] + [1.0, 0.0, 0.0], measured[1])
         estimator.step(shaken, measured)
-    return estimator.accelerometer.factor
+    return estimator.accel_noise.factor
 
 
 def test_a_bad_accelerometer_is_found_and_a_good_one_keeps_its_worth(
@@ -49,11 +49,11 @@ def test_five_seconds_of_false_displacements_are_not_its_fault(make_walk, make_o
 
 @pytest.mark.parametrize(("nis", "moves"), [(1e9, 1), (0.0, -1)])
 def test_one_displacement_moves_it_by_little(nis: float, moves: int) -> None:
-    before = AccelerometerWorth(log_factor=1.0, gain=0.05)
-    after = before.seen(UpdateResult(nis, 3, True))
+    before = AccelNoiseScale(log_factor=1.0, gain=0.05)
+    after = before.updated(UpdateResult(nis, 3, True))
     assert after.log_factor - before.log_factor == pytest.approx(moves * 0.05, abs=1e-6)
 
 
 def test_what_could_not_be_judged_tells_nothing() -> None:
-    before = AccelerometerWorth(log_factor=1.0)
-    assert before.seen(UpdateResult(float("nan"), 3, False)) == before
+    before = AccelNoiseScale(log_factor=1.0)
+    assert before.updated(UpdateResult(float("nan"), 3, False)) == before

@@ -14,8 +14,8 @@ from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
 from stario.fusion.evaluation.checks.spoiling import faults
+from stario.fusion.filter.alternative import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.sceptic import Sceptic, SecondOpinion
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 
@@ -75,7 +75,7 @@ def test_it_travels_with_a_snapshot(
     # The false displacements have not ended yet.
     assert whole._estimator is not None
     state = whole._estimator.state
-    assert isinstance(getattr(state, "sceptic", None), Sceptic)
+    assert isinstance(getattr(state, "alternative", None), AlternativeHypothesis)
     again = FalseFor(oracle, 98, 106)
     again.count = model.count
     resumed = Navigator(again, CONFIG)
@@ -84,34 +84,34 @@ def test_it_travels_with_a_snapshot(
         np.testing.assert_array_equal(ours.p_W, theirs.p_W)
 
 
-def opinion() -> SecondOpinion:
+def hypotheses() -> HypothesisPair:
     filter_ = StateCloningEkf(slots=0)
     filter_.state = replace(filter_.state, time=10.0)
-    asked = SecondOpinion(filter_)
-    asked.sceptic = Sceptic(replace(filter_.state, b_a=np.ones(3)), 10.0)
+    asked = HypothesisPair(filter_)
+    asked.alternative = AlternativeHypothesis(replace(filter_.state, b_a=np.ones(3)), 10.0)
     return asked
 
 
 def test_two_displacements_that_fit_it_alone_convince() -> None:
-    asked = opinion()
-    asked.ask(lambda: False, fits_filter=False)
-    asked.ask(lambda: True, fits_filter=False)
-    assert asked.sceptic is not None
+    asked = hypotheses()
+    asked.compare(lambda: False, fits_filter=False)
+    asked.compare(lambda: True, fits_filter=False)
+    assert asked.alternative is not None
     assert asked.ekf.state.b_a[0] == 0.0
-    asked.ask(lambda: True, fits_filter=False)
-    assert asked.sceptic is None
+    asked.compare(lambda: True, fits_filter=False)
+    assert asked.alternative is None
     assert asked.ekf.state.b_a[0] == 1.0
 
 
 def test_it_is_given_up_where_both_agree_and_where_time_is_over() -> None:
-    asked = opinion()
+    asked = hypotheses()
     for _ in range(4):
-        assert asked.sceptic is not None
-        asked.ask(lambda: True, fits_filter=True)
-    assert asked.sceptic is None
-    late = opinion()
-    assert late.sceptic is not None
-    late.sceptic = replace(late.sceptic, ekf=replace(late.sceptic.ekf, time=16.5))
-    late.ask(lambda: False, fits_filter=True)
-    assert late.sceptic is None
+        assert asked.alternative is not None
+        asked.compare(lambda: True, fits_filter=True)
+    assert asked.alternative is None
+    late = hypotheses()
+    assert late.alternative is not None
+    late.alternative = replace(late.alternative, ekf=replace(late.alternative.ekf, time=16.5))
+    late.compare(lambda: False, fits_filter=True)
+    assert late.alternative is None
     assert late.ekf.state.b_a[0] == 0.0

@@ -20,7 +20,7 @@ from stario.sequences.sequence import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPositions:
+class PlanarAlignment:
     """Sums over positions, counted from a point nearby.
 
     Attributes:
@@ -33,9 +33,9 @@ class SeenPositions:
     count: int = 0
     drift: float = 0.0
 
-    def and_one(
+    def with_position(
         self, track: FloatArray, fix: FloatArray, variance: float, drift: float
-    ) -> SeenPositions:
+    ) -> PlanarAlignment:
         """With one more.
 
         Args:
@@ -48,7 +48,7 @@ class SeenPositions:
         row = np.array([1.0, a, b, c, d, a * c + b * d, a * d - b * c, a * a + b * b])
         usual = self.count / self.sums[0] if self.count else 1.0
         kept = usual / (usual + max(0.0, drift - self.drift))
-        return SeenPositions(kept * self.sums + row / variance, self.count + 1, drift)
+        return PlanarAlignment(kept * self.sums + row / variance, self.count + 1, drift)
 
     @property
     def turn(self) -> tuple[float, float]:

@@ -19,20 +19,20 @@ from stario.fusion.filter.ekf_state import EkfState
 GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the sceptic."""
 
-_CONVINCING = 2
+_FITS_TO_REPLACE = 2
 """Displacements that fit the sceptic alone, until it is believed."""
 
-_ALIKE = 4
+_FITS_TO_DROP = 4
 """That fit both: it was one outlier, or few, and nothing is left to decide."""
 
-_SECONDS = 6.0
+_LONGEST = 6.0
 """The IMU alone knows no more beyond."""
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
-class Sceptic:
+class AlternativeHypothesis:
     """The filter had it left out the displacements that do not fit.
 
     Attributes:
@@ -44,30 +44,32 @@ class Sceptic:
 
     ekf: EkfState
     began: float
-    right: int = 0
-    alike: int = 0
+    exclusive_fits: int = 0
+    shared_fits: int = 0
 
-    def judged(self, fits: bool, fits_filter: bool) -> Sceptic:
+    def updated(self, fits: bool, fits_filter: bool) -> AlternativeHypothesis:
         """With whether a displacement fits it, and whether it fits the filter."""
         if not fits:
-            alone = self.right if not fits_filter else 0
-            return changed(self, right=alone, alike=0)
+            alone = self.exclusive_fits if not fits_filter else 0
+            return changed(self, exclusive_fits=alone, shared_fits=0)
         return changed(
-            self, right=self.right + (not fits_filter), alike=self.alike + 1 if fits_filter else 0
+            self,
+            exclusive_fits=self.exclusive_fits + (not fits_filter),
+            shared_fits=self.shared_fits + 1 if fits_filter else 0,
         )
 
     @property
-    def is_convincing(self) -> bool:
+    def should_replace(self) -> bool:
         """Whether it should take the filter's place."""
-        return self.right >= _CONVINCING
+        return self.exclusive_fits >= _FITS_TO_REPLACE
 
     @property
-    def is_over(self) -> bool:
+    def is_obsolete(self) -> bool:
         """Whether it is of no more use."""
-        return self.alike >= _ALIKE or self.ekf.time - self.began > _SECONDS
+        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _LONGEST
 
 
-class SecondOpinion:
+class HypothesisPair:
     """A filter, and the sceptic beside it while there is one.
 
     Args:
@@ -80,28 +82,31 @@ class SecondOpinion:
 
     def __init__(self, ekf: StateCloningEkf) -> None:
         self.ekf = ekf
-        self.sceptic: Sceptic | None = None
+        self.alternative: AlternativeHypothesis | None = None
 
-    def both(self, work: Callable[[], Made]) -> Made:
+    def apply_to_both(self, work: Callable[[], Result]) -> Result:
         """Do it to the filter, then to the sceptic; returns what came of the first."""
-        made = work()
-        if self.sceptic is not None:
-            mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
+        result = work()
+        if self.alternative is not None:
+            filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
             work()
-            self.sceptic, self.ekf.state = changed(self.sceptic, ekf=self.ekf.state), mine
-        return made
+            self.alternative, self.ekf.state = (
+                changed(self.alternative, ekf=self.ekf.state),
+                filter_state,
+            )
+        return result
 
-    def ask(self, fits: Callable[[], bool], fits_filter: bool) -> None:
+    def compare(self, fits: Callable[[], bool], fits_filter: bool) -> None:
         """About a displacement that the filter has taken in.
 
         Args:
             fits: updates whatever state the filter holds with it, if it fits that one.
             fits_filter: whether it fitted the filter.
         """
-        if self.sceptic is None:
+        if self.alternative is None:
             return
-        mine, self.ekf.state = self.ekf.state, self.sceptic.ekf
+        filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
         fitted = fits()
-        asked = changed(self.sceptic, ekf=self.ekf.state).judged(fitted, fits_filter)
-        self.ekf.state = asked.ekf if asked.is_convincing else mine
-        self.sceptic = None if asked.is_convincing or asked.is_over else asked
+        compared = changed(self.alternative, ekf=self.ekf.state).updated(fitted, fits_filter)
+        self.ekf.state = compared.ekf if compared.should_replace else filter_state
+        self.alternative = None if compared.should_replace or compared.is_obsolete else compared

@@ -1,14 +1,15 @@
-"""The network's input, put together from one interval after the other."""
+"""Buffers of a stream: the last second for the network, magnetic fields until their interval."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import ABSURD, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SECONDS,
@@ -19,6 +20,19 @@ from stario.sequences.windows import (
 
 _TAIL = 4
 """Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
+
+_FIELDS = 64
+"""Fields that are kept: more than come between two intervals."""
+
+_AHEAD = 1.0
+"""A field that is this much ahead of the newest sample [s] is refuted by one that is not."""
+
+_FIELD_SECONDS = 0.11
+"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
+
+
+_LATE = 0.1
+"""A field older than the interval that was cut last by this [s] belongs to none that comes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +108,40 @@ class WindowBuffer:
         imu_N = np.concatenate([block.imu_N for block in blocks], axis=1)
         heading = float(mean_heading(np.array([block.facing_N for block in blocks])))
         return Window(imu_N, blocks[0].R_NB, heading, any(block.flagged for block in blocks))
+
+
+class FieldBuffer:
+    """The newest magnetic fields of a stream."""
+
+    def __init__(self) -> None:
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
+        self._asked = -math.inf
+
+    def add(self, time: float, field_B: FloatArray, now: float) -> bool:
+        """Take in a field (3,) [uT] in B; False where its value or its time cannot be right.
+
+        Args:
+            time: its own [s].
+            field_B: (3,) [uT].
+            now: time of the newest sample [s]. One wild time must not make all that follow look
+                late, so a field far ahead of it counts only until an earlier one comes.
+        """
+        while (
+            self._fields
+            and time <= (last := self._fields[-1][0])
+            and -math.inf < now < last - _AHEAD
+        ):
+            self._fields.pop()
+        newest = self._fields[-1][0] if self._fields else -math.inf
+        newest = max(newest, self._asked - _LATE)
+        right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD
+        if right:
+            self._fields.append((time, field_B))
+        return right
+
+    def at(self, time: float) -> FloatArray | None:
+        """The newest one at a time [s]; fields from ahead of it wait."""
+        self._asked = time
+        return next(
+            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
+        )

@@ -1,0 +1,174 @@
+"""Faults that only a running stream shows: a clock set back, a frozen sensor, gyro in deg/s.
+
+Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
+advance among themselves for seconds come from another clock, and how much time has passed between
+the two is unknown.
+
+Frozen sensor: no real sensor measures the same six numbers for long, since its noise changes the
+last digits. One that does has stopped, and its samples are treated as a gap. Values that have never
+changed are left to the checks of a stream's first second; they may be simulated without noise.
+
+Unit of the gyroscope: it cannot be determined at rest. A recording is checked as a whole before it
+runs (`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece
+may fail because the device is thrown or dropped, so several, with no calm one in between, are
+needed to refuse the stream.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stario.fusion.imu.intervals import ImuInterval
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.checks import average_force, check_gyro
+from stario.sequences.sequence import FloatArray
+from stario.sequences.units import GYRO_UNITS
+
+SET_BACK_SECONDS = 5.0
+"""Late samples that advance for so long in a row [s] are of a clock that was set back; batches that
+come twice or in the wrong order are shorter."""
+
+_FROZEN_SECONDS = 0.1
+"""One sample for so long [s] is none: loggers that repeat slow ones do so for a few hundredths."""
+
+_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
+"""A coarse sensor at rest reads one sample as well: no faster turn [rad/s], and gravity to within
+this [m/s^2]."""
+
+_PIECE_S = 4.0
+"""Length of a piece [s], as in the check of recordings."""
+
+_WRONG_PIECES = 3
+"""Pieces that must fail, no calm one in between: two may share one fall; recordings fail none."""
+
+_TURNING_PIECES = 12
+"""Pieces in which the device turns that clear the gyroscope; later failures are not its unit's."""
+
+_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
+"""Exceeded for a twentieth of a piece: the first by walks, but at rest not by noise and bias, even
+in deg/s; the second by hardly any walk (recorded are 4.2 at most), but by all read as deg/s."""
+
+
+class ClockSetBackError(InputError):
+    """The clock of the samples was set back.
+
+    Attributes:
+        by: how far [s].
+    """
+
+    def __init__(self, by: float) -> None:
+        self.by = by
+        super().__init__(
+            "time",
+            f"a clock set back by {by:.3g} s",
+            "one that goes on",
+            "what follows is another recording",
+        )
+
+
+class ClockSetBackDetector:
+    """Watches the samples that come late."""
+
+    def __init__(self) -> None:
+        self._first = self._last = 0.0
+        self._running = False
+
+    def on_time(self) -> None:
+        """A sample was not late."""
+        self._running = False
+
+    def late(self, time: float, newest: float) -> float:
+        """A sample at `time` came after one at `newest` [s].
+
+        Returns:
+            For how long such samples have come in a row by now [s].
+
+        Raises:
+            ClockSetBackError: the late samples are of another clock.
+        """
+        if not self._running or time < self._last:
+            self._first = time
+        self._running, self._last = True, time
+        if time - self._first >= SET_BACK_SECONDS:
+            raise ClockSetBackError(newest - self._first)
+        return time - self._first
+
+
+class FrozenSensorDetector:
+    """Watches the samples of a stream.
+
+    Args:
+        gravity: magnitude [m/s^2].
+    """
+
+    def __init__(self, gravity: float) -> None:
+        self._gravity = gravity
+        self._values: tuple[float, ...] = ()
+        self._since = math.inf
+        self._changed = False
+
+    def is_frozen(self, sample: tuple[float, ...]) -> bool:
+        """Whether a sample (time, gyro, accel) is only the one before it, held for too long."""
+        time, values = sample[0], sample[1:]
+        if values != self._values:
+            self._changed = bool(self._values)
+            self._values, self._since = values, time
+            return False
+        return self._changed and time - self._since > _FROZEN_SECONDS and not self._looks_at_rest()
+
+    def _looks_at_rest(self) -> bool:
+        gyro, accel = self._values[:3], self._values[3:]
+        off = abs(math.hypot(*accel) - self._gravity)
+        return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
+
+
+class GyroUnitCheck:
+    """Looks at a stream's intervals until the unit of the gyroscope is beyond doubt."""
+
+    def __init__(self) -> None:
+        self._tables: list[FloatArray] = []  # time, gyro, accel (k, 7) of the piece so far
+        self._wrong = self._turned = 0
+
+    def check(self, interval: ImuInterval) -> None:
+        """Take in the stream's next interval.
+
+        Raises:
+            InputError: the gyroscope cannot be in rad/s.
+        """
+        if interval.gap:
+            self._tables = []
+            return
+        if self._turned >= _TURNING_PIECES:
+            return
+        table = np.column_stack([interval.time, interval.gyro, interval.accel])
+        self._tables.append(table[1:] if self._tables else table)
+        if interval.stop - self._tables[0][0, 0] > _PIECE_S - 1e-6:
+            piece, self._tables = np.vstack(self._tables), []
+            self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
+
+    def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
+        try:
+            _check_unit(time, gyro, accel)
+        except InputError as error:
+            self._wrong += 1
+            if self._wrong >= _WRONG_PIECES:
+                fix = "if it is in deg/s, push np.radians(gyro)"
+                raise InputError("gyro", error.found, error.expected, fix) from None
+        else:
+            speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
+            if speed < _DOUBTFUL_RAD_S:
+                self._wrong = 0
+                self._turned += int(speed > _TURNING_RAD_S)
+
+
+def _check_unit(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
+    whole = [slice(0, len(time))]
+    check_gyro(
+        "stream",
+        gyro,
+        float(np.median(np.linalg.norm(accel, axis=1))),
+        average_force(time, gyro, accel, whole),
+        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, whole),
+    )
