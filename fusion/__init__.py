@@ -1,4 +1,4 @@
-"""What we conclude: preintegration, filter, navigator, tracks, command."""
+"""Sensor fusion: preintegration, EKF and factor graph, navigator, evaluation, command line."""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,7 @@
-"""The back ends behind one interface: the filter, and the factor graph that starts from it.
+"""The two back ends behind one interface: the EKF, and the factor graph initialised from it.
 
-For a stream a back end makes an estimator that is stepped from interval to interval; for a
-recording it turns what the filter made of it into the track's states.
+For a stream, a back end creates an estimator that is stepped interval by interval; for a recording,
+it turns the filter's output into the states of the track.
 """
 
 from __future__ import annotations
@@ -29,47 +29,47 @@ from stario.fusion.state import Health, NavState, SmoothedPose, Track, track_fro
 from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
-"""The filter; or the factor graph, fixed-lag for streams and of the whole for recordings."""
+"""The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
 
 
 class StreamEstimator(Protocol):
-    """What a stream needs of an estimator."""
+    """Interface of an estimator that runs on a stream."""
 
     @property
     def time(self) -> float:
-        """Of the newest state [s]."""
+        """Time of the newest state [s]."""
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """The newest pose one window late, None where there is none."""
+        """The newest pose, delayed by one window; None if there is none."""
 
     state: Any
-    """All that varies, for a snapshot; one from a snapshot may be put back."""
+    """The complete state, for snapshots; assigning one restores it."""
 
     def step(
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> object:
-        """Move to the interval's end and take in what was measured."""
+        """Propagate to the end of the interval and apply its measurements."""
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Take in a fix at a time before now; None where it is too late."""
+        """Apply a fix from the past; None if it is too old."""
 
     def nav_state(self) -> NavState:
         """The newest state."""
 
     def health(self, counts: SampleCounts) -> Health:
-        """The report so far."""
+        """The health report so far."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredRecording:
-    """What the filter made of a recording.
+    """A recording after the filter.
 
     Attributes:
-        estimator: behind the last interval.
-        estimates: the start and one for each interval.
-        measurements: what it took in, one for each interval.
-        clones: poses that left the window, corrected by all of it.
+        estimator: after the last interval.
+        estimates: the initial state and one per interval.
+        measurements: those applied, one entry per interval.
+        clones: poses released from the window, corrected by all its measurements.
     """
 
     estimator: Estimator
@@ -80,7 +80,7 @@ class FilteredRecording:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """States of a recording in the frame it ends in, the poses one window late, and notes."""
+    """States of a recording in its final map frame, poses delayed by one window, and notes."""
 
     states: list[NavState]
     smoothed: Trajectory | None
@@ -88,15 +88,15 @@ class Solution:
 
 
 class Backend(Protocol):
-    """What a navigator needs of a back end."""
+    """Interface of a back end."""
 
     def stream(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None
     ) -> StreamEstimator:
-        """An estimator for a stream that starts so."""
+        """Create an estimator for a stream with this start."""
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-        """The states of a recording."""
+        """Return the states of a filtered recording."""
 
 
 class EkfBackend:
@@ -105,11 +105,11 @@ class EkfBackend:
     def stream(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None
     ) -> StreamEstimator:
-        """An estimator that keeps the last second, since fixes may come late."""
+        """Create an estimator that keeps the last second, since fixes may come late."""
         return Estimator(config, start, prior, streaming=True)
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-        """The filter's states."""
+        """Return the filter's states."""
         transforms = filtered.estimator.map_frame_state.transforms
         states = in_last_frame(nav_states(filtered.estimates), transforms)
         smoothed = smoothed_track(smoothed_poses(filtered.clones), transforms)
@@ -117,16 +117,16 @@ class EkfBackend:
 
 
 class GraphBackend:
-    """The factor graph, more accurate and slower."""
+    """The factor graph: more accurate, and slower."""
 
     def stream(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None
     ) -> StreamEstimator:
-        """The fixed-lag graph."""
+        """Create a fixed-lag graph."""
         return FixedLagEstimator(config, start, prior)
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-        """The whole optimised at once; the filter's states where that is not determined."""
+        """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
         estimator = filtered.estimator
         transforms, states = estimator.map_frame_state.transforms, nav_states(filtered.estimates)
         end, seen = states[-1], estimator.ekf.state.field is not None
@@ -139,7 +139,7 @@ class GraphBackend:
 
 
 def _with_bias_prior(first: NavState, variance: float) -> NavState:
-    """The first state with the gyroscope bias's prior as it proved right later."""
+    """Return the first state with the gyroscope bias prior that the filter ended with."""
     covariance = first.covariance.copy()
     covariance[9:12, 9:12] = variance * np.eye(3)
     return replace(first, covariance=covariance)
@@ -156,9 +156,9 @@ def track_recording(
     fixes: Iterable[Fix],
     progress: Progress,
 ) -> Track:
-    """The track of a recording: filtered, then solved by the back end."""
+    """Filter a recording, then solve it with the back end."""
     began = perf_counter()
-    queue = FixQueue(fixes, most=math.inf)  # a recording's are all there at once
+    queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     filtered = _filtered(recording, config, prior, queue, progress)
     solution = backend.solve(filtered, config)
     counts, estimator = recording.front_end.counts, filtered.estimator

@@ -1,4 +1,4 @@
-"""States with a few attributes changed, which the filter makes dozens of per interval."""
+"""Fast copies of states with a few attributes replaced; the filter makes dozens per interval."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ T = TypeVar("T")
 
 
 def changed(state: T, **attributes: Any) -> T:
-    """A frozen dataclass with other values for some attributes, the rest shared.
+    """Return a copy of a frozen dataclass with some attributes replaced, the others shared.
 
-    As `dataclasses.replace`, in a quarter of its time: attributes are neither looked up nor checked
-    again, so it is for states without `__post_init__` alone.
+    Like `dataclasses.replace` in a quarter of its time: attributes are neither looked up nor
+    checked again, so it is only for states without `__post_init__`.
     """
     new = object.__new__(type(state))
     vars(new).update(vars(state))

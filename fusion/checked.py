@@ -1,4 +1,4 @@
-"""Arrays checked at the public edge."""
+"""Checks of arguments at the public edge."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from stario.sequences.sequence import FloatArray
 
 
 def check_type(name: str, value: object, kind: type, otherwise: str | None = "") -> None:
-    """Refuse an argument of another type.
+    """Check the type of an argument.
 
     Args:
-        name: of the argument.
-        value: given.
-        kind: it must be of.
-        otherwise: what gives one; None where the argument may be None as well.
+        name: name of the argument.
+        value: value given.
+        kind: required type.
+        otherwise: how to obtain one, for the message; None if the argument may be None.
 
     Raises:
-        InputError: naming the argument.
+        InputError: the type differs; names the argument.
     """
     if not (isinstance(value, kind) or (otherwise is None and value is None)):
         expected = f"of type {kind.__name__}" + (" or None" if otherwise is None else "")
@@ -28,10 +28,10 @@ def check_type(name: str, value: object, kind: type, otherwise: str | None = "")
 
 
 def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """A copy of `value` as float64 of a given shape.
+    """Return a copy of `value` as float64 of the given shape.
 
     Raises:
-        InputError: it holds no numbers or has another shape.
+        InputError: it is not numeric or has another shape.
     """
     try:
         array = np.array(value, dtype=np.float64)
@@ -43,7 +43,7 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """A copy of `value` as finite float64 of a given shape.
+    """Return a copy of `value` as finite float64 of the given shape.
 
     Raises:
         InputError: as for `shaped`, or a value is not finite.
@@ -55,10 +55,10 @@ def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def check_covariance(covariance: FloatArray) -> None:
-    """Refuse a matrix that is no covariance.
+    """Check that a matrix is a covariance.
 
     Raises:
-        InputError: it is not symmetric, or has a negative eigenvalue beyond rounding.
+        InputError: it is asymmetric, or an eigenvalue is negative beyond rounding.
     """
     largest = np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > 1e-9 * largest:
@@ -69,7 +69,7 @@ def check_covariance(covariance: FloatArray) -> None:
 
 
 def floored(covariance: FloatArray, sigma: float) -> FloatArray:
-    """The covariance with no positive variance below sigma^2; others are left to be refused."""
+    """Raise positive variances to at least sigma^2; others are left for later checks to refuse."""
     variance = covariance.diagonal()
     short = (variance > 0.0) & (variance < sigma * sigma)
     if not short.any():

@@ -1,7 +1,7 @@
-"""Configuration: frozen groups, each field with its unit and default.
+"""Configuration: frozen groups of settings, each with its unit and default.
 
-A file (TOML or JSON) may set any of them; an unknown key is refused. The configuration a run used
-is saved beside its results and can be given to the next run as it is.
+A TOML or JSON file may set any of them; unknown keys are refused. The configuration of a run is
+saved with its results and can be passed to the next run unchanged.
 """
 
 from __future__ import annotations
@@ -22,47 +22,48 @@ from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATE_RATES = (1, 2, 5, 10, 20)
-"""Network updates per second that may be asked for."""
+"""Allowed numbers of network updates per second."""
 
 SMALLEST_SIGMA = 1e-6
-"""What is known exactly is given this much, so that a covariance stays positive definite."""
+"""Smallest standard deviation of a prior, which keeps the covariance positive definite."""
 
 LEAST_OUTPUT_RATE = 10
-"""States per second where the network is asked less often [Hz]."""
+"""States per second if there are fewer network updates [Hz]."""
 
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """The state-cloning EKF.
+    """Settings of the state-cloning EKF.
 
     Attributes:
         update_rate: network updates per second.
-        covariance_scale: factor on the network's covariance beyond update_rate x window length,
-            which accounts for overlapping windows. Successive errors of the network are alike,
-            so innovations are smaller than single errors; fitted to NIS and position NEES on the
-            training and validation recordings, the latter unknown to the network then.
-        network_turn_sigma: by which what the network says of a minute or so is turned [rad]; a
-            state of its own once fixes tell the direction.
-        gate: probability of the chi-square test; beyond it the covariance is inflated, at once: one
-            left out lets the speed drift, which makes the next right one look false.
-        tilt_sigma: of the first attitude when the device is moving [rad].
-        yaw_sigma: of the first attitude's yaw [rad]; small, since the start defines the yaw.
-        velocity_sigma: of the first velocity, taken as zero [m/s].
-        gyro_bias_sigma: of the first gyroscope bias [rad/s], of devices that correct it well. What
-            a network says of it is weak and biased itself: its slow errors turn the tracks of
-            devices whose gyroscope is right. Where gravity, rest or the magnetic field show more,
-            the filter widens it by itself.
-        accel_bias_sigma: of the first accelerometer bias [m/s^2].
-        gap_gyro_noise: while no samples arrive [rad/s/sqrt(Hz)].
-        gap_accel_noise: while no samples arrive [m/s^2/sqrt(Hz)].
-        stillness_noise: factor on the white noise of a phone's IMU within which a second of samples
-            counts as rest (`rest`); 0 never does.
-        adaptive: whether the accelerometer's density and the gyroscope bias's prior are first
-            guesses that innovations and gravity correct; False where the device is known.
-        magnetometer: whether a recording's or stream's magnetic field is used.
-        declination: of magnetic from true north, positive east [rad]. Where it is given, a track
-            whose direction nothing else tells is turned by its magnetic field, so that x points
-            east and y north; None leaves its first yaw zero.
+        covariance_scale: factor on the network's covariance, in addition to update_rate x window
+            length, which accounts for overlapping windows. Successive errors of the network are
+            correlated, so innovations are smaller than single errors; fitted to NIS and position
+            NEES on the training recordings and on validation recordings unseen by the network.
+        network_turn_sigma: standard deviation of the network's yaw error, correlated over about a
+            minute [rad]; becomes a state once fixes make the direction observable.
+        gate: probability of the chi-square test. The covariance of an outlier is inflated rather
+            than the measurement rejected: without it the speed drifts, and the next correct
+            measurement looks false.
+        tilt_sigma: initial tilt of a moving device [rad].
+        yaw_sigma: initial yaw [rad]; small, since the start defines the yaw.
+        velocity_sigma: initial velocity, taken as zero [m/s].
+        gyro_bias_sigma: initial gyroscope bias of a device that corrects it well [rad/s]. The
+            network's information on the bias is weak and itself biased: its slow errors would turn
+            the tracks of devices with a good gyroscope. The filter widens this prior where gravity,
+            stillness or the magnetic field show a larger bias.
+        accel_bias_sigma: initial accelerometer bias [m/s^2].
+        gap_gyro_noise: density while no samples arrive [rad/s/sqrt(Hz)].
+        gap_accel_noise: density while no samples arrive [m/s^2/sqrt(Hz)].
+        stillness_noise: factor on a phone's white noise below which a second of samples counts as
+            stationary; 0 disables zero-velocity updates.
+        adaptive: whether innovations and gravity adapt the accelerometer's density and the prior of
+            the gyroscope bias; False for a device that is known.
+        magnetometer: whether the magnetic field of a recording or stream is used.
+        declination: of magnetic from true north, positive east [rad]. If given, a track without any
+            other direction is turned by its magnetic field so that x points east and y north; None
+            leaves its initial yaw at zero.
     """
 
     update_rate: int = 2
@@ -97,35 +98,35 @@ class FilterConfig:
         if self.declination is not None:
             check_number(self, "declination", -math.pi, math.pi)
         if self.covariance_scale == 0.0:
-            raise ConfigError("covariance_scale", "0", "a factor > 0: nothing is measured exactly")
+            raise ConfigError("covariance_scale", "0", "a factor > 0: no measurement is exact")
 
     @property
     def output_rate(self) -> int:
-        """States per second: the IMU is folded and the state reported this often [Hz]."""
+        """States per second: rate of preintegration and of reported states [Hz]."""
         return max(LEAST_OUTPUT_RATE, self.update_rate)
 
     @property
     def intervals_per_update(self) -> int:
-        """States from one network update to the next."""
+        """Number of states from one network update to the next."""
         return self.output_rate // self.update_rate
 
     @property
     def window_updates(self) -> int:
-        """Updates per window: how many clones are held."""
+        """Number of updates per window, and so of clones held."""
         return round(self.update_rate * WINDOW_SECONDS)
 
     @property
     def overlap_scale(self) -> float:
-        """Factor on the network's covariance: the same motion is measured this many times."""
+        """Factor on the network's covariance, since overlapping windows measure the same motion."""
         return self.update_rate * WINDOW_SECONDS * self.covariance_scale
 
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """The factor graph.
+    """Settings of the factor graph.
 
     Attributes:
-        lag: how far back the graph of a stream moves its keyframes [s].
+        lag: length of the fixed-lag window of a stream [s].
     """
 
     lag: float = 5.0
@@ -136,14 +137,14 @@ class GraphConfig:
 
 @dataclass(frozen=True)
 class NavigatorConfig:
-    """Everything a run depends on besides the recording and the weights.
+    """Everything that a run depends on, except the recording and the weights.
 
     Attributes:
-        noise: densities of the IMU as the filter assumes them. Ten to thirty times a phone's at
-            rest: errors of scale and alignment act like noise while it moves, and a filter that
-            believes more follows the network's slow errors with its biases.
-        filter: the EKF.
-        graph: the factor graph.
+        noise: IMU noise densities assumed by the filter, ten to thirty times those of a stationary
+            phone: errors of scale and alignment act like noise in motion, and with smaller
+            densities the biases would absorb the network's slow errors.
+        filter: settings of the EKF.
+        graph: settings of the factor graph.
         gravity: magnitude [m/s^2].
     """
 
@@ -165,10 +166,10 @@ class NavigatorConfig:
 
 
 def read_config(path: Path | str) -> NavigatorConfig:
-    """A configuration from a TOML or JSON file.
+    """Read a configuration from a TOML or JSON file.
 
     Raises:
-        ConfigError: the file is missing or malformed, a key is unknown or a value does not fit.
+        ConfigError: the file is missing or malformed, a key is unknown or a value is invalid.
     """
     path = Path(path)
     try:

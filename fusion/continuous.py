@@ -1,8 +1,8 @@
-"""A continuous position beside the corrected one, for control and display (REP 105: odom to map).
+"""A continuous position next to the corrected one, for control and display (REP 105, map to odom).
 
-The corrected state steps at every update, as it should. The continuous position moves with the
-velocity alone; what it lacks to the corrected one is kept apart as `correction_W` and bled in
-slowly. README.md, "Continuous output".
+The corrected state steps at every update, as it should. The continuous position integrates the
+velocity only; its difference from the corrected one is kept as `correction_W` and bled in slowly.
+README.md, "Continuous output".
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
 LARGEST_STEP = 0.01
-"""Of the correction that is bled in from one state to the next [m]."""
+"""Largest part of the correction bled in from one state to the next [m]."""
 
 BLEED_SECONDS = 1.0
-"""Time constant in which a small correction is bled in [s]."""
+"""Time constant for bleeding in a small correction [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +32,8 @@ class ContinuousPose:
         p_W: (3,) position [m].
         R_WB: (3, 3) attitude, that of the corrected state.
         v_W: (3,) velocity of the corrected state [m/s].
-        correction_W: (3,) corrected minus continuous position, not bled in yet [m].
-        map_frame: as in `NavState`; where fixes moved the frame the position begins anew.
+        correction_W: (3,) corrected minus continuous position, not yet bled in [m].
+        map_frame: as in `NavState`; the position is reset when fixes move the frame.
     """
 
     time: float
@@ -45,14 +45,14 @@ class ContinuousPose:
 
 
 def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
-    """The pose at the next state: moved by the mean velocity and a bounded part of the correction.
+    """Advance the pose to a state: by the mean velocity and a bounded part of the correction.
 
-    It begins at the corrected position, and anew where the frame was moved or behind a gap, over
-    which nothing is known of the motion.
+    It starts at the corrected position, and is reset to it when the frame moves and after a gap,
+    in which the motion is unknown.
 
     Args:
-        before: the pose at the state before, None at first.
-        state: the newest one.
+        before: pose at the previous state, None at first.
+        state: the newest state.
     """
     p_W = state.p_W
     if before is not None and before.map_frame == state.map_frame and not state.in_gap:
@@ -66,6 +66,6 @@ def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
 
 
 def copied(pose: ContinuousPose) -> ContinuousPose:
-    """One with arrays of its own: whoever gets it may write to them."""
+    """Return a copy whose arrays the caller may write to."""
     arrays = {k: v.copy() for k, v in vars(pose).items() if isinstance(v, np.ndarray)}
     return changed(pose, **arrays)

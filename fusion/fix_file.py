@@ -7,7 +7,7 @@ sx    standard deviation [m], [m/s] or [rad]
 sy sz standard deviations of the other axes; empty, or no column, where they equal sx
 
 Columns come in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
-A position without z is one in the plane: of its height nothing is known.
+A position without z is horizontal; its height is unknown.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _NEEDED = (*_COLUMNS[:3], "sx")
 
 _UNITS = {"t": ("s",), "kind": ()}
-"""That a header may name; of the others metres, metres a second, radians."""
+"""Units that a header may name for a column; for the others m, m/s and rad."""
 
 _UNKNOWN_HEIGHT = 1e3
-"""Deviation of a height that is not given [m]."""
+"""Standard deviation of a height that is not given [m]."""
 
 
 def read_fixes(path: Path | str) -> list[Fix]:
-    """The fixes of a CSV file, in the format of this module's first lines.
+    """Read fixes from a CSV file in the format described at the top of this module.
 
     Raises:
-        ReadError: the file cannot be read, its header or a line does not fit; names the line.
+        ReadError: the file cannot be read, or its header or a line is invalid; names the line.
     """
     path = Path(path)
     try:
@@ -64,17 +64,17 @@ def read_fixes(path: Path | str) -> list[Fix]:
 
 
 def _without_unit(title: str) -> str:
-    """A column's name where its unit, if one is named, is the one it has; else the whole title."""
+    """Return the name without its unit; the whole title if the unit is not the expected one."""
     name, _, unit = title.strip().partition("[")
     known = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
     return name.strip() if not unit or unit.rstrip("] ") in known else title.strip()
 
 
 def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
-    """Refuse fixes of which none is of the recording's time.
+    """Check that at least one fix lies within the recording.
 
     Raises:
-        InputError: they are of another clock.
+        InputError: none does, so that they belong to another clock.
     """
     counted = sequence.time[np.isfinite(sequence.time)]
     counted = counted[advancing(counted)]
@@ -82,7 +82,7 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
     if times and not any(start <= t <= stop for t in times):
         found = f"times from {min(times):.6g} to {max(times):.6g} s"
         expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"
-        raise InputError("fixes", found, expected, "count them from the recording's first sample")
+        raise InputError("fixes", found, expected, "count times from the recording's first sample")
 
 
 def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str]) -> Fix:

@@ -1,8 +1,8 @@
-"""Fixes: what something else than the IMU knows of position, yaw or velocity at some time.
+"""Fixes: external measurements of position, yaw or velocity.
 
-They are given in the map frame, z up: for a track that starts without a pose they say where it is
-and how it is turned (`filter.map_frame`). Yaw is that of the twist about the vertical (`lie`): for
-a level device the direction its x axis points to, counter-clockwise from the map's x axis.
+They are given in the map frame, z up, and place and orient a track that starts without a pose
+(`filter.map_frame`). Yaw is that of the twist about the vertical (`lie`): for a level device, the
+direction of its x axis, counter-clockwise from the map's x axis.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ FixKind = Literal["position", "yaw", "velocity"]
 log = logging.getLogger(__name__)
 
 LARGEST_YAW = 20.0 * math.pi
-"""A yaw of more than ten turns [rad] is in other units, or no yaw at all."""
+"""Largest plausible yaw [rad]: more than ten turns means other units, or no yaw at all."""
 
 KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
-"""Kinds of fixes and how many numbers each measures."""
+"""Kinds of fixes, with the dimension of each."""
 
 MOST_WAITING = 10_000
-"""So many fixes of a stream may wait for their time, since memory must not grow."""
+"""Number of fixes of a stream that may wait for their time, which bounds the memory."""
 
 _SMALLEST_SIGMA = 1e-4
-"""Nothing is measured better than this [m], [m/s], [rad]."""
+"""Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """One fix; made by `position_fix`, `yaw_fix` or `velocity_fix`.
+    """One fix, created by `position_fix`, `yaw_fix` or `velocity_fix`.
 
     Attributes:
         time: [s].
-        kind: what is measured.
+        kind: measured quantity.
         value: (3,) position [m] or velocity [m/s] in W, or (1,) yaw [rad].
         covariance: (3, 3) or (1, 1).
     """
@@ -54,11 +54,11 @@ class Fix:
     covariance: FloatArray
 
     def shifted(self, by: FloatArray) -> Fix:
-        """The fix in a frame whose origin lies at -`by` (3,) [m]."""
+        """Express the fix in a frame whose origin lies at -`by` (3,) [m]."""
         return replace(self, value=self.value + by) if self.kind == "position" else self
 
     def fault(self) -> str:
-        """Why it cannot be used; empty where it can."""
+        """Return why the fix cannot be used; empty if it can."""
         numbers = (np.atleast_1d(self.time), self.value, self.covariance)
         if not all(np.isfinite(array).all() for array in numbers):
             return "value that is not finite"
@@ -71,20 +71,20 @@ class Fix:
 
 
 class Accepted(NamedTuple):
-    """A fix that a filter took in."""
+    """A fix applied by a filter."""
 
     fix: Fix
     scale: float
-    """Factor by which its covariance was inflated."""
+    """Factor applied to its covariance."""
 
     @property
     def inflated(self) -> Fix:
-        """The fix as it was taken in."""
+        """The fix with its covariance as applied."""
         return replace(self.fix, covariance=self.scale * self.fix.covariance)
 
 
 def position_fix(time: float, p_W: Any, covariance: Any) -> Fix:
-    """Position (3,) [m] with covariance (3, 3) [m^2].
+    """Create a fix of position (3,) [m] with covariance (3, 3) [m^2].
 
     Raises:
         InputError: a value does not have that shape.
@@ -93,7 +93,7 @@ def position_fix(time: float, p_W: Any, covariance: Any) -> Fix:
 
 
 def velocity_fix(time: float, v_W: Any, covariance: Any) -> Fix:
-    """Velocity (3,) [m/s] in W with covariance (3, 3) [m^2/s^2].
+    """Create a fix of velocity (3,) [m/s] in W with covariance (3, 3) [m^2/s^2].
 
     Raises:
         InputError: a value does not have that shape.
@@ -102,32 +102,32 @@ def velocity_fix(time: float, v_W: Any, covariance: Any) -> Fix:
 
 
 def yaw_fix(time: float, yaw: Any, sigma: Any) -> Fix:
-    """Yaw [rad] of the body with its standard deviation [rad].
+    """Create a fix of the body's yaw [rad] with its standard deviation [rad].
 
     Raises:
-        InputError: a value is no number.
+        InputError: a value is not a number.
     """
     sigma = shaped("sigma", sigma, ())
-    # A square alone would hide a wrong sign, which `fault` is to see.
+    # Squaring would hide a wrong sign from `fault`.
     variance = np.reshape(sigma * np.abs(sigma), (1, 1))
     return make_fix(time, "yaw", np.atleast_1d(shaped("yaw", yaw, ())), variance)
 
 
 def by_time(fix: Fix) -> tuple[float, str]:
-    """The order of fixes, whatever order they came in."""
+    """Sort key: makes the result independent of the order of arrival."""
     return fix.time, fix.kind
 
 
 class FixQueue:
-    """Fixes that wait for their time, in its order.
+    """Fixes waiting for their time, in order of time.
 
     Args:
-        fixes: to begin with.
-        most: so many may wait; beyond, those that lie furthest ahead are refused.
+        fixes: initial fixes.
+        most: largest number of waiting fixes; beyond it, those furthest ahead are refused.
 
     Attributes:
-        waiting: the fixes.
-        refused: how many others were left out, by reason.
+        waiting: the waiting fixes.
+        refused: number of refused fixes, by reason.
     """
 
     def __init__(self, fixes: Iterable[Fix] = (), most: float = MOST_WAITING) -> None:
@@ -138,8 +138,8 @@ class FixQueue:
             self.add(fix)
 
     def add(self, fix: Fix) -> None:
-        """Keep a fix until `due`; one without meaning is refused and counted."""
-        check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix make one")
+        """Keep a fix until it is due; invalid ones are refused and counted."""
+        check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
         if reason := fix.fault():
             self.refuse(reason)
             return
@@ -149,7 +149,7 @@ class FixQueue:
             self.refuse("too many waiting")
 
     def due(self, time: float) -> list[Fix]:
-        """Give out the fixes up to a time [s], in their order."""
+        """Remove and return the fixes up to a time [s], in order."""
         if not self.waiting or self.waiting[0].time > time:
             return []
         n = bisect.bisect_right(self.waiting, time, key=lambda fix: fix.time)
@@ -157,24 +157,24 @@ class FixQueue:
         return due
 
     def refuse(self, reason: str, count: int = 1) -> None:
-        """Count fixes that were left out; the first of a kind is told."""
+        """Count refused fixes; the first one for each reason is logged."""
         if count:
             if reason not in self.refused:
-                log.warning("a fix is left out: %s", reason)
+                log.warning("fix refused: %s", reason)
             self.refused[reason] = self.refused.get(reason, 0) + count
 
     def start(self, time: float) -> None:
-        """Refuse what lies before the first state's time [s]."""
+        """Refuse fixes before the time of the first state [s]."""
         self.refuse("before the start", len(self.due(np.nextafter(time, -math.inf))))
 
     def health(self, health: Health) -> Health:
-        """A report with what was refused and what still waits."""
+        """Add the refused and the waiting fixes to a report."""
         waiting = {"waiting": len(self.waiting)} if self.waiting else {}
         return replace(health, fixes=health.fixes | self.refused | waiting)
 
 
 def make_fix(time: Any, kind: FixKind, value: Any, covariance: Any) -> Fix:
-    """A fix of any kind from numbers of the shapes that belong to it; `InputError` otherwise."""
+    """Create a fix of any kind; `InputError` if a value does not have the shape of that kind."""
     n = KINDS[kind]
     return Fix(
         time=shaped("time", time, ()).item(),

@@ -1,7 +1,7 @@
 """Extended poses as matrix groups: SE(3) and SE_2(3) in closed form, and the yaw of a rotation.
 
-Every function works on stacks, leading axes first, because the filter corrects all of its clones at
-once. Conventions: X = exp(xi) with xi = (theta, rho_v, rho_p), rotation [rad] first; the left
+Functions take stacks, leading axes first, because the filter corrects all of its clones at once.
+Conventions: X = exp(xi) with xi = (theta, rho_v, rho_p), rotation [rad] first; the left
 Jacobian J carries the translation parts, exp(theta, rho) = (exp(theta), J(theta) rho).
 
 Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics",
@@ -19,13 +19,13 @@ from stario.sequences.attitude.so3 import exp_and_left_jacobian, log_so3, series
 from stario.sequences.sequence import FloatArray
 
 UNKNOWN_YAW = math.pi / math.sqrt(3.0)
-"""Standard deviation of a yaw of which nothing is known, uniform over the circle [rad]."""
+"""Standard deviation of an unknown yaw, uniform over the circle [rad]."""
 
 _EYE = np.eye(3)
 
 
 def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
-    """exp(theta, rho) X for a stack of poses, without forming the exponential.
+    """Return exp(theta, rho) X for a stack of poses, without forming the exponential.
 
     By Rodrigues' formula in homogeneous form, exp(A) X = X + A X + b A^2 X + c A^3 X, where A maps
     [R | p] to [K R | K p + rho] once and multiplies by K = [theta]x from then on.
@@ -51,26 +51,26 @@ def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
     return np.concatenate([theta, rho[..., 0], rho[..., 1]], axis=-1)
 
 
-# Yaw of a rotation is that of its twist about the vertical: R is split into a tilt and a turn about
-# z by atan2(s, c), s = R10 - R01, c = R00 + R11 (README.md, "Frames"); `sequences.rotations.yaw_of`
-# is the same for many at once.
+# The yaw of a rotation is that of its twist about the vertical: R is split into a tilt and a
+# rotation about z by atan2(s, c), s = R10 - R01, c = R00 + R11 (README.md, "Frames").
+# `sequences.attitude.rotations.yaw_of` is the same for stacks.
 _UPSIDE_DOWN = 0.01
-"""s^2 + c^2 = (1 + cos tilt)^2 below which yaw means nothing: within 26 degrees of upside down."""
+"""s^2 + c^2 = (1 + cos tilt)^2 below which yaw is undefined: 26 degrees from upside down."""
 
 
 def twist(R: FloatArray) -> tuple[float, float]:
-    """S and c: sine and cosine of the yaw of R (3, 3), times 1 + cos tilt."""
+    """Return s and c: sine and cosine of the yaw of R (3, 3), times 1 + cos tilt."""
     return float(R[1, 0] - R[0, 1]), float(R[0, 0] + R[1, 1])
 
 
 def yaw_twist(R_WB: FloatArray) -> float:
-    """Yaw [rad] of an attitude (3, 3); not-a-number close to upside down."""
+    """Return the yaw [rad] of an attitude (3, 3); NaN close to upside down."""
     s, c = twist(R_WB)
     return math.atan2(s, c) if s * s + c * c > _UPSIDE_DOWN else math.nan
 
 
 def yaw_rotation(R: FloatArray) -> FloatArray:
-    """The turn about the vertical (3, 3) that has the yaw of R; none where R has none."""
+    """Return the rotation about the vertical (3, 3) with the yaw of R; identity if undefined."""
     s, c = twist(R)
     norm = math.hypot(s, c)
     s, c = (s / norm, c / norm) if norm > 0.0 else (0.0, 1.0)

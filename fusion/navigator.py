@@ -1,9 +1,9 @@
-"""The navigator: the same estimate of streams and recordings.
+"""The navigator: the same estimate for streams and recordings.
 
-Samples become IMU intervals (`imu.front_end`), the windows of intervals become displacements (the
-network), and both move an estimator (`filter.estimator`). A stream does this sample by sample; a
-recording lets the network see many windows at once. As the front end does not depend on the filter
-both give the same track.
+Samples are cut into IMU intervals (`imu.front_end`), the network predicts displacements from their
+windows, and both drive an estimator (`filter.estimator`). A stream is processed sample by sample,
+while the windows of a recording pass through the network in batches. Since the front end does not
+depend on the filter, both give the same track.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ Vector = Sequence[float] | FloatArray
 """Three numbers."""
 
 _START_FORCE = (5.0, 15.0)
-"""Average force [m/s^2] of a first second that may hold a jump, but neither g nor deg/s."""
+"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
 
 
 def _silent(share: float) -> None:
-    """Progress that nobody watches."""
+    """Ignore progress."""
 
 
 class Navigator:
     """Inertial navigation with a displacement network.
 
     Args:
-        model: a `DisplacementModel`, or anything with its `predict`.
-        config: noise, filter, gravity; the defaults are those of handheld devices.
-        prior: what is known of the first pose; None starts level by gravity, yaw and position zero.
-        backend: "ekf", or "graph" for the factor graph, which is more accurate and takes more time.
+        model: a `DisplacementModel`, or any object with its `predict`.
+        config: noise, filter, gravity; the defaults are for handheld devices.
+        prior: prior of the first pose; None starts levelled by gravity, with yaw and position zero.
+        backend: "ekf", or "graph" for the factor graph, which is more accurate and slower.
 
     Raises:
-        InputError: there is no such back end, or an argument is of another type.
+        InputError: the back end does not exist, or an argument has the wrong type.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Navigator:
         if not (isinstance(backend, str) and backend in BACKENDS):
             raise InputError("backend", repr(backend), f"one of {', '.join(BACKENDS)}")
         if not hasattr(model, "predict") or isinstance(model, type):
-            remedy = "load_model(name) gives one"
+            remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
         check_type("config", config, NavigatorConfig, None)
         check_type("prior", prior, PriorPose, None)
@@ -82,10 +82,10 @@ class Navigator:
         self._begin_stream()
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
-        """Take in one sample of a stream.
+        """Process one sample of a stream.
 
         Samples that are not finite, repeated or late are dropped and counted (`health`); gaps are
-        noticed by themselves. The first state comes one second after the first sample.
+        detected. The first state comes one second after the first sample.
 
         Args:
             time: [s].
@@ -93,23 +93,23 @@ class Navigator:
             accel: (3,) specific force in B [m/s^2].
 
         Returns:
-            The newest state if this sample completed an update period, else None.
+            The newest state if this sample completed an output period, else None.
 
         Raises:
-            InputError: time is no number, or every sample is far from the one before, as where it
-                is not in seconds; gyro or accel does not hold three; the first second's average
-                force cannot be gravity in m/s^2, or its rate is not about 50 Hz to 1 kHz; gyro
-                cannot be in rad/s, which shows once the device turns; or the clock was set back
-                by five seconds and more (by less, samples are late until it has caught up). From
-                the first second's force on the stream then begins anew, behind a clock that was
-                set back without prior and fixes.
+            InputError: time is not a number, or every sample is far from the previous one (time
+                not in seconds); gyro or accel does not hold three numbers; the mean force of the
+                first second cannot be gravity in m/s^2, or the rate is not about 50 Hz to 1 kHz;
+                gyro cannot be in rad/s, which shows once the device turns; or the clock was set
+                back by at least five seconds (after less, samples are late until it has caught
+                up). After the last four the stream starts again; after a clock that was set back,
+                without prior and fixes.
         """
         sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
         state = None
         try:
             intervals = self._front_end.push(sample)
         except ClockSetBackError:
-            # What was known of the first pose, or waits for its time, is of the other clock.
+            # The prior and the waiting fixes belong to the other clock.
             self.prior, self._fixes = None, FixQueue()
             self._begin_stream()
             raise
@@ -119,34 +119,34 @@ class Navigator:
         return state
 
     def push_magnetometer(self, time: float, field: Vector) -> None:
-        """Take in a magnetic field of the stream, before the IMU's samples that follow it.
+        """Process one magnetometer sample of a stream, before the IMU samples that follow it.
 
-        Its bearing tells the gyroscope's bias about the vertical; steel and magnets are judged by
-        size, dip and consistency (`filter.magnetic`). Fields that are not finite, repeated, or late
-        by more than a tenth of a second are dropped and counted. Without fields nothing changes.
+        Its bearing makes the gyroscope's vertical bias observable; disturbances are detected by
+        size, dip and consistency (`filter.magnetic`). Samples that are not finite, repeated, or
+        late by more than a tenth of a second are dropped and counted. The magnetometer is optional.
 
         Args:
             time: [s], on the IMU's clock.
             field: (3,) magnetic flux density in B [uT].
 
         Raises:
-            InputError: time is no number, or field does not hold three.
+            InputError: time is not a number, or field does not hold three numbers.
         """
         self._front_end.push_field(_seconds(time), np.array(_three("field", field)))
 
     def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
-        """A position fix for the stream.
+        """Apply a position fix to the stream.
 
-        It is taken in at its own time: up to a window (1 s) before the newest state, or later,
-        when the stream gets there. Older ones, and values that are not finite or no covariance,
-        are refused and counted in `health`. A track that started without a pose is moved to its
-        first position fix and turned by the second that is far enough away (`filter.map_frame`):
-        states with another `map_frame` must not be compared with those before.
+        It is applied at its own time, which may lie up to one window (1 s) before the newest state
+        or in the future. Older fixes, values that are not finite and invalid covariances are
+        refused and counted in `health`. A track that started without a pose is moved to its first
+        position fix and turned by the first later one that is far enough away (`filter.map_frame`);
+        states with different `map_frame` must not be compared.
 
         Args:
             time: [s], on the samples' clock.
             p_W: (3,) [m].
-            covariance: (3, 3) [m^2]; a large variance, such as 1e6, for a height that is not known.
+            covariance: (3, 3) [m^2]; use a large variance, such as 1e6, for an unknown height.
 
         Raises:
             InputError: a value has another shape.
@@ -154,51 +154,51 @@ class Navigator:
         self._take(position_fix(time, p_W, covariance))
 
     def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> None:
-        """A velocity fix (3,) [m/s] in W with covariance (3, 3); else as `update_position`.
+        """Apply a velocity fix (3,) [m/s] in W with covariance (3, 3), as `update_position`.
 
-        What is measured along the body's axes, as by wheels, is turned by the attitude first.
+        Rotate velocities measured along the body's axes, as by wheels, by the attitude first.
         """
         self._take(velocity_fix(time, v_W, covariance))
 
     def update_yaw(self, time: float, yaw: float, sigma: float) -> None:
-        """A fix of the body's yaw [rad]; else as `update_position`.
+        """Apply a fix of the body's yaw [rad], as `update_position`.
 
-        Yaw counts counter-clockwise from the map's x axis (no compass heading); at any tilt it is
-        that of the twist about the vertical (`lie.yaw_twist`).
+        Yaw counts counter-clockwise from the map's x axis, unlike a compass heading; at any tilt it
+        is that of the twist about the vertical (`lie.yaw_twist`).
         """
         self._take(yaw_fix(time, yaw, sigma))
 
     @property
     def state(self) -> NavState | None:
-        """The newest state of the stream, None before the first second is over."""
+        """The newest state of the stream; None during the first second."""
         return None if self._estimator is None else self._estimator.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
-        """The newest pose without the steps of updates; None before the first second is over."""
+        """The newest pose without steps at updates; None during the first second."""
         return None if self._continuous is None else copied(self._continuous)
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """The stream's newest pose one window (1 s) late, corrected by all measured since.
+        """The stream's newest pose delayed by one window (1 s), using all measurements since.
 
-        It comes with each network update; None before the first, and for the graph.
+        It changes with each network update; None before the first, and for the graph.
         """
         return None if self._estimator is None else self._estimator.smoothed
 
     @property
     def health(self) -> Health:
-        """The stream's report so far."""
+        """The health report of the stream so far."""
         counts = self._front_end.counts
         return self._fixes.health(
             counts.health() if self._estimator is None else self._estimator.health(counts)
         )
 
     def snapshot(self) -> bytes:
-        """The stream as it is now, to be continued by `restore`, in another process if need be.
+        """Return the current stream as bytes, to be continued by `restore` in any process.
 
-        The bytes' format is documented in `stario.fusion.snapshot`; nothing in it is pickled. They
-        hold neither configuration files nor weights, only what tells them.
+        The format is documented in `stario.fusion.snapshot`; nothing is pickled. The bytes identify
+        the configuration and the weights but do not contain the weights.
         """
         return pack(
             {
@@ -215,14 +215,14 @@ class Navigator:
         )
 
     def restore(self, data: bytes) -> None:
-        """Continue the stream of a `snapshot`: the states are the same as without the break.
+        """Continue the stream of a `snapshot`; the states are those without the interruption.
 
-        The navigator must have the same back end, configuration and weights; its own stream, and
-        its prior, are given up for the snapshot's.
+        The navigator must have the same back end, configuration and weights; the snapshot's stream
+        and prior replace its own.
 
         Raises:
-            InputError: the bytes are no whole snapshot of this version, or one of another back end,
-                configuration or model. The navigator is then as it was before.
+            InputError: the bytes are not a complete snapshot of this version, or belong to another
+                back end, configuration or model. The navigator is then unchanged.
         """
         tree = unpack(data)
         check_same("backend", tree["backend"], self.backend)
@@ -242,16 +242,15 @@ class Navigator:
     def run(
         self, sequence: ImuSequence, progress: Progress = _silent, fixes: Iterable[Fix] = ()
     ) -> Track:
-        """The fused track of a recording; its truth is never looked at.
+        """Estimate the fused track of a recording; its ground truth is not used.
 
-        Does not touch the stream of `push`.
+        The stream of `push` is not affected.
 
         Args:
             sequence: the recording.
-            progress: called now and then with the share of the work done.
-            fixes: of position, yaw or velocity, in any order; those outside the recording, or
-                without meaning, are refused and counted. The whole track is given in the frame it
-                ends in.
+            progress: called from time to time with the fraction of the work done.
+            fixes: position, yaw or velocity fixes, in any order; invalid ones and those outside the
+                recording are refused and counted. The whole track is given in its final map frame.
 
         Raises:
             InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
@@ -259,15 +258,17 @@ class Navigator:
         return self.track(self.observe(sequence, progress), progress, fixes)
 
     def observe(self, sequence: ImuSequence, progress: Progress = _silent) -> PreprocessedRecording:
-        """Prepare a recording and let the network see its windows.
+        """Preprocess a recording and predict the displacements of its windows.
 
         Raises:
             InputError: as for `run`.
         """
-        check_type("sequence", sequence, ImuSequence, "read_recording(path) gives one")
+        check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
         if not callable(progress):
-            fix = "fixes are given by name: fixes=[...]"
-            raise InputError("progress", f"{progress!r:.60}", "a function of the share done", fix)
+            fix = "pass fixes by name: fixes=[...]"
+            raise InputError(
+                "progress", f"{progress!r:.60}", "a function of the fraction done", fix
+            )
         return preprocess(sequence, self.model, self.config, progress)
 
     def track(
@@ -276,13 +277,13 @@ class Navigator:
         progress: Progress = _silent,
         fixes: Iterable[Fix] = (),
     ) -> Track:
-        """The back end's track of a prepared recording; fixes as for `run`.
+        """Estimate the track of a preprocessed recording; fixes as for `run`.
 
         Raises:
-            InputError: it was prepared for another update rate.
+            InputError: it was preprocessed for another update rate.
         """
         check_type(
-            "preprocessed", preprocessed, PreprocessedRecording, "observe(sequence) gives one"
+            "preprocessed", preprocessed, PreprocessedRecording, "observe(sequence) returns one"
         )
         if preprocessed.update_rate != self.config.filter.update_rate:
             raise InputError(
@@ -316,7 +317,7 @@ class Navigator:
             (displacement,) = displacements_of(self._network, [interval], self._front_end.counts)
         self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         state = self._estimator.nav_state()
-        self._continuous = copied(advanced(self._continuous, state))  # the state is the caller's
+        self._continuous = copied(advanced(self._continuous, state))  # `state` is writable
         return state
 
     def _take(self, fix: Fix) -> None:
@@ -337,7 +338,7 @@ class Navigator:
             raise
 
     def _checked_start(self) -> Start:
-        """A stream cannot be checked as a whole before it runs: its first second is."""
+        """Check the first second of a stream, which cannot be checked as a whole."""
         start = self._front_end.start
         assert start is not None  # set before the first interval
         if not MIN_RATE <= start.rate <= MAX_RATE:
@@ -355,7 +356,7 @@ class Navigator:
 
 
 def _fingerprint(model: Predictor) -> str:
-    """What tells a model's weights, empty where it has no card."""
+    """Return the checksum of a model's weights; empty if it has no card."""
     return str(getattr(getattr(model, "card", None), "sha256", ""))
 
 

@@ -1,4 +1,4 @@
-"""A recording made ready for the estimators: cut into intervals, its windows inferred."""
+"""Preprocessing of a recording: cut into intervals, displacements inferred from its windows."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 
 _BATCH = 512
-"""Windows of a recording that the network is given at once."""
+"""Number of windows per batch of the network."""
 
 Progress = Callable[[float], None]
-"""Called with the share of the work done, 0 to 1."""
+"""Callback that receives the fraction of the work done, 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreprocessedRecording:
-    """A recording as the estimators see it.
+    """A recording after front end and network.
 
     Attributes:
-        intervals: in order.
-        update_rate: of the network [Hz], as it was cut for.
-        measurements: the network's displacement of the window that ends with each interval, None
-            where there is no window.
-        front_end: with its counts and the start.
-        seconds_front_end: computing time [s].
-        seconds_network: computing time [s].
+        intervals: IMU intervals, in order.
+        update_rate: network updates per second that it was cut for.
+        measurements: predicted displacement of the window ending with each interval, None if no
+            window ends there.
+        front_end: holds the sample counts and the start.
+        seconds_front_end: computing time of the front end [s].
+        seconds_network: computing time of the network [s].
     """
 
     intervals: list[ImuInterval]
@@ -52,7 +52,7 @@ class PreprocessedRecording:
 def preprocess(
     sequence: ImuSequence, model: Predictor, config: NavigatorConfig, progress: Progress
 ) -> PreprocessedRecording:
-    """Cut a recording into intervals and let the network see its windows.
+    """Cut a recording into intervals and predict the displacements of its windows.
 
     Raises:
         InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
@@ -99,7 +99,7 @@ def _displacements(
 
 
 def _batches(intervals: Sequence[ImuInterval], unbroken: bool) -> Iterator[range]:
-    """Runs of intervals whose windows the network sees at once; `unbroken` ones end at a gap."""
+    """Yield ranges of intervals that form a batch; with `unbroken`, batches end at gaps."""
     begin = windows = 0
     for k, interval in enumerate(intervals):
         if windows == _BATCH or (unbroken and interval.gap and k > begin):

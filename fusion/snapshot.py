@@ -1,25 +1,24 @@
-"""A stream stopped in one process and continued in another, as bytes without a pickle.
+"""Snapshots of a stream as bytes, without pickle: it can be continued in another process.
 
 Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON value in
 which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
 `{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
-dictionary whose keys are no texts, and
-`{"is": name, "has": {...}}` for an object of one of the classes in `_CLASSES`; not-a-number and
-infinity are written as NaN and Infinity. The tree holds
+dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
+`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree holds
 
     format     "stario snapshot"
-    version    of this layout; another one is refused
+    version    version of this layout; others are refused
     backend    "ekf" or "graph"
-    config     the effective configuration, which must equal the restoring navigator's
-    model      checksum of the weights, likewise; empty for models without a card
-    prior      what was known of the first pose, or null
+    config     effective configuration, which must equal that of the restoring navigator
+    model      checksum of the weights, which must be equal too; empty for models without a card
+    prior      prior of the first pose, or null
     front end  samples, windows and counts
-    network    what the network remembers of earlier windows, or null
-    continuous the pose without steps, or null
-    fixes      those that wait, and counts of those refused
-    estimator  the back end's state, or null before the first second is over
+    network    memory of the network, or null
+    continuous the continuous pose, or null
+    fixes      waiting fixes, and counts of those refused
+    estimator  state of the back end, or null during the first second
 
-Arrays and numbers are kept to the last bit, so the continued stream gives the same states.
+Arrays and numbers keep every bit, so the continued stream gives the same states.
 """
 
 from __future__ import annotations
@@ -49,12 +48,12 @@ fusion.graph.keyframes fusion.graph.whitening fusion.imu.buffers fusion.imu.fron
 fusion.imu.intervals fusion.imu.outliers fusion.imu.preintegration fusion.imu.stream_checks
 sequences.attitude.levelling sequences.noise
 """
-"""Modules whose classes a snapshot may hold: plain data, made anew from their attributes."""
+"""Modules whose classes a snapshot may hold: plain data, rebuilt from their attributes."""
 
 
 @cache
 def _classes() -> dict[str, type]:
-    """Every class that a snapshot may hold, by name."""
+    """Return every class that a snapshot may hold, by name."""
     modules = [importlib.import_module(f"stario.{name}") for name in _HOLDS.split()]
     return {
         name: each
@@ -65,8 +64,8 @@ def _classes() -> dict[str, type]:
 
 
 def pack(tree: dict[str, Any]) -> bytes:
-    """A tree of dictionaries, sequences, arrays, numbers, text, None and known objects as bytes."""
-    # By identity: states share what did not change.
+    """Convert a tree of dicts, sequences, arrays, plain values and known objects to bytes."""
+    # By identity: states share unchanged arrays.
     arrays: dict[int, tuple[int, np.ndarray[Any, Any]]] = {}
 
     def plain(value: Any) -> Any:
@@ -99,10 +98,10 @@ def pack(tree: dict[str, Any]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The tree that `pack` was given.
+    """Return the tree given to `pack`.
 
     Raises:
-        InputError: the bytes are no snapshot, or one of another version.
+        InputError: the bytes are not a snapshot, or one of another version.
     """
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
@@ -119,7 +118,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         return {key: _whole(value, arrays) for key, value in tree.items()}
     except InputError:
         raise
-    except Exception as error:  # flipped bytes meet any line of zip, NumPy or JSON
+    except Exception as error:  # corrupt bytes may fail anywhere in zip, NumPy or JSON
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("snapshot", found, f"bytes of a {FORMAT}, whole") from error
 
@@ -153,7 +152,7 @@ def _rebuilt(kind: type, has: dict[str, Any]) -> Any:
 
 
 def check_same(name: str, found: object, expected: object) -> None:
-    """Refuse a snapshot that belongs to something else; names the first value that differs.
+    """Check that a snapshot belongs to this navigator; names the first value that differs.
 
     Raises:
         InputError: the values differ.

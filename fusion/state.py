@@ -1,4 +1,4 @@
-"""What a navigator gives back: states, tracks, innovations and the health report."""
+"""Results of a navigator: states, tracks, innovations and the health report."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class NavState:
-    """The estimate at one time.
+    """Estimated state at one time.
 
     Attributes:
         time: [s].
         R_WB: (3, 3) attitude, body to world.
         v_W: (3,) velocity [m/s].
-        p_W: (3,) position [m]; zero at the start, until a fix places the track.
+        p_W: (3,) position [m]; zero at the start unless a prior or a fix places the track.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         covariance: (15, 15) of rotation about W's axes [rad], velocity, position, b_g, b_a; each
-            error is true minus estimate. Its blocks have names of their own below.
+            error is true minus estimate. The properties below give its blocks.
         in_gap: True right after a stretch without samples.
-        map_frame: how many frame transforms there were before (`filter.map_frame`): states with
-            different ones must not be compared.
+        map_frame: number of frame transforms so far (`filter.map_frame`); states with different
+            numbers must not be compared.
     """
 
     time: float
@@ -42,7 +42,7 @@ class NavState:
 
     @property
     def quat_xyzw(self) -> FloatArray:
-        """Attitude as a unit quaternion (4,), x y z w."""
+        """Attitude as a unit quaternion (4,), xyzw."""
         return np.asarray(Rotation.from_matrix(self.R_WB).as_quat())
 
     @property
@@ -52,37 +52,37 @@ class NavState:
 
     @property
     def attitude_covariance(self) -> FloatArray:
-        """(3, 3) of the rotation about W's axes [rad^2]."""
+        """Covariance (3, 3) of the rotation about W's axes [rad^2]."""
         return self.covariance[0:3, 0:3]
 
     @property
     def velocity_covariance(self) -> FloatArray:
-        """(3, 3) [m^2/s^2]."""
+        """Covariance (3, 3) of the velocity [m^2/s^2]."""
         return self.covariance[3:6, 3:6]
 
     @property
     def position_covariance(self) -> FloatArray:
-        """(3, 3) [m^2]."""
+        """Covariance (3, 3) of the position [m^2]."""
         return self.covariance[6:9, 6:9]
 
     @property
     def gyro_bias_covariance(self) -> FloatArray:
-        """(3, 3) [rad^2/s^2]."""
+        """Covariance (3, 3) of the gyroscope bias [rad^2/s^2]."""
         return self.covariance[9:12, 9:12]
 
     @property
     def accel_bias_covariance(self) -> FloatArray:
-        """(3, 3) [m^2/s^4]."""
+        """Covariance (3, 3) of the accelerometer bias [m^2/s^4]."""
         return self.covariance[12:15, 12:15]
 
     def shifted(self, by: FloatArray) -> NavState:
-        """The state in a frame whose origin lies at -`by` (3,) [m]."""
+        """Express the state in a frame whose origin lies at -`by` (3,) [m]."""
         return changed(self, p_W=self.p_W + by)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedPose:
-    """A pose as it is known one window later, with what was measured since.
+    """A pose estimated one window later, using the measurements made since.
 
     Attributes:
         time: of the pose [s].
@@ -101,12 +101,12 @@ class SmoothedPose:
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Measured minus predicted displacement of every update.
+    """Innovations (measured minus predicted displacement) of all updates.
 
     Attributes:
         time: (M,) end of the window [s].
-        residual_W: (M, 3) [m] (or [m/s] where mean velocities are measured).
-        sigma: (M, 3) standard deviations the filter expects.
+        residual_W: (M, 3) innovation [m] (or [m/s] if mean velocities are measured).
+        sigma: (M, 3) predicted standard deviations.
         nis: (M,) normalised innovation squared, before any inflation.
         gated: (M,) whether the covariance was inflated.
     """
@@ -120,28 +120,29 @@ class Innovations:
 
 @dataclass
 class Health:
-    """What happened during a run, counted by reason.
+    """Report of a run: counts by reason, and final uncertainty.
 
     Attributes:
-        samples: used, and dropped by reason.
-        flagged: of those used, spikes that were replaced and samples at the sensor's limit.
-        gap_count: stretches without samples.
-        longest_gap: of them [s].
-        gaps: start and length [s] of the newest of them, at most a hundred.
-        updates: network measurements offered.
-        gated: of these, how many had their covariance inflated.
-        refused: of these, how many were left out, by reason.
-        mean_nis: mean of the normalised innovation squared; its expectation is `nis_expected`.
+        samples: number used, and numbers dropped by reason.
+        flagged: of those used, replaced spikes and samples at the sensor's limit.
+        gap_count: number of stretches without samples.
+        longest_gap: length of the longest gap [s].
+        gaps: start and length [s] of the latest gaps, at most a hundred.
+        updates: number of network measurements offered.
+        gated: of these, number whose covariance was inflated.
+        refused: of these, numbers refused by reason.
+        mean_nis: mean normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
-        fixes: absolute fixes applied (of these gated), and left out by reason.
-        zero_velocity: updates at rest (one per state there) applied, and left out by reason.
-        bearings: of the magnetic field applied (of these gated), left out by reason, and whether
-            they told north.
-        accel_noise_factor: of the accelerometer's noise to the configured density at the end, as
-            the innovations tell.
-        final_sigma: standard deviations at the end, the largest of the axes: tilt and yaw [rad],
-            velocity [m/s], position in the plane and height [m], biases [rad/s], [m/s^2].
-        notes: one line each on what else went on, such as a graph that fell back to the filter.
+        fixes: numbers of fixes applied (of these gated) and refused by reason.
+        zero_velocity: numbers of zero-velocity updates (one per state) applied and refused by
+            reason.
+        bearings: numbers of magnetic bearings applied (of these gated) and refused by reason, and
+            whether they determined north.
+        accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
+            from the innovations.
+        final_sigma: final standard deviations, the largest over the axes: tilt and yaw [rad],
+            velocity [m/s], horizontal position and height [m], biases [rad/s], [m/s^2].
+        notes: further remarks, one line each, such as a graph that fell back to the filter.
     """
 
     samples: dict[str, int] = field(default_factory=dict)
@@ -162,7 +163,7 @@ class Health:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The counts for a person; `stario.fusion.report.health` says what they mean."""
+        """Format the counts as text; `stario.fusion.report.health` interprets them."""
         dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
         text = [f"samples used {self.samples.get('used', 0)}, dropped {_counted(dropped)}"]
         if any(self.flagged.values()):
@@ -175,7 +176,7 @@ class Health:
                 f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
             )
         else:
-            text.append("updates none: the network was never asked, or the device lay still")
+            text.append("updates none: no window was complete, or the device was stationary")
         if self.fixes:
             text.append(f"fixes {_counted(self.fixes)}")
         if self.zero_velocity:
@@ -189,7 +190,7 @@ class Health:
 
 
 def _counted(counts: dict[str, int]) -> str:
-    """The counts by reason; `none` where there are none."""
+    """Format counts by reason; `none` if there are none."""
     return ", ".join(f"{reason} {n}" for reason, n in counts.items()) or "none"
 
 
@@ -198,14 +199,14 @@ class Track:
     """An estimated track.
 
     Attributes:
-        trajectory: poses, velocities and position covariances at the update times.
-        b_g: (N, 3) gyroscope bias [rad/s], None where the track has none.
-        b_a: (N, 3) accelerometer bias [m/s^2], None where the track has none.
-        covariance: (N, 15, 15) as in `NavState`, None where the track has none.
-        innovations: of the network's measurements, None where there is no filter.
-        health: counts and statistics of the run, None where there is no filter.
-        smoothed: poses at the times of the filter's clones, each as it was known one window later;
-            None where there are none.
+        trajectory: poses, velocities and position covariances at the output times.
+        b_g: (N, 3) gyroscope bias [rad/s], None if not estimated.
+        b_a: (N, 3) accelerometer bias [m/s^2], None if not estimated.
+        covariance: (N, 15, 15) as in `NavState`, None if not estimated.
+        innovations: innovations of the network's measurements, None without a filter.
+        health: report of the run, None without a filter.
+        smoothed: poses at the times of the filter's clones, each estimated one window later; None
+            if there are none.
         seconds_network: computing time of the network [s].
         seconds_filter: computing time of everything else [s].
     """
@@ -222,7 +223,7 @@ class Track:
 
     @property
     def time(self) -> FloatArray:
-        """(N,) [s]."""
+        """Times (N,) [s]."""
         return self.trajectory.time
 
     @property
@@ -231,7 +232,7 @@ class Track:
         return None if self.health is None else self.health.mean_nis
 
     def arrays(self) -> dict[str, Any]:
-        """Everything by name, for an npz file."""
+        """Return all arrays by name, for an npz file."""
         known = {
             "time": self.time,
             "position_W": self.trajectory.position_W,
@@ -253,7 +254,7 @@ def track_from_states(
     seconds_network: float = 0.0,
     seconds_filter: float = 0.0,
 ) -> Track:
-    """Stack states into a track; the first state behind a gap is marked not valid."""
+    """Stack states into a track; the first state after a gap is marked invalid."""
     covariance = np.array([s.covariance for s in states])
     trajectory = Trajectory(
         time=np.array([s.time for s in states]),
