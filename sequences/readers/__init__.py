@@ -1,4 +1,4 @@
-"""Readers: one file per format, recognised by what a file holds."""
+"""Readers, one module per format; a recording's format is recognised by its content."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"
 
 @dataclass(frozen=True)
 class Format:
-    """How a format is told from others, and how it is read.
+    """A format of recordings: how to recognise and how to read it.
 
     Attributes:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
-        read: reads it, or raises ReadError.
-        words: what it is called before a person, where the reader knows no better.
-        options: names of what else `read` takes, all text.
+        read: function that reads the recording or raises ReadError.
+        words: name shown to users if the reader does not set a more specific one.
+        options: names of further arguments of `read`, all of them strings.
     """
 
     recognises: Callable[[Path], bool]
@@ -65,13 +65,13 @@ def _is_archive_or_member(path: Path) -> bool:
 
 
 def _read_zip(path: Path) -> ImuSequence:
-    """Read the one recording in a zip; its errors name the zip and the file in it."""
+    """Read the only recording in a zip; errors name the zip and the file in it."""
     with unpacked(path) as folder:
         found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
         if len(found) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
             raise ReadError(
-                path, "content", f"{len(found)} recordings, {names}", "one", "unpack it"
+                path, "content", f"{len(found)} recordings ({names})", "one", "unpack the zip"
             )
         return _read_unpacked(path, folder, found[0] if found else folder)
 
@@ -82,7 +82,7 @@ def _read_json(path: Path) -> ImuSequence:
 
 
 def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
-    """Read what was unpacked from `path`; errors name `path` instead of the folder."""
+    """Read the recording unpacked from `path`; errors name `path` instead of `folder`."""
     try:
         sequence = read_recording(inside)
     except ReadError as error:
@@ -97,7 +97,7 @@ FORMATS: dict[str, Format] = {
     "archive": Format(_is_archive_or_member, read_archive, "archive"),
     "ronin": Format(is_ronin, read_ronin, "RoNIN"),
     "ridi": Format(is_ridi, read_ridi, "RIDI"),
-    "imunet": Format(is_imunet, read_imunet, "IMUNet's recorder"),
+    "imunet": Format(is_imunet, read_imunet, "IMUNet recorder"),
     "rnin": Format(is_rnin, read_rnin, "RNIN"),
     "tlio": Format(is_tlio, read_tlio, "TLIO"),
     "bag": Format(is_bag, read_bag, "ROS bag", options=("imu_topic", "truth_topic")),
@@ -109,39 +109,39 @@ FORMATS: dict[str, Format] = {
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
     "zip": Format(is_zip, _read_zip, "zip"),
     "json": Format(is_json_export, _read_json, "Sensor Logger"),
-    "csv": Format(is_own_csv, read_own_csv, "CSV of one's own"),
+    "csv": Format(is_own_csv, read_own_csv, "generic CSV"),
 }
-"""Known formats by name, asked in this order, the more particular first; `euroc` is TUM-VI's as
-well, `ridi` that of IMUNet's processed recordings."""
+"""Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
+`ridi` also IMUNet's processed recordings."""
 
 _SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
     *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
-"""Files that may be a recording by themselves."""
+"""Suffixes of files that may be a recording by themselves."""
 
 _CONTAINERS = (
     (b"SQLite format 3", "an SQLite database"),
-    (b"PK\x03\x04", "a zip without text files, as a spreadsheet is, or one that is cut short"),
+    (b"PK\x03\x04", "a zip without text files (such as a spreadsheet), or one that is cut short"),
     (b"\xd0\xcf\x11\xe0", "a spreadsheet"),
     (b"\x1f\x8b", "a file compressed with gzip"),
     (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
     (b"MATLAB", "a MATLAB file"),
 )
-"""How files begin that may hold a recording but are not unpacked."""
+"""First bytes of files that may hold a recording but that are not unpacked."""
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
     """Read a recording.
 
     Args:
-        path: a file or a folder, as the format has it; of an archive `file.h5:name`.
-        format: a name in `FORMATS`, or "auto" to recognise it by its content.
-        options: what the format's reader takes besides: `imu_topic` and `truth_topic` of a bag.
+        path: a file or a folder, depending on the format; `file.h5:name` in an archive.
+        format: a name in `FORMATS`, or "auto" to recognise the format by the content.
+        options: further arguments of the format's reader: `imu_topic` and `truth_topic` for a bag.
 
     Raises:
-        InputError: the format's name is unknown, or it does not take an option.
-        ReadError: nothing is there, no format fits, or the content is malformed.
+        InputError: `path` is not a path, the format is unknown, or it does not take an option.
+        ReadError: the path does not exist, no format matches, or the content is malformed.
     """
     if not isinstance(path, str | Path):
         raise InputError("path", f"{path!r:.60}", "the path of a recording")
@@ -149,14 +149,14 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     if format != "auto" and format not in FORMATS:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
     if not split_name(path)[0].exists():
-        raise ReadError(path, "path", "nothing there", "a recording")
+        raise ReadError(path, "path", "no such file or folder", "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
         raise _unknown(path)
     for option in options:
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
-            raise InputError(option, f"an option of a {name} recording", known)
+            raise InputError(option, f"an option that format {name} does not take", known)
     sequence = in_order(FORMATS[name].read(path, **options))
     return sequence if sequence.source else replace(sequence, source=FORMATS[name].words)
 
@@ -166,25 +166,26 @@ def find_recordings(
     on_error: Callable[[ReadError], None] | None = None,
     where: Where | None = None,
 ) -> list[Path]:
-    """The recordings at a path: itself if it is one, those that it lists, else all below it.
+    """Return the recordings at a path: the path itself, those that it lists, or all below it.
 
-    A list is a text file with the name of a recording, or of a folder of some, on each line. Of a
-    folder the recordings come in sorted order; folders called `raw` beside `syn` are left out:
-    OxIOD's unsynchronised doubles.
+    A list is a text file with the name of a recording, or of a folder of recordings, on each line.
+    The recordings of a folder are sorted. Folders called `raw` next to a folder `syn` are skipped:
+    they hold OxIOD's unsynchronised duplicates.
 
     Args:
         path: a recording, a list file or a folder.
-        on_error: called for each entry of a list that is empty or leads nowhere; the others are
-            returned all the same. Without it such an entry is raised.
-        where: attributes that recordings must have, which only those of an archive do: for each
-            patterns, one of which must fit, `{"person": ["dan", "ha*"]}`.
+        on_error: called for each list entry that is empty or leads nowhere; the others are still
+            returned. Without it, such an entry raises its error.
+        where: attributes that recordings must have (only those in archives have any): patterns for
+            each attribute, one of which must match, `{"person": ["dan", "ha*"]}`.
 
     Raises:
-        ReadError: nothing is there, a folder holds no recording, or a list's entry is wrong.
+        ReadError: the path does not exist, a folder holds no recording, no recording has the
+            attributes, or a list entry is invalid.
     """
     path = Path(path)
     if not split_name(path)[0].exists():
-        raise ReadError(path, "path", "nothing there", "a recording or a folder of recordings")
+        raise ReadError(path, "path", "no such file or folder", "a recording or a folder of them")
     if is_archive(path):
         return archive_members(path, where)
     if _is_recording(path):
@@ -202,7 +203,7 @@ def find_recordings(
 
 
 def _with_attributes(found: list[Path], where: Where | None) -> list[Path]:
-    """Those of the recordings whose attributes fit; only archives' have any."""
+    """Return the recordings whose attributes match; only those in archives have any."""
     if not where or not found:
         return found
     members: dict[Path, list[Path]] = {}
@@ -221,8 +222,8 @@ def _with_attributes(found: list[Path], where: Where | None) -> list[Path]:
         raise errors[0]
     if not chosen:
         asked = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
-        fix = "recordings outside of archives have no attributes"
-        raise ReadError(found[0], f"recordings with {asked}", "none", "some", fix)
+        fix = "only recordings in archives have attributes"
+        raise ReadError(found[0], f"recordings with {asked}", "none", "at least one", fix)
     return chosen
 
 
@@ -248,14 +249,14 @@ def _below(path: Path) -> list[Path]:
 def _listed(
     path: Path, on_error: Callable[[ReadError], None] | None, where: Where | None
 ) -> list[Path]:
-    """What a list names, each once; a list in a list is an error, or it could name itself."""
+    """Return what a list names, each once; a list in a list is an error: it could be a cycle."""
     found: list[Path] = []
     for entry in list_entries(path):
         try:
             if isinstance(entry, ReadError):
                 raise entry
             if not _is_recording(entry.path) and is_list(entry.path):
-                raise ReadError(path, "list", f"the list {entry.path.name}", "names of recordings")
+                raise ReadError(path, "list", f"another list, {entry.path.name}", "recordings")
             found += find_recordings(entry.path, where=entry.where)
         except ReadError as error:
             if on_error is None:
@@ -269,7 +270,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _recognised(path: Path) -> str | None:
-    """Name of the format whose content a path has."""
+    """Return the name of the format that matches a path's content, or None."""
     return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
 
 
@@ -278,19 +279,19 @@ def _names() -> str:
 
 
 def _poses_alone(path: Path, pose: Path) -> ReadError:
-    expected = "a gyroscope's and an accelerometer's file"
-    fix = "put the IMU's files beside them"
-    return ReadError(path, "content", f"poses alone, {pose.name}", expected, fix)
+    expected = "a gyroscope file and an accelerometer file"
+    fix = "put the IMU files into the same folder"
+    return ReadError(path, "content", f"only poses, {pose.name}", expected, fix)
 
 
 def _unknown(path: Path) -> ReadError:
-    """What was seen instead of a recording, in one line."""
+    """Return an error that states in one line what was found instead of a recording."""
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
     elif lone := lone_sensors(path):
         expected = "a gyroscope and an accelerometer"
-        return ReadError(path, "sensors", f"{' and '.join(lone)} alone", expected, "log both")
+        return ReadError(path, "sensors", f"only {' and '.join(lone)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
         return _poses_alone(path, poses[0])
     elif path.is_dir():
@@ -304,5 +305,5 @@ def _unknown(path: Path) -> ReadError:
     elif (line := first_line(path)) is None:
         found, fix = "no line of text", "is it empty or compressed?"
     else:
-        found, fix = f"{line.strip()[:60]!r}", f"for a CSV of your own start with {HEADER}"
+        found, fix = f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"
     return ReadError(path, "content", found, _names(), fix)

@@ -1,8 +1,8 @@
-"""StarIO's archive: many recordings in one HDF5 file, each a group; one is named `file.h5:name`.
+"""StarIO's archive: an HDF5 file with a group per recording; `file.h5:name` names a recording.
 
-A group holds `imu/{t,gyro,accel}`, where known `mag/{t,field}`, and truth of one of three kinds:
+A group holds `imu/{t,gyro,accel}`, `mag/{t,field}` if known, and one of three kinds of truth:
 `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or `p`). Units are
-s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes say who
+s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes record who
 carried which device where. Poses may come with `truth/{velocity,position_covariance,valid}`.
 """
 
@@ -33,7 +33,7 @@ from stario.sequences.time_order import advancing
 SUFFIXES = (".h5", ".hdf5")
 
 Where = Mapping[str, Sequence[str]]
-"""What recordings are asked for: patterns, one of which must fit, for each attribute."""
+"""Filter of recordings: patterns for each attribute, one of which must match."""
 
 _HDF5_MAGIC = b"\x89HDF"
 _RONIN = "data.hdf5"
@@ -44,11 +44,11 @@ _OPTIONAL = {
 
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
-"""What h5py and NumPy raise of a damaged file, or of one that holds something else."""
+"""What h5py and NumPy raise for a damaged file, or for one with other content."""
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
-    """The archive's file and the recording's name in it: `file.h5:name`, or None without one."""
+    """Split `file.h5:name` into the archive's file and the recording's name, None without one."""
     text = str(path)
     for suffix in SUFFIXES:
         stop = text.lower().find(f"{suffix}:") + len(suffix)
@@ -64,9 +64,10 @@ def is_archive_member(path: Path) -> bool:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file is an archive: HDF5 whose groups hold an IMU's samples or a track.
+    """Whether a file is an archive: HDF5 whose first group holds IMU samples or a track.
 
-    One that cannot be opened is taken for one, by its name: reading it says what is wrong.
+    A file that cannot be opened counts as one unless it is named like RoNIN's: reading it then
+    raises an error that names the damage.
     """
     if path.suffix.lower() not in SUFFIXES or magic(path, 4) != _HDF5_MAGIC:
         return False
@@ -80,15 +81,15 @@ def is_archive(path: Path) -> bool:
 
 
 def archive_members(path: Path, where: Where | None = None) -> list[Path]:
-    """`file.h5:name` of every recording of an archive that has an IMU; only names are read.
+    """Return `file.h5:name` for each recording in an archive with IMU data, reading no samples.
 
     Args:
         path: the archive's file.
-        where: for each attribute patterns of which one must fit its text, `*` for anything:
+        where: patterns for each attribute, one of which must match its text, `*` for anything:
             `{"person": ["dan", "ha*"]}`.
 
     Raises:
-        ReadError: the file cannot be read, or none has the attributes; it names the values seen.
+        ReadError: the file cannot be read, or no recording matches; it lists the values present.
     """
     wanted = where or {}
     with _opened(path) as file:
@@ -104,7 +105,7 @@ def archive_members(path: Path, where: Where | None = None) -> list[Path]:
 
 
 def archive_attributes(path: Path) -> dict[str, str | float]:
-    """Attributes of the recording `file.h5:name`, its numbers unread; of other files none."""
+    """Return the attributes of `file.h5:name` without its samples; empty for other paths."""
     file_path, name = split_name(path)
     if name is None:
         return {}
@@ -113,7 +114,7 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
 
 
 def matches(name: str, attributes: Mapping[str, str | float], where: Where) -> bool:
-    """Whether a recording's attributes (its name is one) are as asked for."""
+    """Whether a recording's attributes, its `name` among them, match the filter."""
     told = {"name": name, **attributes}
     return all(
         any(fnmatchcase(_text(told.get(key, "")), pattern) for pattern in patterns)
@@ -130,7 +131,7 @@ def _none_chosen(
     )
     values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
     seen = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
-    expected = f"{key} of {seen}" if seen else f"an attribute that they have: none has {key}"
+    expected = f"{key} to be one of {seen}" if seen else f"another attribute: none has {key}"
     return ReadError(path, f"recordings with {asked}", "none", expected)
 
 
@@ -143,13 +144,13 @@ def _text(value: str | float) -> str:
 
 
 def read_archive(path: Path) -> ImuSequence:
-    """Read one recording of an archive.
+    """Read one recording from an archive.
 
     Args:
-        path: `file.h5:name`, or the file alone where it holds one recording.
+        path: `file.h5:name`, or only the file if it holds a single recording.
 
     Raises:
-        ReadError: the file or the recording is not there, or its content is malformed.
+        ReadError: the file or the recording does not exist, or its content is malformed.
     """
     file_path, name = split_name(path)
     with _opened(file_path) as file:
@@ -157,13 +158,13 @@ def read_archive(path: Path) -> ImuSequence:
         if name is None and len(names) == 1:
             name = names[0]
         if name is None:
-            found = f"{len(names)} of them"
+            found = f"{len(names)} recordings"
             raise ReadError(
-                file_path, "recording", found, "the name of one", f"{path.name}:{names[0]}"
+                file_path, "recording", found, "the name of one", f"use {path.name}:{names[0]}"
             )
         if name not in file:
             known = ", ".join(names[:3])
-            raise ReadError(file_path, "recording", repr(name), f"a name in it, as {known}")
+            raise ReadError(file_path, "recording", repr(name), f"a name in it, such as {known}")
         return _sequence(path, name, file[name])
 
 
@@ -202,7 +203,7 @@ def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
 
 
 def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:
-    """Poses, and positions or waypoints."""
+    """Return the poses, and the positions or waypoints."""
     positions = None
     if "waypoints" in group:
         place = "waypoints/xy" if "waypoints/xy" in group else "waypoints/p"
@@ -215,7 +216,7 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
     keep = advancing(time)
     valid = _valid(path, group, "truth", time)[keep]
     quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
-    # What is not valid may hold anything; a rotation must be one.
+    # Invalid rows may hold anything, but each must become a rotation.
     usable = valid | np.isfinite(quat).all(axis=1)
     quat = np.where(usable.reshape(-1, 1), quat, [0.0, 0.0, 0.0, 1.0])
     attitude_WB = rotations(path, "truth/quat_xyzw", quat, "xyzw")
@@ -245,7 +246,7 @@ def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
 
 
 def _column(path: Path, group: Any, field: str, finite: bool = True) -> FloatArray:
-    """A dataset as numbers; of the IMU some may be missing, which its health report counts."""
+    """Return a dataset as numbers; IMU samples may be NaN, which the health report counts."""
     if field not in group:
         raise ReadError(path, field, "no such dataset", "an array of numbers")
     values: FloatArray = np.asarray(group[field][:], dtype=np.float64)
@@ -263,7 +264,7 @@ def _plain(value: Any) -> str | float:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The open file; whatever of it is damaged or of another form shows as it is read."""
+    """Open the file; damage or other content raises ReadError while the block reads it."""
     h5py = optional_package("h5py", "readers")
     try:
         with h5py.File(path) as file:
@@ -273,4 +274,4 @@ def _opened(path: Path) -> Iterator[Any]:
     except _DAMAGED as error:
         found = " ".join(str(error).split())[:200] or type(error).__name__
         fix = "is the download complete?"
-        raise ReadError(path, "content", found, "a whole HDF5 archive", fix) from error
+        raise ReadError(path, "content", found, "an intact HDF5 archive", fix) from error

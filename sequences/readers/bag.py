@@ -1,12 +1,12 @@
-"""ROS 1 and ROS 2 bags: an Imu topic and, where there are, a pose topic as truth, a MagneticField.
+"""ROS 1 and ROS 2 bags: Imu messages and, if present, poses as ground truth and MagneticField.
 
-`.bag` files, rosbag2 folders, `.mcap` and `.db3` files, read by `rosbags` without ROS. Of the
-messages only the numbers are looked at: whatever precedes them, a message of the types below ends
-with a fixed run of doubles, in ROS 1's serialisation as in CDR, and both hold the stamp at byte 4.
-That needs no definition of the types (a `.db3` of the older kind has none) and is quick.
+Reads `.bag` files, rosbag2 folders, `.mcap` and `.db3` files with `rosbags`, without ROS. Only the
+numbers of a message are decoded: a message of the types below ends with a fixed number of doubles,
+whatever precedes them, and has the stamp at byte 4, both in ROS 1's serialisation and in CDR. This
+is fast and needs no type definitions, which older `.db3` files lack.
 
-Time is the header's stamp, the bag's own where a driver left that zero. Poses are taken as those of
-the IMU in a world with z up; `stario inspect` shows where they are not.
+Time is the header's stamp, or the bag's time if a driver left all stamps zero. Poses are assumed to
+be those of the IMU in a world with z up; `stario inspect` shows if they are not.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _GYRO, _ACCEL = slice(13, 16), slice(25, 28)
 _STAMP = slice(4, 12)
 
 NO_TRUTH = "none"
-"""Given as the topic of the truth: leave it out."""
+"""Value of `truth_topic` that disables ground truth."""
 
 
 def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSequence:
@@ -52,12 +52,12 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
 
     Args:
         path: a `.bag`, `.mcap` or `.db3` file, or a rosbag2 folder.
-        imu_topic: the topic with sensor_msgs/Imu; may be left out if there is one.
+        imu_topic: a topic with sensor_msgs/Imu; optional if there is only one.
         truth_topic: a topic with PoseStamped, PoseWithCovarianceStamped, Odometry or
-            TransformStamped; may be left out if there is one or none, "none" for no truth.
+            TransformStamped; optional if there is one or none, "none" to read no ground truth.
 
     Raises:
-        ReadError: the bag is broken, a topic is missing, or several fit and none was named.
+        ReadError: the bag is damaged, a topic is missing, or several match and none was named.
         InputError: rosbags is not installed.
     """
     messages = _messages(path, imu_topic, truth_topic)
@@ -100,7 +100,7 @@ class _Messages:
 
 
 def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messages]:
-    """The IMU's messages and the truth's, if there is one, by type."""
+    """Return the messages of the IMU and, if present, ground truth and magnetic field, by type."""
     version = "1" if magic(path).startswith(b"#ROSBAG") else "2"
     reader_type: Any = optional_package(f"rosbags.rosbag{version}", "bags").Reader
     try:
@@ -117,9 +117,9 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
         return {topics[t]: _decoded(path, t, topics[t], received[t], little) for t in chosen}
     except ReadError:
         raise
-    except Exception as error:  # whatever the library stumbles over, the file is broken
+    except Exception as error:  # any error of the library means a damaged file
         found = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        raise ReadError(path, "file", found, "a whole bag", "is the download complete?") from None
+        raise ReadError(path, "file", found, "an intact bag", "is the download complete?") from None
 
 
 def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
@@ -147,7 +147,7 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
 
 
 def _magnetic_topic(topics: dict[str, str], imu_topic: str) -> list[str]:
-    """The magnetic field's topic; of several the one nearest to the IMU's in the tree of names."""
+    """Return the magnetic field's topic; of several, the one nearest to the IMU's by name."""
     fitting = [topic for topic, kind in sorted(topics.items()) if kind == _MAGNETIC]
     here = set(accumulate(imu_topic.split("/"), "{}/{}".format))
     near = [len(here & set(accumulate(t.split("/"), "{}/{}".format))) for t in fitting]
@@ -162,19 +162,21 @@ def _magnetometer(field: _Messages, start_ns: np.int64) -> Magnetometer | None:
 
 def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:
     if wanted not in fitting:
-        raise ReadError(path, field, repr(wanted), f"one of {', '.join(fitting) or 'none'}")
+        raise ReadError(
+            path, field, repr(wanted), f"one of {', '.join(fitting) or '(none in this bag)'}"
+        )
     return wanted
 
 
 def _decoded(
     path: Path, topic: str, kind: str, received: list[tuple[int, bytes]], little: bool
 ) -> _Messages:
-    """Stamps and doubles of a topic's messages; CDR says its byte order in its second byte."""
+    """Return the stamps and doubles of messages; CDR gives its byte order in the second byte."""
     raws = [raw for _, raw in received]
     size = 8 * _DOUBLES[kind]
     shortest = min(map(len, raws), default=0)
     if shortest < _STAMP.stop + size:
-        raise ReadError(path, topic, f"a message of {shortest} bytes", f"a whole {kind}")
+        raise ReadError(path, topic, f"a message of {shortest} bytes", f"a complete {kind}")
     order = "<" if little or raws[0][1] & 1 else ">"
     parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{order}u4").reshape(-1, 2)
     stamps = parts.astype(np.int64) @ np.array([10**9, 1])

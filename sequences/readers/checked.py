@@ -1,4 +1,4 @@
-"""What every reader of a data set holds against its file: finite numbers, unit quaternions."""
+"""Checks shared by the readers: finite numbers, unit quaternions, optional packages."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _HELD_SHARE = 1.0 / 3.0
 
 
 def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
-    """The values (N,) or (N, K) if every one is finite.
+    """Return the values if all of them are finite.
 
     Args:
-        path: the file they come from.
-        field: what they are, for the error.
-        values: to be checked.
+        path: the file that holds the values.
+        field: name of the values, for the error.
+        values: (N,) or (N, K) values to be checked.
         first_row: number of the first row in the file, for the error.
 
     Raises:
-        ReadError: one is not; it names the row.
+        ReadError: a value is not finite; the error names its row.
     """
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
@@ -41,17 +41,17 @@ def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> F
 def rotations(
     path: Path, field: str, quat: FloatArray, order: str = "wxyz", first_row: int = 1
 ) -> Rotation:
-    """Rotations from unit quaternions.
+    """Return rotations from unit quaternions.
 
     Args:
-        path: the file they come from.
-        field: what they are, for the error.
-        quat: (N, 4).
-        order: of their components, `wxyz` or `xyzw`.
+        path: the file that holds the quaternions.
+        field: name of the quaternions, for the error.
+        quat: (N, 4) quaternions.
+        order: order of the components, `wxyz` or `xyzw`.
         first_row: number of the first row in the file, for the error.
 
     Raises:
-        ReadError: a component is not finite or a norm is off 1 by more than a percent.
+        ReadError: a component is not finite or a norm differs from 1 by more than a percent.
     """
     norm = np.linalg.norm(checked(path, field, quat, first_row), axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
@@ -65,13 +65,13 @@ def rotations(
 
 
 def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magnetometer | None:
-    """A magnetometer's samples that are numbers, not zero, and whose times advance; None if none.
+    """Return the finite, non-zero samples of a magnetometer whose times advance; None if none.
 
     Args:
-        time: (N,) [s].
-        field: (N, 3) [uT].
-        held: leave repeated values out where more than a third are: apps that write the last
-            reading at the IMU's rate.
+        time: (N,) sample times [s].
+        field: (N, 3) magnetic field [uT].
+        held: whether to skip repeated values if more than a third are repeated: some apps write
+            the last reading at the IMU's rate.
     """
     known = np.isfinite(field).all(axis=1) & np.isfinite(time) & field.any(axis=1)
     time, field = time[known], field[known]
@@ -89,7 +89,7 @@ def trajectory(
     attitude_WB: Rotation,
     velocity_W: FloatArray | None = None,
 ) -> Trajectory:
-    """A track of the poses whose times advance: files repeat rows."""
+    """Return a trajectory of the poses whose times advance; files may repeat rows."""
     keep = advancing(time)
     return Trajectory(
         time=time[keep],
@@ -100,10 +100,10 @@ def trajectory(
 
 
 def optional_package(name: str, extra: str) -> Any:
-    """An optional package, imported.
+    """Import and return an optional package.
 
     Raises:
-        InputError: it is not installed; it names the extra that brings it.
+        InputError: the package is not installed; the error names the extra that installs it.
     """
     try:
         return importlib.import_module(name)

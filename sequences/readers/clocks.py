@@ -1,4 +1,4 @@
-"""Times in a unit that nothing names, and sensors with clocks of their own."""
+"""Times whose unit is not named, and sensors with separate sample times."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from stario.sequences.units import TIME_UNITS
 from stario.sequences.windows import MAX_RATE
 
 _RATES = (9.0, 1.05 * MAX_RATE)
-"""Samples a second that sensors and captures make, with some slack for rounding; the units are
-further apart than these."""
+"""Plausible rates of sensors and captures [Hz], with slack for rounding; the range spans less than
+the factor between two units, so that only one unit fits."""
 
 
 def on_one_clock(
     path: Path, gyro_ns: IntArray, gyro: FloatArray, accel_ns: IntArray, accel: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """The gyroscope's samples of the common stretch, the accelerometer interpolated to them.
+    """Interpolate the accelerometer to the gyroscope's samples in their common time span.
 
-    Samples within a gap of the accelerometer of more than 0.1 s are left out: nothing is known
-    there.
+    Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
+    unknown.
 
     Args:
         path: the recording, for errors.
-        gyro_ns: (N,) [ns].
-        gyro: (N, 3).
-        accel_ns: (M,) [ns], of the same origin.
-        accel: (M, 3).
+        gyro_ns: (N,) gyroscope times [ns].
+        gyro: (N, 3) gyroscope samples.
+        accel_ns: (M,) accelerometer times [ns], with the same origin.
+        accel: (M, 3) accelerometer samples.
 
     Returns:
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
 
     Raises:
-        ReadError: the two have no stretch in common.
+        ReadError: the two sensors do not overlap in time.
     """
     order = np.unique(accel_ns, return_index=True)[1]
     accel_ns, accel = accel_ns[order], accel[order]
@@ -48,7 +48,7 @@ def on_one_clock(
             f"{name} from {seconds(ns, origin).min():.3f} to {seconds(ns, origin).max():.3f} s"
             for name, ns in (("gyroscope", gyro_ns), ("accelerometer", accel_ns))
         ]
-        raise ReadError(path, "time", ", ".join(spans), "a common stretch of one clock")
+        raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
     before, after = accel_ns[right - 1], accel_ns[np.minimum(right, len(accel_ns) - 1)]
     exact = (gyro_ns == before) | (gyro_ns == after)
@@ -58,15 +58,15 @@ def on_one_clock(
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
-    """How many of the time's units make a second, told by the rate where no unit is named.
+    """Return the number of time units in a second, inferred from the rate if no unit is named.
 
     Args:
-        file: for errors.
-        time: (N,) in whatever unit.
-        unit: its name, or empty.
+        file: the file that holds the times, for errors.
+        time: (N,) times in any unit.
+        unit: the unit's name, or empty.
 
     Raises:
-        ReadError: the unit is unknown, or none makes a sensor's rate of it.
+        ReadError: the unit is unknown, or no unit gives a plausible sample rate.
     """
     if unit in TIME_UNITS:
         return TIME_UNITS[unit]
@@ -78,5 +78,5 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     for per_second in TIME_UNITS.values():
         if step and _RATES[0] <= per_second / step <= _RATES[1]:
             return per_second
-    expected = f"10 to {MAX_RATE:.0f} samples a second in {', '.join(TIME_UNITS)}"
+    expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(TIME_UNITS)}"
     raise ReadError(file, "time", f"a step of {step:.4g}", expected)

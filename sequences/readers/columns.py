@@ -1,4 +1,4 @@
-"""The header of a CSV of one's own: which column holds what, in which unit."""
+"""The header of a generic CSV: which column holds what, in which unit."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stario.sequences.errors import ReadError
 from stario.sequences.units import unit_named
 
 HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
-"""What a header looks like."""
+"""The required columns of a header, as they are written."""
 
 TRUTH_HEADER = "px [m],py [m],pz [m],qx,qy,qz,qw"
-"""What may follow it: poses, or positions without attitude (px and py at least)."""
+"""Optional ground truth: poses, or positions without attitude (px and py at least)."""
 
 MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
-"""What may stand among them."""
+"""Optional magnetometer columns."""
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]
 
 @dataclass(frozen=True)
 class Column:
-    """Where a quantity stands in a row, the header's words for it, and its unit."""
+    """A quantity's position in a row, its title in the header, and its unit."""
 
     index: int
     title: str
@@ -61,7 +61,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """How many lines end with it, what separates cells, and columns by their canonical name."""
+    """Number of lines up to the header's end, cell separator, and columns by canonical name."""
 
     lines: int
     separator: str
@@ -69,10 +69,10 @@ class Header:
 
 
 def read_header(path: Path, lines: list[str]) -> Header:
-    """The header of a file's lines.
+    """Return the header found in a file's lines.
 
     Raises:
-        ReadError: there is none, or its columns or their units do not fit.
+        ReadError: there is none, or its columns or their units are invalid.
     """
     index = _header_index(lines)
     if index is None:
@@ -85,7 +85,7 @@ def read_header(path: Path, lines: list[str]) -> Header:
 
 
 def _header_index(lines: list[str]) -> int | None:
-    """Where the header stands: the first line that is no comment, or one that names columns."""
+    """Return the index of the first line that is not a comment, or is one that names columns."""
     for index, line in enumerate(lines):
         if line.strip() and (not line.lstrip().startswith("#") or _names_columns(line)):
             return index
@@ -107,12 +107,12 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
         if name is None:
             ignored.append(title)
         elif name in columns:
-            found = f"{title} beside {columns[name].title}"
+            found = f"both {title} and {columns[name].title}"
             raise ReadError(path, f"line {number}, {name}", found, "one column")
         else:
             columns[name] = Column(index, title, unit)
     missing = [name for name in ("t", *IMU) if name not in columns]
-    if not set(POSITION) & set(columns):  # an attitude alone is no track
+    if not set(POSITION) & set(columns):  # attitude alone is not a track
         ignored += [columns.pop(name).title for name in QUAT if name in columns]
     truth = [name for name in TRUTH if name in columns]
     if set(QUAT) & set(columns):
@@ -122,7 +122,7 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
     if set(MAGNETIC) & set(columns):
         missing += [name for name in MAGNETIC if name not in columns]
     if missing:
-        fix = "or leave truth out" if truth and not set(missing) & {"t", *IMU} else ""
+        fix = "or remove the truth columns" if truth and not set(missing) & {"t", *IMU} else ""
         expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER
         expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
@@ -131,7 +131,7 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
         alike = [title for title in ignored if _LIKE_TRUTH.match(title)]
         if alike and not truth:
             _log.warning(
-                "%s: no truth is read from %s: it takes %s",
+                "%s: no ground truth is read from %s: it must have %s",
                 path, ", ".join(alike), TRUTH_HEADER,
             )  # fmt: skip
     for name in truth:
@@ -140,7 +140,7 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
 
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
-    """Factor of a column's unit; the table's first where the header names none."""
+    """Return the factor of a column's unit; the table's first if the header names none."""
     unit = unit_named(column.unit) or next(iter(known))
     if unit not in known:
         names = ", ".join(filter(None, known)) or "no unit"
@@ -149,7 +149,7 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Fact
 
 
 def _names_columns(line: str) -> bool:
-    """Whether a line names any column of the IMU that this format knows."""
+    """Whether a line names any IMU column of this format."""
     names = {_ALIASES.get(_cell(text)[0].lower(), "") for text in _titles(line)}
     return bool(names & set(IMU))
 
@@ -163,6 +163,6 @@ def _separator(header: str) -> str:
 
 
 def _cell(text: str) -> tuple[str, str]:
-    """Name and unit of a header's cell, `gx [deg/s]` or `gx (deg/s)`."""
+    """Return the name and unit of a header's cell, `gx [deg/s]` or `gx (deg/s)`."""
     match = _CELL.match(text)
     return (match["name"], match["unit"] or "") if match else (text.strip(), "")

@@ -1,4 +1,4 @@
-"""Writing a CSV of one's own: samples, magnetometer and truth in rows shared where times agree."""
+"""Writing a generic CSV: samples, magnetometer and truth share rows where their times agree."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from stario.sequences.sequence import FloatArray, ImuSequence
 
 
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
-    """Write a recording so that `read_own_csv` returns the same numbers, whole or not at all.
+    """Write a recording so that `read_own_csv` returns the same numbers; never a partial file.
 
-    The magnetometer's samples and truth's valid poses or positions go to the IMU's rows where
-    their times are the same and to rows of their own elsewhere; truth's velocity and covariance
-    have no column.
-    Reading counts time from the first IMU sample.
+    Magnetometer samples and the truth's valid poses or positions go into the IMU's rows where
+    their times are equal and into separate rows elsewhere; the truth's velocity and covariance
+    have no column. The reader counts time from the first IMU sample.
 
     Raises:
         InputError: the folder does not exist.
@@ -40,12 +39,12 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
 
 
 class _Written:
-    """A file's rows as they are put together: the IMU's, with what shares their times."""
+    """Rows of a file under construction: the IMU's, with values that share their times."""
 
     def __init__(self, sequence: ImuSequence) -> None:
         table = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
         self._rows = [",".join(map(repr, row)) for row in table.tolist()]
-        # What is added stays in order: it shares rows of the IMU newer than all before them.
+        # Added values stay in order: they share only IMU rows newer than all before them.
         self._newest = np.maximum.accumulate(np.nan_to_num(sequence.time, nan=-np.inf))
         advances = np.flatnonzero(np.diff(self._newest, prepend=-np.inf) > 0)
         self._shared = {float(sequence.time[k]): int(k) for k in advances}
@@ -53,7 +52,7 @@ class _Written:
         self._blank = "," * len(IMU)
 
     def add(self, time: FloatArray, values: FloatArray) -> None:
-        """Columns to the right of those there are, at times (M,) that increase."""
+        """Append columns on the right, with values (M, K) at increasing times (M,)."""
         empty = "," * values.shape[1]
         tails = [empty] * len(self._rows)
         own = []
@@ -68,7 +67,7 @@ class _Written:
         self._blank += empty
 
     def merged(self) -> list[str]:
-        """All rows, those without IMU samples before the first IMU row that is later."""
+        """Return all rows; a row without IMU samples precedes the first later IMU row."""
         own = sorted(self._own, key=lambda item: item[0])
         places = np.searchsorted(self._newest, [t for t, _ in own]).tolist()
         merged: list[str] = []

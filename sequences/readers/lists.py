@@ -1,8 +1,8 @@
-"""List files: a recording's name on each line, as the data sets publish their splits.
+"""List files: one recording per line, as the data sets publish their splits.
 
-Behind an archive's name may stand what its recordings are chosen by, as for `find_recordings`:
-`file.h5 person=dan place="building 2"`. Blanks around a name, `,type` behind it and comments from
-`#` on are dropped; so are blank lines at the end, but an empty entry elsewhere is an error, because
+An archive's name may be followed by a filter of its recordings, as for `find_recordings`:
+`file.h5 person=dan place="building 2"`. Blanks around a name, a `,type` after it and comments from
+`#` on are ignored, as are blank lines at the end. An empty entry elsewhere is an error, because
 the data sets' own readers take it for the folder itself.
 """
 
@@ -24,9 +24,9 @@ _CHOICE = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file may be a list: text by its suffix, none of whose first lines is a row.
+    """Whether a file may be a list: a text suffix and no row of numbers in its first lines.
 
-    A row is one of numbers. A single number may be a name: TLIO's are.
+    A line with a single number may be a name, as in TLIO's lists.
     """
     if path.suffix.lower() not in _SUFFIXES or first_line(path, comments=True) is None:
         return False
@@ -36,18 +36,18 @@ def is_list(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of a list: a path, and which of its recordings are meant."""
+    """An entry of a list: a path and the filter of its recordings."""
 
     path: Path
     where: Where
 
 
 def list_entries(path: Path) -> Iterator[Entry | ReadError]:
-    """The files and folders that a list names, in its order, or what is wrong with a line.
+    """Yield the files and folders that a list names, in its order, or the error of a line.
 
-    Names count from the list's folder, from a folder in it, or, where the list stands in a folder
-    of nothing but lists, from the folder around that. `data1/imu3.csv` is found as
-    `data1/syn/imu3.csv` too (OxIOD).
+    Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
+    may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
+    `data1/syn/imu3.csv` (OxIOD).
 
     Raises:
         ReadError: the list cannot be read or names nothing.
@@ -69,15 +69,15 @@ def list_entries(path: Path) -> Iterator[Entry | ReadError]:
             )
             continue
         found = _located(bases, Path(name))
-        fix = "take it off the list or fetch it"
+        fix = "remove the line or fetch the recording"
         if found is None:
-            yield ReadError(path, f"line {number}", f"{name}, not there", "a recording", fix)
+            yield ReadError(path, f"line {number}", f"no {name}", "a recording", fix)
         else:
             yield Entry(found, where)
 
 
 def _chosen(text: str) -> tuple[str, Where]:
-    """A line without the `key=value` at its end, and these."""
+    """Split the `key=value` filters off the end of a line."""
     where: dict[str, list[str]] = {}
     while match := _CHOICE.search(text):
         where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))

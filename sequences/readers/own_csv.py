@@ -1,20 +1,20 @@
-"""A CSV of one's own: `t,gx,gy,gz,ax,ay,az` with units in the header, truth columns optional.
+"""A generic CSV: `t,gx,gy,gz,ax,ay,az` with units in the header and optional ground truth columns.
 
 The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order and
-separated by commas, semicolons or tabs as the rows below it; comments (`#`) may stand above it:
+separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
 
 - `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
   IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
-  (-m/s^2 or -g where the device reports gravity, as Apple's do). Without a unit: rad/s, m/s^2,
-  and of time the unit that makes a sensor's rate of it.
-- `mx,my,mz` [uT] (or nT, mT, T, gauss) magnetic field, in rows of its own or in those of the IMU;
+  (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named are rad/s,
+  m/s^2 and, for time, the unit that gives a plausible sample rate.
+- `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
   blank or nan where it was not sampled.
-- truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may leave
-  truth blank (slower truth), or gyroscope and accelerometer (truth at times of its own).
-- or `px,py` or `px,py,pz` alone: waypoints that were passed (two seconds apart or more), or a
-  track of positions, as of satellites.
+- ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
+  leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
+- or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
+  a track of positions, for example from satellites.
 
-A sample written as `nan` is kept as such; other columns are ignored.
+A sample written as `nan` stays NaN; other columns are ignored.
 """
 
 from __future__ import annotations
@@ -61,24 +61,24 @@ from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME
 _log = logging.getLogger(__name__)
 
 _WAYPOINTS_APART = 2.0
-"""Positions that lie so far apart in the median are waypoints [s]."""
+"""Median interval between positions from which they are waypoints [s]."""
 
 _HEAD_LINES = 200
-"""Among which the header must stand for a file to be recognised."""
+"""Number of lines in which the header must be for a file to be recognised."""
 
 
 def read_own_csv(path: Path) -> ImuSequence:
-    """Read a CSV of one's own, see the module's first lines.
+    """Read a generic CSV in the format that the module's docstring describes.
 
     Raises:
-        ReadError: header, unit, row or number does not fit; it names line and column.
+        ReadError: header, unit, row or number is invalid; the error names line and column.
     """
     lines = read_lines(path)
     header = read_header(path, lines)
     columns = header.columns
     if _ends_within_a_row(path, lines, header):
-        # A recorder was killed while it wrote: what it wrote before is whole.
-        _log.warning("%s: the last line, %d, is cut short and left out", path, len(lines))
+        # The recorder was killed while it wrote: all earlier rows are complete.
+        _log.warning("%s: skipped the last line, %d, which is cut short", path, len(lines))
         rows = _rows_carefully(path, lines[:-1], header)
     else:
         rows = _rows_quickly(path, header) or _rows_carefully(path, lines, header)
@@ -105,7 +105,7 @@ def read_own_csv(path: Path) -> ImuSequence:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns by their canonical name, time [s], which rows are IMU samples, where rows stand."""
+    """Columns by canonical name, times [s], mask of IMU samples, and line numbers of the rows."""
 
     table: dict[str, FloatArray]
     time: FloatArray
@@ -114,7 +114,7 @@ class _Rows:
 
 
 def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
-    """Whether the last line has no end and fewer cells than the row before it."""
+    """Whether the last line has no line end and fewer cells than the row before it."""
     if len(lines) < header.lines + 2 or not _is_row(lines[-2]):
         return False
     if lines[-1].count(header.separator) >= lines[-2].count(header.separator):
@@ -125,7 +125,7 @@ def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
 
 
 def _rows_quickly(path: Path, header: Header) -> _Rows | None:
-    """The rows of a large file in which every row is whole, else None."""
+    """Return the rows of a large file if every row is complete, else None."""
     columns = header.columns
     names = ["t", *(name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns)]
     used = [columns[name].index for name in names]
@@ -138,7 +138,7 @@ def _rows_quickly(path: Path, header: Header) -> _Rows | None:
         time = np.asarray((stamps - stamps[0]) / per_second, dtype=np.float64)
     elif stamps is not None and per_second == 1 and stamps[0] == 0.0:
         time = np.asarray(stamps, dtype=np.float64)
-    else:  # the difference of long decimals is taken before it is rounded
+    else:  # long decimals must be subtracted before they are rounded
         return None
     count = len(time)
     return _Rows(
@@ -180,7 +180,7 @@ def _is_row(line: str) -> bool:
 def _numbers(
     path: Path, numbered: list[tuple[int, str]], separator: str, columns: list[Column]
 ) -> FloatArray:
-    """The columns asked for as (N, K), blank cells as NaN."""
+    """Return the given columns as (N, K), with blank cells as NaN."""
     text = "\n".join(line for _, line in numbered)
     used = [column.index for column in columns]
     with suppress(ValueError, IndexError):
@@ -192,7 +192,7 @@ def _numbers(
 
 
 def _blank(separator: str) -> re.Pattern[str]:
-    """Cells with nothing but blanks in them, of one line: its end is no blank."""
+    """Return a pattern for blank cells within a line; a line end is not a blank."""
     blanks = rf"[^\S\n{separator}]*"
     return re.compile(
         rf"(?<={separator}){blanks}(?={separator}|$)|^{blanks}(?={separator})", flags=re.MULTILINE
@@ -200,11 +200,11 @@ def _blank(separator: str) -> re.Pattern[str]:
 
 
 def _row(path: Path, number: int, line: str, separator: str, columns: list[Column]) -> list[float]:
-    """One row the slow way, for the error that names its line and column."""
+    """Parse one row slowly, to raise an error that names its line and column."""
     cells = line.split(separator)
     needed = 1 + max(column.index for column in columns)
     if len(cells) < needed:
-        alone = f"separate them by {separator!r} as in the header"
+        alone = f"separate the values by {separator!r} as in the header"
         fix = alone if len(cells) == 1 else "is the file cut short?"
         raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
     row = []
@@ -220,7 +220,7 @@ def _row(path: Path, number: int, line: str, separator: str, columns: list[Colum
 
 
 def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArray) -> BoolArray:
-    """Rows that are IMU samples: not those with truth alone, whose IMU cells are all blank."""
+    """Return the mask of IMU samples: rows whose IMU cells are not all blank."""
     is_imu = np.ones(len(values), dtype=np.bool_)
     indices = [header.columns[name].index for name in IMU]
     for k in np.flatnonzero(np.isnan(values).all(axis=1)):
@@ -232,7 +232,7 @@ def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArra
 def _seconds(
     path: Path, numbered: list[tuple[int, str]], header: Header, origin: int
 ) -> FloatArray:
-    """Seconds since the row `origin`, from the digits as they are written."""
+    """Return seconds since the row `origin`, computed exactly from the digits."""
     column = header.columns["t"]
     stamps = []
     for number, line in numbered:
@@ -255,7 +255,7 @@ def _magnetometer(path: Path, header: Header, rows: _Rows) -> Magnetometer | Non
 
 
 def _per_second(path: Path, column: Column, time: FloatArray) -> int:
-    """The unit of time that the header names, else the one that makes a sensor's rate of it."""
+    """Return the units per second, as the header names them or else inferred from the rate."""
     if not column.unit:
         with suppress(ReadError):
             return time_unit(path, time)
@@ -263,13 +263,13 @@ def _per_second(path: Path, column: Column, time: FloatArray) -> int:
 
 
 def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
-    """The positions of the rows that hold one; None if fewer than two do."""
+    """Return the positions of the rows that hold one; None if fewer than two do."""
     names = [name for name in POSITION if name in rows.table]
     known = np.stack([rows.table[name] for name in names], axis=1)
     kept = np.flatnonzero(np.isfinite(known).all(axis=1) & np.isfinite(rows.time))
     kept = kept[advancing(rows.time[kept])]
     if len(kept) < 2:
-        _log.warning("%s: %d rows hold a position, which makes no track", path, len(kept))
+        _log.warning("%s: %d rows hold a position, too few for a track", path, len(kept))
         return None
     time = rows.time[kept]
     apart = float(np.median(np.diff(time))) >= _WAYPOINTS_APART
@@ -277,13 +277,13 @@ def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:
-    """The track of the rows that hold truth; None if fewer than two do."""
+    """Return the trajectory of the rows that hold truth; None if fewer than two do."""
     time = rows.time
     poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
     kept = kept[advancing(time[kept])]
     if len(kept) < 2:
-        _log.warning("%s: %d rows hold truth, which makes no track", path, len(kept))
+        _log.warning("%s: %d rows hold ground truth, too few for a trajectory", path, len(kept))
         return None
     norm = np.linalg.norm(poses[kept, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE

@@ -1,11 +1,11 @@
-"""Poses that an augmented-reality logger wrote beside an IMU, brought into the IMU's frames.
+"""Poses that an augmented-reality app logged alongside an IMU, transformed to the IMU's frames.
 
 Rows are time, position xyz [m] and a quaternion, or the upper three rows of a pose matrix (ARKit).
-Files differ in what they are of (camera, display, sensor), in the quaternion's order, which some
-headers name wrongly, and in the world's vertical (y for ARCore and ARKit). The gyroscope tells:
-each file and order is held against it (`stario.sequences.truth.alignment`), the one that agrees
-is taken, its constant turn against the IMU's axes taken out and its world turned upright by the
-mean specific force. Of several that agree the one that is turned least is the sensor's own.
+Files differ in the body they describe (camera, display, sensor), in the quaternion's order, which
+some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). The gyroscope
+decides: each file and order is compared with it (`stario.sequences.truth.alignment`), and the best
+is used. Its constant rotation relative to the IMU's axes is removed, and its world is levelled with
+the mean specific force. If several agree, the one with the smallest rotation is the sensor's own.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ _OTHER = {"point", "points", "cloud", "intrinsics", "image", "frames"}
 _SUFFIXES = (".txt", ".csv")
 
 _AGREES = 0.9
-"""Correlation of the turning from which a pose is that of the IMU's device."""
+"""Minimum correlation of angular rates for a pose to be that of the IMU's device."""
 
 _ALIKE = 0.02
 _DOWN = 0.985
-"""Cosine to a world's y or z from which a mean force points down it."""
+"""Minimum cosine between a mean force and a world's -y or -z for it to point down."""
 
 _SQUARE_RAD = np.deg2rad(15.0)
-"""A turn against the IMU that is nearer to right angles than this is by right angles: cameras and
-displays are mounted along a phone's edges, and the rest is the estimate's error."""
+"""Rotations relative to the IMU that are closer than this to right angles are rounded to them:
+cameras and displays are mounted along a phone's edges, and the rest is estimation error."""
 
 _SAME_AXES_RAD = np.deg2rad(1.0)
 _SAME_CLOCK_S = 0.1
-"""A lag between pose and gyroscope that is larger is not one of the same clock."""
+"""Maximum lag between pose and gyroscope if both use the same clock."""
 
 
 @dataclass(frozen=True)
 class PoseRows:
-    """A pose file's rows in one of the ways they can be read.
+    """A pose file's rows in one of the possible interpretations.
 
     Attributes:
         file: the file.
-        stamps_ns: (N,) [ns].
-        position: (N, 3) [m].
-        attitude: N rotations, of whatever body to whatever world.
-        order: how the attitude was read.
+        stamps_ns: (N,) times [ns].
+        position: (N, 3) positions [m].
+        attitude: N rotations, from an unknown body to an unknown world.
+        order: how the attitude was read: "xyzw", "wxyz" or "matrix".
     """
 
     file: Path
@@ -75,7 +75,7 @@ class PoseRows:
 
 
 def pose_files(folder: Path, key: str = "") -> list[Path]:
-    """The files of poses of a recording, by their names; `key` is what all its names share."""
+    """Return a recording's pose files by name; `key` holds the words that its names share."""
     found = []
     for file in sorted(folder.iterdir()):
         words = set(words_of(file.stem))
@@ -93,13 +93,13 @@ def with_pose(
     files: list[Path],
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
 ) -> ImuSequence:
-    """The recording with the truth that the best of the pose files gives, if one agrees.
+    """Return the recording with the best of the pose files as ground truth, if one agrees.
 
     Args:
         sequence: a recording without truth.
-        start_ns: its first sample on the poses' clock [ns].
-        files: of poses; others in the same form.
-        orders: in which attitudes may be written, where a data set says so.
+        start_ns: time of its first sample on the poses' clock [ns].
+        files: candidate pose files.
+        orders: orders to try for the attitude, restricted if a data set specifies it.
 
     Raises:
         ReadError: a file's rows are malformed.
@@ -109,10 +109,10 @@ def with_pose(
     if not fits:
         if ways:
             names = ", ".join(dict.fromkeys(way.file.name for way in ways))
-            _log.warning("%s: no pose of %s agrees with the gyroscope", sequence.name, names)
+            _log.warning("%s: no poses in %s agree with the gyroscope", sequence.name, names)
         elif files:
             names = ", ".join(file.name for file in files)
-            _log.warning("%s: no row of %s holds a pose", sequence.name, names)
+            _log.warning("%s: no row in %s holds a pose", sequence.name, names)
         return sequence
     best = max(fit.aligned.correlation for _, fit in fits)
     near = [(way, fit) for way, fit in fits if fit.aligned.correlation > best - _ALIKE]
@@ -122,7 +122,7 @@ def with_pose(
 
 
 def pose_rows(file: Path) -> list[PoseRows]:
-    """A file's poses in each way that they can be read; none if it holds no poses.
+    """Return a file's poses in each possible interpretation; none if it holds no poses.
 
     Raises:
         ReadError: a row is malformed.
@@ -165,7 +165,7 @@ def pose_rows(file: Path) -> list[PoseRows]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How a pose stands to the IMU: its times on the IMU's clock, which rows, the mount R_PB."""
+    """Fit of poses to the IMU: times on the IMU's clock, their rows, alignment and mount R_PB."""
 
     time: FloatArray
     rows: IntArray
@@ -203,7 +203,7 @@ def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseRows) -> _
 
 
 def _squared(mount: Rotation) -> Rotation:
-    """A mount by right angles where it is near one, else itself."""
+    """Return the nearest mount by right angles if it is close, else the mount itself."""
     square = Rotation.create_group("O")
     away = (square.inv() * mount).magnitude()
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
@@ -213,13 +213,13 @@ def _say(
     sequence: ImuSequence, fits: list[tuple[PoseRows, _Fit]], way: PoseRows, fit: _Fit
 ) -> None:
     _log.info(
-        "%s: truth is %s, quaternion %s, %.0f degrees off the IMU's axes, correlation %.3f",
+        "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
         sequence.name, way.file.name, way.order, np.degrees(fit.turn), fit.aligned.correlation,
     )  # fmt: skip
     for other, its in fits:
         if other.file != way.file and its.turn > _SAME_AXES_RAD:
             _log.warning(
-                "%s: %s is taken as the truth; %s is %.0f degrees off the IMU's axes",
+                "%s: the ground truth is %s; %s is rotated %.0f degrees from the IMU's axes",
                 sequence.name, way.file.name, other.file.name, np.degrees(its.turn),
             )  # fmt: skip
 
@@ -235,10 +235,10 @@ def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
     force = interpolated(pose.time, sequence.time, sequence.accel)
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
     if np.linalg.norm(up) < LEAST_FORCE:
-        _log.warning("%s: no gravity to level %s by", sequence.name, way.file.name)
+        _log.warning("%s: rejected %s: no gravity to level its poses", sequence.name, way.file.name)
         return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
-        _log.warning("%s: the accelerometer has Apple's sign, turned over", sequence.name)
+        _log.warning("%s: inverted the accelerometer, which has Apple's sign", sequence.name)
         converted = sequence.converted | {"accel"}
         sequence, up = replace(sequence, accel=-sequence.accel, converted=converted), -up
     R_WP = tilt_aligning(up)

@@ -25,7 +25,7 @@ _LARGE_BYTES = 2_000_000
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file.
+    """Return the lines of a text file.
 
     Raises:
         ReadError: the file is missing, empty or not text.
@@ -33,31 +33,31 @@ def read_lines(path: Path) -> list[str]:
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        raise ReadError(path, "file", "nothing there", "a readable file") from None
+        raise ReadError(path, "file", "no such file", "a readable file") from None
     except OSError as error:
         raise ReadError(path, "file", type(error).__name__, "a readable file") from None
     if b"\0" in content:
-        raise ReadError(path, "file", "bytes that are no text", "UTF-8 text")
+        raise ReadError(path, "file", "binary data", "UTF-8 text")
     lines = _decoded(content).splitlines()
     if not any(line.strip() for line in lines):
-        raise ReadError(path, "file", "no line", "rows of numbers", "is the download complete?")
+        raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
     return lines
 
 
 def first_line(path: Path, comments: bool = False) -> str | None:
-    """The first line of a text file that is not blank, or None if it has none or is no text.
+    """Return the first non-blank line of a text file, or None if it has none or is not text.
 
     Args:
         path: the file.
-        comments: return a line that starts with `#` as well.
+        comments: whether to include lines that start with `#`.
     """
     return next(iter(first_lines(path, 1, comments)), None)
 
 
 def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
-    """Up to `count` lines like `first_line`; little of the file is read.
+    """Return up to `count` lines selected as in `first_line`, reading little of the file.
 
-    Never raises: it serves to recognise formats.
+    Never raises: used to recognise formats.
     """
     lines = head_lines(path)
     kept = [x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#"))]
@@ -65,7 +65,7 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
 
 
 def _decoded(content: bytes) -> str:
-    """Text in UTF-8 or, as old apps write their unit signs, in Latin-1."""
+    """Decode UTF-8 or, as old apps write their unit signs, Latin-1."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -73,7 +73,7 @@ def _decoded(content: bytes) -> str:
 
 
 def head_lines(path: Path) -> list[str]:
-    """Every line at the beginning of a text file, the last of them perhaps cut; never raises."""
+    """Return the lines at the start of a text file, the last possibly cut; never raises."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -81,13 +81,13 @@ def head_lines(path: Path) -> list[str]:
         return []
     if b"\0" in head:
         return []
-    # The head may end within a character, which the last line is cut by anyway.
+    # The head may end within a character: decode its last line, cut anyway, separately.
     end = max(head.rfind(b"\n"), 0)
     return _decoded(head[:end]).splitlines() + _decoded(head[end:].lstrip(b"\r\n")).splitlines()
 
 
 def magic(path: Path, count: int = 16) -> bytes:
-    """The first bytes of a file, empty where there is none; never raises."""
+    """Return the first bytes of a file, empty if it does not exist; never raises."""
     try:
         with path.open("rb") as file:
             return file.read(count)
@@ -96,7 +96,7 @@ def magic(path: Path, count: int = 16) -> bytes:
 
 
 def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
-    """The numbers of a line, or an empty list if it holds anything else."""
+    """Return the numbers of a line, or an empty list if it holds anything else."""
     try:
         return [float(cell) for cell in line.split(delimiter)]
     except ValueError:
@@ -104,19 +104,19 @@ def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
 
 
 def first_numbers(path: Path) -> list[float]:
-    """The first row's numbers, or an empty list if the first row is anything else."""
+    """Return the first row's numbers, or an empty list if the first row is anything else."""
     return numbers_in(first_line(path) or "")
 
 
 class Table:
-    """Rows of numbers as they stand in a file.
+    """Rows of numbers as they are in a file.
 
     Attributes:
         path: the file.
-        values: (N, K); `nan` and empty cells are NaN.
-        first_row: where the first row stands in the file, counted from 1.
-        numbers: a column of the file, as whole numbers where all of it is written so; None where
-            that is not known.
+        values: (N, K) numbers; `nan` and empty cells are NaN.
+        first_row: line number of the first row in the file, counted from 1.
+        numbers: function that returns a column of the file, as integers if all of it is written
+            so; None if unavailable.
     """
 
     def __init__(
@@ -133,15 +133,15 @@ class Table:
     def stamps_ns(
         self, column: int = 0, per_second: int = 10**9, rows: IntArray | None = None
     ) -> IntArray:
-        """A column of times as whole nanoseconds (N,), exact: float64 cannot hold those of today.
+        """Return a column of times (N,) as integer nanoseconds, which float64 cannot hold exactly.
 
         Args:
-            column: which one, counted in the file.
-            per_second: how many of the column's units make a second.
-            rows: those whose times are wanted; all if None.
+            column: index of the column in the file.
+            per_second: number of the column's units in a second.
+            rows: rows to return the times of; all if None.
 
         Raises:
-            ReadError: a cell is no time.
+            ReadError: a cell is not a time.
         """
         unit_ns = 10**9 // per_second
         rows = np.arange(len(self.values)) if rows is None else rows
@@ -166,7 +166,7 @@ class Table:
         try:
             whole, _, fraction = cell.strip().partition(".")
             if whole.isdecimal() and (fraction.isdecimal() or not fraction):
-                # Digit by digit: seconds since 1970 with nine decimals are more than a float holds.
+                # By digits: seconds since 1970 with nine decimals exceed the precision of a float.
                 return int(whole) * unit_ns + round(float(f"0.{fraction or 0}") * unit_ns)
             return round(float(cell) * unit_ns)
         except (ValueError, OverflowError):
@@ -183,16 +183,16 @@ def read_table(
     decimal: str = ".",
     killed: bool = False,
 ) -> Table:
-    """Rows of numbers; `nan` and empty cells become NaN.
+    """Read rows of numbers; `nan` and empty cells become NaN.
 
     Args:
         path: the file; lines that start with `#` are skipped.
-        columns: how many numbers a row must at least hold; more are dropped.
-        skip: how many header lines come first.
-        delimiter: between the cells; None for blanks.
-        used: the columns to return, in this order; all if None.
-        decimal: what separates a number's fraction, a point or a comma.
-        killed: do without a last row that is cut short: the app was killed while it wrote.
+        columns: minimum number of cells in a row; further ones are ignored.
+        skip: number of header lines.
+        delimiter: separator of the cells; None for blanks.
+        used: the columns to return, in this order; the first `columns` if None.
+        decimal: decimal mark, a point or a comma.
+        killed: whether to skip a last row that is cut short because the app was killed.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
@@ -206,10 +206,10 @@ def read_table(
 def read_quickly(
     path: Path, skip: int, delimiter: str | None, wanted: list[int], decimal: str = "."
 ) -> Table | None:
-    """A large file by pandas, five times as fast as by NumPy; None if anything is odd about it.
+    """Read a large file with pandas, five times as fast as with NumPy; else None.
 
-    What is odd (no pandas, a blank or malformed cell, a row cut short) is left to the careful way,
-    which names it. Arguments are those of `read_table`, `wanted` its `used`.
+    Returns None for a small file, without pandas, and for blank or malformed cells or rows cut
+    short, which the slow way names. Arguments are those of `read_table`; `wanted` is its `used`.
     """
     try:
         if path.stat().st_size < _LARGE_BYTES:
@@ -260,7 +260,7 @@ def _read_carefully(
         try:
             _row(path, *numbered[-1], columns, delimiter, wanted)
         except ReadError:
-            _log.warning("%s: the last row is cut short and left out", path)
+            _log.warning("%s: skipped the last row, which is cut short", path)
             numbered.pop()
     rows = [line for _, line in numbered]
     try:
@@ -278,12 +278,12 @@ def _read_carefully(
 
 
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
-    """Seconds since an origin."""
+    """Convert time stamps [ns] to seconds since an origin."""
     return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
 
 
 def _unquoted(line: str, delimiter: str | None) -> str:
-    """A line without the quotes around its cells; a delimiter within a cell becomes a blank."""
+    """Remove the quotes around a line's cells; a delimiter within a cell becomes a blank."""
     if '"' not in line:
         return line
     if delimiter is None:
@@ -300,7 +300,7 @@ def _is_row(line: str) -> bool:
 def _row(
     path: Path, number: int, text: str, columns: int, delimiter: str | None, wanted: list[int]
 ) -> list[float]:
-    """One row the slow way, for the error that names its line and column."""
+    """Parse one row slowly, to raise an error that names its line and column."""
     cells = text.split(delimiter)
     if len(cells) < columns:
         raise ReadError(

@@ -1,4 +1,4 @@
-"""Recordings as apps export them: a zip of the files that would be in a folder, or of such zips."""
+"""Recordings exported by apps as a zip of the files of a folder, or as a zip of such zips."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stario.sequences.readers.text import magic
 
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _LARGEST = 4 * 2**30
-"""More text [bytes] than any recording has: a zip that unpacks to it is a trap."""
+"""Maximum unpacked text [bytes], more than any recording has; guards against zip bombs."""
 
 
 def is_zip(path: Path) -> bool:
@@ -30,10 +30,10 @@ def is_zip(path: Path) -> bool:
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """A temporary folder with a zip's text files, gone after the block.
+    """Unpack a zip's text files into a temporary folder, which is deleted after the block.
 
     Raises:
-        ReadError: the zip is broken, encrypted or far too large.
+        ReadError: the zip is damaged, encrypted or far too large.
     """
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         try:
@@ -43,7 +43,7 @@ def unpacked(path: Path) -> Iterator[Path]:
                 inner.unlink()
         except _BROKEN as error:
             found = " ".join(str(error).split())
-            raise ReadError(path, "zip", found, "a whole zip", "is it complete?") from None
+            raise ReadError(path, "zip", found, "an intact zip", "is the zip complete?") from None
         except _TooLargeError:
             found = f"more than {_LARGEST / 2**30:.0f} GiB of text"
             raise ReadError(path, "zip", found, "a recording") from None
@@ -51,15 +51,15 @@ def unpacked(path: Path) -> Iterator[Path]:
 
 
 _BROKEN = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError)
-"""What a damaged zip raises, and one that is encrypted or packed in a rare way."""
+"""Exceptions raised for a zip that is damaged, encrypted or compressed in a rare way."""
 
 
 class _TooLargeError(Exception):
-    """A zip that unpacks to more than is allowed."""
+    """Error for a zip that unpacks to more than the maximum size."""
 
 
 def _extract(path: Path, folder: Path, most: int) -> int:
-    """Unpack what is wanted of a zip; its size [bytes]."""
+    """Unpack the wanted files of a zip; return their size [bytes]."""
     with zipfile.ZipFile(path) as file:
         wanted = [info for info in file.infolist() if _is_wanted(info)]
         size = sum(info.file_size for info in wanted)

@@ -1,4 +1,4 @@
-"""Which app wrote a logger's files, as far as they show it: for a person, nothing depends on it."""
+"""The app that wrote a logger's files, if they reveal it; for display only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _BY_HEADER = {
     "loggingTime(txt)": "SensorLog",
     "gFx": "Physics Toolbox",
 }
-"""What stands in the headers of an app's files."""
+"""Text in the headers of an app's files."""
 
 _BY_FILE = {
     "record.properties": "SensLogs on Android",
@@ -22,11 +22,11 @@ _BY_FILE = {
     "acce_uncalib.txt": "RoNIN-style logger",
     "game_rv.txt": "RoNIN-style logger",
 }
-"""Files that an app writes beside its sensors'."""
+"""Files that an app writes alongside its sensor files."""
 
 
 def app_of(files: PhoneFiles) -> str:
-    """The app's name, or else what kind of logger it is."""
+    """Return the app's name, or else the kind of logger."""
     header = "\n".join(head_lines(files.gyro)[:8])
     for words, app in _BY_HEADER.items():
         if words in header:

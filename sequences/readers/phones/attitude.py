@@ -1,8 +1,8 @@
-"""The attitude that a phone's own fusion logged beside its sensors.
+"""The attitude that a phone's own fusion logged alongside its sensors.
 
 Apps differ in the order of a quaternion and in whether it takes the body to the world or back, so
-all are held against the gyroscope: over a step the attitude turns by R_k^T R_k+1 in the body's
-axes.
+all variants are compared with the gyroscope: over a step the attitude rotates by R_k^T R_k+1 in the
+body's axes.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.time_order import advancing
 
 _ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
-"""Where x, y, z and w stand in rows without a header."""
+"""Possible places of x, y, z and w in rows without a header."""
 
 _EXPLAINED = 0.5
-"""Share of the turning that an attitude must explain to be the phone's."""
+"""Share of the gyroscope's rotation that an attitude must explain to be the phone's."""
 
 _LONGEST_STEP_S = 0.3
 
 
 def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotation] | None:
-    """Time stamps (N,) [ns] and N rotations, body to a world with z up; None without a good one."""
+    """Return times (N,) [ns] and N rotations, body to a world with z up; None if none fits."""
     table = files.first("attitude")
     if table is None or not table.quaternion:
         return None
     try:
         stamps, quaternion = read_quaternion(table)
-    except ReadError:  # a recording does without
+    except ReadError:  # attitude is optional
         return None
     return agreeing_attitude(stamps, quaternion, gyro, table.quaternion[0].title != "")
 
@@ -43,13 +43,13 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
 def agreeing_attitude(
     stamps: IntArray, quaternion: FloatArray, gyro: Samples, named: bool = True
 ) -> tuple[IntArray, Rotation] | None:
-    """Those of the ways to read an attitude that the gyroscope agrees with, the best; else None.
+    """Return the reading of an attitude that best fits the gyroscope, or None if none fits.
 
     Args:
-        stamps: (N,) [ns].
-        quaternion: (N, 4), x, y, z and w; rows that are no unit quaternion are left out.
-        gyro: its samples, of the same clock.
-        named: whether the order is known, or it may as well be w, x, y and z.
+        stamps: (N,) times [ns].
+        quaternion: (N, 4) x, y, z and w; rows that are not unit quaternions are skipped.
+        gyro: gyroscope samples, on the same clock.
+        named: whether the order is known; otherwise w, x, y and z is tried as well.
 
     Returns:
         Time stamps (K,) [ns] and K rotations, body to a world with z up.
@@ -69,9 +69,9 @@ def agreeing_attitude(
 
 
 def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> float:
-    """Share of the gyroscope's turning that an attitude's steps tell of, by medians.
+    """Return the share of the gyroscope's rotation that an attitude's steps explain, by medians.
 
-    A phone's attitude jumps now and then, when its fusion thinks better of the field.
+    A phone's attitude occasionally jumps when its fusion revises its magnetic field estimate.
     """
     order = np.unique(gyro.stamps_ns, return_index=True)[1]
     clock = seconds(gyro.stamps_ns[order], stamps_ns[0])

@@ -1,13 +1,13 @@
-"""Files of one line per event, whichever sensor it came from: `TYPE_...` traces and GetSensorData.
+"""Files with one line per event of any sensor: `TYPE_...` traces and GetSensorData.
 
-Indoor Location's traces (blank-free words between tabs): time [ms since 1970], `TYPE_GYROSCOPE`,
-`TYPE_ACCELEROMETER` or `TYPE_MAGNETIC_FIELD` and xyz, uncalibrated ones with their biases behind;
-`TYPE_WAYPOINT` and x, y [m] on a floor plan, tapped by a surveyor. Some lines lack the break before
-them. GetSensorData's logfiles (IPIN's competitions; semicolons, `%` comments): `ACCE`, `GYRO` or
-`MAGN`, the app's and the sensor's time [s] and xyz; `POSI`, the app's time, a count, latitude and
-longitude [deg] of a reference point. Positions come as waypoints, horizontal and in metres. The
-device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last three of `AHRS`: x,
-y and z of a quaternion whose w is not negative.
+Indoor Location's traces (tab-separated): time [ms since 1970], `TYPE_GYROSCOPE`,
+`TYPE_ACCELEROMETER` or `TYPE_MAGNETIC_FIELD` and xyz, followed by the biases if uncalibrated;
+`TYPE_WAYPOINT` and x, y [m] on a floor plan, tapped by a surveyor. Some lines lack the line break
+before them. GetSensorData's log files (IPIN's competitions; semicolons, `%` comments): `ACCE`,
+`GYRO` or `MAGN`, the app's and the sensor's time [s] and xyz; `POSI`, the app's time, a count,
+latitude and longitude [deg] of a reference point. Positions are returned as waypoints, horizontal
+and in metres. The device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last
+three values of `AHRS`: x, y and z of a quaternion whose w is not negative.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Rows = tuple[IntArray, FloatArray]
 
 
 def read_event_lines(path: Path) -> ImuSequence:
-    """Read a trace or a logfile.
+    """Read a trace or a log file.
 
     Raises:
         ReadError: a sensor is missing, a line is malformed, or the sensors do not overlap.
@@ -61,8 +61,8 @@ def read_event_lines(path: Path) -> ImuSequence:
     sensors, points = _trace(path) if trace else _logfile(path)
     for name in ("gyro", "accel"):
         if name not in sensors:
-            seen = ", ".join(sensors) or "none"
-            raise ReadError(path, "events", f"of {seen}", "of gyroscope and accelerometer")
+            seen = ", ".join(sensors) or "no sensor"
+            raise ReadError(path, "events", f"those of {seen}", "those of gyro and accel")
     stamps, gyro, accel = on_one_clock(path, *sensors["gyro"], *sensors["accel"])
     field = sensors.get("mag")
     attitude = _attitude(sensors)
@@ -82,7 +82,7 @@ def read_event_lines(path: Path) -> ImuSequence:
 
 
 def is_event_lines(path: Path) -> bool:
-    """Whether a text file's first lines hold an event of a sensor."""
+    """Whether a text file's first lines hold a sensor event."""
     if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
         return False
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
@@ -99,12 +99,12 @@ def _add_attitude(
     try:
         if rows:
             sensors["attitude"] = _rows(path, kind, rows, unit_ns, used)
-    except ReadError as error:  # a recording does without
-        _log.info("attitude left out: %s", error)
+    except ReadError as error:  # attitude is optional
+        _log.info("attitude skipped: %s", error)
 
 
 def _attitude(sensors: dict[str, Rows]) -> tuple[IntArray, Rotation] | None:
-    """The device's own attitude, where it was logged and the gyroscope agrees with it."""
+    """Return the device's own attitude if it was logged and agrees with the gyroscope."""
     if "attitude" not in sensors:
         return None
     stamps, xyz = sensors["attitude"]
@@ -120,7 +120,7 @@ def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
 
 
 def _whole_lines(path: Path, separator: str) -> list[str]:
-    """All lines but a last one that is cut short: the app was killed while it wrote."""
+    """Return all lines but a last one that is cut short because the app was killed."""
     lines = read_lines(path)
     if len(lines) < 2 or path.read_bytes()[-1:] in (b"\n", b"\r"):
         return lines
@@ -142,7 +142,7 @@ def _is_number(text: str) -> bool:
 
 
 def _kind(cells: Sequence[str]) -> str:
-    """What an event is of: the first cell that is a word."""
+    """Return the type of an event: the first cell that starts with a letter."""
     return next((cell for cell in cells if cell[:1].isalpha()), "")
 
 
@@ -182,20 +182,20 @@ def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
     )
     if _POINT not in events or "ACCE" not in events:
         return sensors, None
-    apart = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock is another
+    apart = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
     stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
     return sensors, (stamps - round(float(np.median(apart)) * 1e9), _metres(degrees))
 
 
 def _metres(degrees: FloatArray) -> FloatArray:
-    """East and north [m] of the first point, of latitude and longitude (N, 2)."""
+    """Convert latitude and longitude (N, 2) [deg] to east and north of the first point [m]."""
     latitude, longitude = np.radians(degrees - degrees[0]).T
     east = longitude * np.cos(np.radians(degrees[0, 0]))
     return _EARTH_M * np.stack([east, latitude], axis=1)
 
 
 def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: slice) -> Rows:
-    """Stamps and values of events whose first cell is the time."""
+    """Return the stamps and values of events whose first cell is the time."""
     try:
         cells = [(row[0], [float(cell) for cell in row[used]]) for row in rows]
         stamps = [round(float(time) * unit_ns) if "." in time else int(time) * unit_ns
@@ -204,6 +204,6 @@ def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: 
     except ValueError as error:
         raise ReadError(path, kind, " ".join(str(error).split()), "time and numbers") from None
     if values.ndim != 2 or values.shape[1] != used.stop - used.start:
-        expected = f"{used.stop - used.start} values a line"
-        raise ReadError(path, kind, "a line cut short", expected)
+        expected = f"{used.stop - used.start} values per line"
+        raise ReadError(path, kind, "a line that is cut short", expected)
     return np.array(stamps, dtype=np.int64), checked(path, kind, values)

@@ -1,8 +1,8 @@
-"""Which of a folder's files hold a recording's sensors, by what their names say.
+"""The sensor and the recording that each file of a folder belongs to, determined by its name.
 
-A file is of the one sensor that its name tells of (`Gyroscope.csv`, `acce.txt`, `Eight_gyr.csv`);
-what the name says besides is the recording's, so that files of two recordings in one folder are
-two recordings, each named by its gyroscope's file.
+A file belongs to the one sensor that its name contains (`Gyroscope.csv`, `acce.txt`,
+`Eight_gyr.csv`). The rest of the name identifies the recording, so files of two recordings in one
+folder are read as two recordings, each named by its gyroscope file.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from stario.sequences.readers.phones.sensor_words import (
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
-"""Words of files that come from Apple's Core Motion, `MotMagnFull.txt`: no recording's name."""
+"""Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
 
 _NEEDED: tuple[Sensor, ...] = ("accel", "linear")
 
 
 @dataclass
 class PhoneFiles:
-    """A recording's files by sensor, the better variant first."""
+    """A recording's files by sensor, the preferred variant first."""
 
     key: str
     tables: dict[Sensor, list[SensorTable]] = field(default_factory=dict)
 
     @property
     def gyro(self) -> Path:
-        """The file that names the recording where a folder holds several."""
+        """Gyroscope file, which names the recording if a folder holds several."""
         return self.tables["gyro"][0].file
 
     def first(self, sensor: Sensor) -> SensorTable | None:
-        """The better file of a sensor."""
+        """Return the preferred file of a sensor, or None."""
         return next(iter(self.tables.get(sensor, [])), None)
 
 
 def phone_recordings(folder: Path) -> list[PhoneFiles]:
-    """The recordings whose gyroscope and accelerometer lie in a folder; never raises."""
+    """Return the recordings whose gyroscope and accelerometer are in a folder; never raises."""
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if _may_hold(file)]
     groups: dict[str, PhoneFiles] = {}
     for file, words in sorted(named, key=lambda item: _preference(*item)):
@@ -63,9 +63,9 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
 
 
 def lone_sensors(path: Path) -> list[Sensor]:
-    """The sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
+    """Return the sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
 
-    Empty where it holds both, or neither.
+    Empty if it holds both, or no sensor at all.
     """
     sensors = _sensors(path)
     whole = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
@@ -88,12 +88,12 @@ def _may_hold(file: Path) -> bool:
 
 
 def _sensor_of(words: list[str]) -> Sensor | None:
-    """The sensor of a file's name; iOS Logger's `Motion.txt` is an attitude."""
+    """Return the sensor in a file's name; iOS Logger's `Motion.txt` is an attitude."""
     return "attitude" if words == ["motion"] else sensor_of(words)
 
 
 def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
-    """A total force comes before others, what is calibrated before what is raw."""
+    """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
     calibrated = {"calibrated", "mot"} & set(words)
     return is_uncalibrated(words), "total" not in words, not calibrated, file
 
@@ -103,7 +103,7 @@ def _is_whole(group: PhoneFiles) -> bool:
 
 
 def _united(groups: list[PhoneFiles]) -> PhoneFiles:
-    """One recording of files whose names differ by more than the sensor: one file of each."""
+    """Merge groups into one recording, which is empty if a sensor occurs in several of them."""
     lone = PhoneFiles("")
     for group in groups:
         for sensor, tables in group.tables.items():

@@ -1,8 +1,8 @@
-"""Sensor Logger's JSON export: one array, an object for each sample with its sensor's name.
+"""Sensor Logger's JSON export: an array with one object per sample that names its sensor.
 
     [{"sensor": "Gyroscope", "time": "1698501144401773000", "z": "0.1", "y": "0.2", "x": "0.3"}, ...
 
-It holds what the app's folder of CSV files does, so it is laid out as that and read as a folder.
+It holds the same data as the app's folder of CSV files, so it is converted to such a folder.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NAME = re.compile(r"\w+")
 
 
 def is_json_export(path: Path) -> bool:
-    """Whether a file begins as such an array; never raises."""
+    """Whether a file begins with such an array; never raises."""
     if path.suffix.lower() != ".json" or not path.is_file():
         return False
     return _FIRST.match("\n".join(head_lines(path))) is not None
@@ -32,18 +32,18 @@ def is_json_export(path: Path) -> bool:
 
 @contextmanager
 def laid_out(path: Path) -> Iterator[Path]:
-    """A temporary folder with a file for each sensor, gone after the block.
+    """Write a file for each sensor into a temporary folder, which is deleted after the block.
 
     Raises:
-        ReadError: the file is no JSON array of objects.
+        ReadError: the file is not a JSON array of objects that name sensors.
     """
     sensors: dict[str, list[dict[str, Any]]] = {}
     for row in _rows(path):
         name = row.get("sensor")
-        if isinstance(name, str) and _NAME.fullmatch(name):  # notes and the like have others
+        if isinstance(name, str) and _NAME.fullmatch(name):  # skips notes and the like
             sensors.setdefault(name, []).append(row)
     if not sensors:
-        raise ReadError(path, "sensor", "no name", "a sensor's name in each object")
+        raise ReadError(path, "sensor", "no name", "a sensor name in each object")
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         for name, rows in sensors.items():
             titles = [title for title in rows[0] if title != "sensor"]

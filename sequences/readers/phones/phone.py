@@ -1,19 +1,19 @@
 """Phone loggers: a folder with a text file for each sensor, or one wide file with all of them.
 
-Written by many apps, each in its way (Sensor Logger, phyphox, SensLogs, the Android and iOS loggers
-of several data sets), so what a file holds is told by its name and content; see `sensor_words` and
-`sensor_table`. Time without a unit is in the one that makes 10 to 1200 samples a second of it;
-values without a unit are rad/s, m/s^2 and uT.
+Each app writes its own variant (Sensor Logger, phyphox, SensLogs, the Android and iOS loggers of
+several data sets), so a file's name and content determine what it holds; see `sensor_words` and
+`sensor_table`. Time without a unit is in the unit that gives 10 to 1200 samples per second;
+values without a unit are in rad/s, m/s^2 and uT.
 
 A wide file (AndroSensor, Physics Toolbox, phyphox, `*_IMU.txt`) has a clock and columns for each
 sensor; cells of sensors that were not sampled are empty.
 
-Both sensors are brought onto the gyroscope's times of their common stretch. Where the
-accelerometer's file has lost gravity and there is one of gravity, that is added. Apple's
-accelerometers report the opposite of specific force, in g: that is known by the app and system that
-the folder tells of (Sensor Logger's `Metadata.csv`), or by the phone's own attitude beside it. A
-pose that an ARCore or ARKit logger wrote beside is the truth, see `poses`; reference points
-(`*_ref.csv`: time, x, y [m]) are waypoints.
+Both sensors are brought to the gyroscope's times in their common time span. If the accelerometer's
+file lacks gravity and there is a file of gravity, it is added. Apple's accelerometers report the
+opposite of specific force, in g: this is determined from the app and system that the folder
+indicates (Sensor Logger's `Metadata.csv`), or from the phone's own attitude. A pose that an ARCore
+or ARKit logger wrote alongside is the ground truth, see `poses`; reference points (`*_ref.csv`:
+time, x, y [m]) are waypoints.
 """
 
 from __future__ import annotations
@@ -60,15 +60,15 @@ from stario.sequences.sequence import (
 _log = logging.getLogger(__name__)
 
 _GRAVITY_REMOVED = 5.0
-"""A median force below this [m/s^2] has lost gravity."""
+"""Median force [m/s^2] below which gravity was removed."""
 
 
 def read_phone(path: Path) -> ImuSequence:
-    """Read a logger's folder, or by its gyroscope's file one recording of a folder with several.
+    """Read a logger's folder, or the recording of one gyroscope file in a folder with several.
 
     Raises:
         ReadError: a file is missing or malformed, the folder holds more than one recording, or the
-            two sensors have no stretch in common.
+            two sensors do not overlap in time.
     """
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
@@ -77,7 +77,7 @@ def read_phone(path: Path) -> ImuSequence:
 
 
 def read_wide(path: Path) -> ImuSequence:
-    """Read one file that holds all sensors in columns of their own.
+    """Read one file that holds all sensors in separate columns.
 
     Raises:
         ReadError: the file is malformed.
@@ -85,8 +85,8 @@ def read_wide(path: Path) -> ImuSequence:
     files = _wide(path)
     if files is None:
         lines = head_lines(path)[:1]
-        found = repr(lines[0].strip()[:60]) if lines else "no line"
-        expected = "a header that names a clock, a gyroscope's and an accelerometer's axes"
+        found = repr(lines[0].strip()[:60]) if lines else "no lines"
+        expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
     return assembled(path.parent, path.stem, files, _wide_poses(path, files))
 
@@ -94,7 +94,7 @@ def read_wide(path: Path) -> ImuSequence:
 def is_wide(path: Path) -> bool:
     """Whether a file's header names a clock and the axes of both sensors.
 
-    A CSV of one's own is none, unless poses lie beside it or it holds forces of two kinds.
+    A generic CSV does not count unless poses lie next to it or it holds two kinds of force.
     """
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return False
@@ -102,7 +102,7 @@ def is_wide(path: Path) -> bool:
     if files is None:
         return False
     axes = files.tables["gyro"][0].axes
-    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx beside ax
+    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx and ax
     return not is_own_csv(path) or bool(_wide_poses(path, files)) or more
 
 
@@ -120,7 +120,7 @@ def _wide(path: Path) -> PhoneFiles | None:
 
 
 def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
-    """Poses of the same name beside `*_IMU.txt`."""
+    """Return the pose files with the same name as an `*_IMU.txt`."""
     return pose_files(path.parent, files.key) if "imu" in words_of(path.stem) else []
 
 
@@ -132,18 +132,18 @@ def assembled(
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
     core_motion: bool = False,
 ) -> ImuSequence:
-    """The recording of a set of files.
+    """Assemble the recording of a set of files.
 
     Args:
-        folder: where they lie, for errors.
-        name: the recording's.
-        files: by sensor.
-        poses: files of poses beside them.
-        orders: as for `with_pose`.
-        core_motion: whether an iPhone wrote them: numbers in g have Apple's sign.
+        folder: folder of the files, for errors.
+        name: name of the recording.
+        files: files by sensor.
+        poses: pose files alongside them.
+        orders: orders to try for their attitude, as for `with_pose`.
+        core_motion: whether an iPhone wrote the files: values in g have Apple's sign.
 
     Raises:
-        ReadError: a file is malformed or the sensors have no stretch in common.
+        ReadError: a file is malformed or the sensors do not overlap in time.
     """
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
@@ -170,7 +170,7 @@ def assembled(
 
 
 def is_phone(path: Path) -> bool:
-    """Whether a folder holds one recording's files, or a file is the gyroscope's of one of several.
+    """Whether a folder holds one recording, or a file is the gyroscope file of one of several.
 
     Never raises.
     """
@@ -186,20 +186,20 @@ def _chosen(path: Path) -> PhoneFiles:
     found = phone_recordings(folder)
     if path.is_dir() and len(found) > 1:
         names = ", ".join(files.gyro.name for files in found)
-        fix = f"name one by its gyroscope's file: {found[0].gyro}"
-        raise ReadError(folder, "files", f"{len(found)} recordings, {names}", "one", fix)
+        fix = f"name one by its gyroscope file: {found[0].gyro}"
+        raise ReadError(folder, "files", f"{len(found)} recordings ({names})", "one", fix)
     chosen = [files for files in found if path.is_dir() or files.gyro == path]
     if not chosen:
         names = ", ".join(sorted(p.name for p in folder.glob("*"))[:6]) or "nothing"
-        expected = "a gyroscope's and an accelerometer's file of one recording"
+        expected = "a gyroscope file and an accelerometer file of one recording"
         raise ReadError(
-            folder, "files", names, expected, "put each recording into a folder of its own"
+            folder, "files", names, expected, "put each recording into a separate folder"
         )
     return chosen[0]
 
 
 def _read(table: SensorTable, sensor: Sensor) -> Samples:
-    """The sensor's columns: those that its header names so, or those of a file that names none."""
+    """Read the columns that the header gives for the sensor, or those of a file that names none."""
     axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
     if axes is None:
         raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
@@ -212,7 +212,7 @@ def _force(
     attitude: tuple[IntArray, Rotation] | None,
     core_motion: bool,
 ) -> tuple[Samples, set[str]]:
-    """Specific force, and whether its unit or sign were converted."""
+    """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity = _gravity(files)
     whole = _with_gravity(candidates, or_g=gravity is None)
@@ -227,7 +227,7 @@ def _force(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
-        _log.info("%s: gravity added from its own file", folder)
+        _log.info("%s: added gravity from its separate file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
     sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, apart)
@@ -239,12 +239,12 @@ def _force(
 
 
 def gyro_folder(files: PhoneFiles) -> Path:
-    """The folder that a recording's files lie in."""
+    """Return the folder of a recording's files."""
     return files.gyro.parent
 
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
-    """The first that holds gravity in m/s^2, or else the steadiest that may hold it in g."""
+    """Return the first that holds gravity in m/s^2, else the steadiest that may hold it in g."""
     sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
     for one, size in zip(candidates, sizes, strict=True):
         if float(np.median(size)) >= _GRAVITY_REMOVED:
@@ -271,12 +271,12 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
         return None
     try:
         samples = _read(table, "mag")
-    except ReadError as error:  # a recording does without
-        _log.warning("magnetometer left out: %s", error)
+    except ReadError as error:  # the magnetometer is optional
+        _log.warning("magnetometer skipped: %s", error)
         return None
     inside = (samples.stamps_ns >= start_ns) & (samples.stamps_ns <= stop_ns)
     if not inside.any():
-        _log.warning("magnetometer left out: none of its samples is of the recording's time")
+        _log.warning("magnetometer skipped: none of its samples is within the recording")
         return None
     time: FloatArray = seconds(samples.stamps_ns, start_ns)
     return magnetometer(time, samples.values)

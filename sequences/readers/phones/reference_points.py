@@ -1,4 +1,4 @@
-"""Reference points beside a logger's files: places that the user passed at known times."""
+"""Reference points next to a logger's files: places that the user passed at known times."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from stario.sequences.units import TIME_UNITS
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
 
 _BESIDE_S = 60.0
-"""Reference points lie within a recording, or so little before or behind it."""
+"""Maximum time of reference points before or after their recording."""
 
 
 def reference_points(
     folder: Path, key: str, start_ns: np.int64, stop_ns: np.int64
 ) -> PositionTrack | None:
-    """Waypoints of `*_ref.csv` and the like: rows of time, x and y [m]; None without such a file.
+    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one.
 
     Args:
-        folder: where to look.
-        key: the words that all files of the recording share.
-        start_ns: the recording's first sample on the sensors' clock [ns].
-        stop_ns: its last one.
+        folder: the folder to search.
+        key: the words that the names of all files of the recording share.
+        start_ns: time of the recording's first sample on the sensors' clock [ns].
+        stop_ns: time of its last sample [ns].
 
     Raises:
         ReadError: a row is malformed.
@@ -46,14 +46,14 @@ def reference_points(
         table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
         start, stop = float(start_ns) * 1e-9 - _BESIDE_S, float(stop_ns) * 1e-9 + _BESIDE_S
         stamps = table.values[:, 0]
-        # Of stamps from zero on finer units fit as well, with all points at the start.
+        # Stamps from zero fit finer units as well, but with all points at the start.
         fitting = {
             unit: int(((stamps / unit > start) & (stamps / unit < stop)).sum())
             for unit in sorted(TIME_UNITS.values())
         }
         unit = max(fitting, key=lambda unit: fitting[unit])
         if not fitting[unit]:
-            raise ReadError(file, "time", "other times", "those of the sensors' files")
+            raise ReadError(file, "time", "other times", "times of the recording")
         time = seconds(table.stamps_ns(0, unit), start_ns)
         kept = advancing(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")

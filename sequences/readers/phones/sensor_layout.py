@@ -1,8 +1,8 @@
-"""Where a text file's clocks and sensors' axes stand: by its titles or, without any, by its rows.
+"""Columns of clocks and sensor axes in a text file, found by its titles or else by its rows.
 
-With a header, columns are found by their names (`sensor_words`), in any order, among any others;
-without one a row is time and three values, or three values and time, a second clock between them
-is left out.
+With a header, columns are found by their names (`sensor_words`), in any order, among any others.
+Without one, a row is time and three values, or three values and time; a second clock between them
+is skipped.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from stario.sequences.readers.phones.sensor_words import (
 from stario.sequences.sequence import FloatArray
 
 _CLOCK_FROM = 1e6
-"""A second column that grows and is larger than this is another clock."""
+"""A second column that grows and exceeds this is another clock."""
 
 _SAME_PACE = 0.02
-"""One that grows as fast as the first, in whatever unit, is another clock as well."""
+"""Relative tolerance within which a column as fast as the time, in any unit, is another clock."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A column: where it stands, what its header says, and the unit named there."""
+    """A column: its index, its title and the unit named in the title."""
 
     index: int
     title: str = ""
@@ -41,14 +41,14 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Which columns hold what.
+    """Content of the columns.
 
     Attributes:
-        clock: the column with the sensor's time.
-        axes: x, y and z of each sensor; under "" those of a file that names none.
-        quaternion: x, y, z and w of an attitude, where the header names one.
-        biases: columns of what an uncalibrated sensor's values are too large by, if any.
-        clocks: a sensor's own clock, by the key of its axes, where it stands before them.
+        clock: column with the sensor's time.
+        axes: x, y and z of each sensor; key "" if the file names no sensor.
+        quaternion: x, y, z and w of an attitude, if any.
+        biases: columns to subtract from an uncalibrated sensor's values, if any.
+        clocks: a sensor's own clock, by the key of its axes, if one precedes them.
     """
 
     clock: Place
@@ -58,16 +58,16 @@ class Layout:
     clocks: dict[str, Place] = field(default_factory=dict)
 
     def clock_of(self, axes: str) -> Place:
-        """The clock of the sensor with these axes."""
+        """Return the clock of the sensor with these axes."""
         return self.clocks.get(axes, self.clock)
 
 
 def by_header(titles: list[str], head: FloatArray) -> Layout | None:
-    """The layout that titles tell of; None where they name no clock or no sensor.
+    """Return the layout that titles describe; None if they name no clock or no sensor.
 
     Args:
         titles: the header's cells.
-        head: (N, K) the first rows; NaN where a cell is no number.
+        head: (N, K) first rows; NaN where a cell is not a number.
     """
     groups: dict[tuple[str, ...], dict[str, Place]] = {}
     quaternion: dict[str, Place] = {}
@@ -105,7 +105,7 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
 
 
 def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
-    """What is calibrated comes first, then a total force, then what is said in fewer words."""
+    """Return a sort key: calibrated sensors first, then total force, then fewer words."""
     return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)
 
 
@@ -118,7 +118,7 @@ def _clocks(titles: list[str], head: FloatArray) -> list[Place]:
 
 
 def _run_before(clocks: list[Place], column: int) -> list[Place]:
-    """The clocks that stand side by side nearest before a column."""
+    """Return the adjacent clocks that most closely precede a column."""
     run: list[Place] = []
     for clock in reversed(clocks):
         if clock.index < (run[-1].index if run else column):
@@ -129,7 +129,7 @@ def _run_before(clocks: list[Place], column: int) -> list[Place]:
 
 
 def _finest(clocks: list[Place], head: FloatArray) -> Place:
-    """A sensor's own clock rather than the app's, and the finer unit."""
+    """Return the best clock: a sensor's own rather than the app's, then the finer unit."""
     order = {"ns": 0, "us": 1, "": 2, "s": 3, "ms": 4}
 
     def rank(place: Place) -> tuple[bool, int]:
@@ -146,7 +146,7 @@ def _grows(column: FloatArray) -> bool:
 
 
 def by_rows(head: FloatArray) -> Layout | None:
-    """The layout of rows (N, K) without titles: time is first or fourth, whichever grows."""
+    """Return the layout of rows (N, K) without titles: time is first or fourth, and grows."""
     if len(head) < 2:
         return None
     width = head.shape[1]
@@ -171,7 +171,7 @@ def by_rows(head: FloatArray) -> Layout | None:
 
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:
-    """Whether a column beside the time is another clock: large, or of the time's pace."""
+    """Whether a column next to the time is another clock: large, or as fast as the time."""
     if not (np.diff(column) >= 0).all():
         return False
     if abs(column[0]) > _CLOCK_FROM:

@@ -1,7 +1,7 @@
 """A text file of sensor samples: how its rows are written, and reading them in known units.
 
-Which columns hold what is told by `sensor_layout`. Cells stand between commas, semicolons, tabs or
-blanks; with the latter three numbers may be written with a decimal comma.
+`sensor_layout` determines the columns' content. Cells are separated by commas, semicolons, tabs or
+blanks; with any of the latter three, numbers may have a decimal comma.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ UNITS = {
     "mag": MAGNETIC_UNITS,
 }
 _LIMITS = {"accel": 2e3, "linear": 2e3, "gravity": 2e3, "gyro": 1e4, "mag": 1e5}
-"""No sensor gives more, in m/s^2, deg/s and uT."""
+"""Maximum values of any sensor, in m/s^2, deg/s and uT."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorTable(Layout):
-    """How a file's rows are to be read.
+    """How to read a file's rows.
 
     Attributes:
         file: the file.
-        delimiter: between cells; None for blanks.
-        decimal: point or comma.
-        skip: lines before the first row.
+        delimiter: separator of the cells; None for blanks.
+        decimal: decimal mark, a point or a comma.
+        skip: number of lines before the first row.
     """
 
     file: Path
@@ -51,7 +51,7 @@ class SensorTable(Layout):
 
 @dataclass(frozen=True)
 class Samples:
-    """A sensor's samples: time stamps (N,) [ns], values (N, 3), the unit that was named or none."""
+    """Samples of a sensor: times (N,) [ns], values (N, 3), and the named unit, empty if none."""
 
     stamps_ns: IntArray
     values: FloatArray
@@ -59,7 +59,7 @@ class Samples:
 
 
 def sensor_table(file: Path) -> SensorTable | None:
-    """How a file's rows are to be read, or None if that cannot be told; never raises."""
+    """Return how to read a file's rows, or None if that cannot be determined; never raises."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
     numbered = numbered[: 4 * _LOOKED_AT]
     if len(numbered) < 2:
@@ -89,16 +89,16 @@ def sensor_table(file: Path) -> SensorTable | None:
 def read_samples(
     table: SensorTable, sensor: str, axes: str = "", per_second: int | None = None
 ) -> Samples:
-    """A sensor's samples, in rad/s, m/s^2 or uT where the file names a unit.
+    """Read a sensor's samples, in rad/s, m/s^2 or uT if the file names a unit.
 
     Args:
         table: the file's layout.
-        sensor: which one, a key of `UNITS`.
+        sensor: the sensor, a key of `UNITS`.
         axes: the key of its columns in `table.axes`.
-        per_second: how many of the clock's units make a second where its header does not say.
+        per_second: number of the clock's units in a second if its header names no unit.
 
     Raises:
-        ReadError: a row is malformed, a unit is unknown, or a value is none that a sensor gives.
+        ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
     """
     places, clock = table.axes[axes], table.clock_of(axes)
     rows = _rows(table, [clock, *places, *table.biases])
@@ -122,7 +122,7 @@ def read_samples(
 
 
 def _rows(table: SensorTable, used: Sequence[Place]) -> Table:
-    """The columns asked for; what a killed recorder left of a last row is left out."""
+    """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
     columns = max(indices) + 1
     return read_table(
@@ -135,15 +135,15 @@ def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> Non
     if largest > _LIMITS[sensor]:
         unit = next(iter(UNITS[sensor]))
         raise ReadError(
-            file, titles, f"{largest:.3g}", f"what a sensor can give, in {unit}",
-            "is another column meant, or a clock among them?",
+            file, titles, f"{largest:.3g}", f"a plausible value in {unit}",
+            "is one of these columns a clock or of another sensor?",
         )  # fmt: skip
 
 
 def read_quaternion(
     table: SensorTable, per_second: int | None = None
 ) -> tuple[IntArray, FloatArray]:
-    """Time stamps (N,) [ns] and the four numbers of an attitude (N, 4), in the table's order.
+    """Read the times (N,) [ns] and quaternions (N, 4) of an attitude, in the table's order.
 
     Raises:
         ReadError: a row is malformed.
@@ -155,17 +155,17 @@ def read_quaternion(
 
 
 _ROWS_SEEN = 5
-"""Rows that tell the decimal mark together."""
+"""Number of rows that determine the decimal mark."""
 
 
 def first_row(
     numbered: list[tuple[int, str]], least: int = 4
 ) -> tuple[int, str | None, str] | None:
-    """Which line is the first row of numbers, what separates its cells, and its decimal mark.
+    """Return the index of the first row of numbers, its delimiter and its decimal mark.
 
     Args:
-        numbered: lines of a file with their numbers, blank ones left out.
-        least: numbers that a row must hold.
+        numbered: a file's lines with their numbers, without blank lines.
+        least: minimum count of numbers in a row.
     """
     for k, (_, line) in enumerate(numbered):
         if line.lstrip().startswith("#"):
@@ -180,7 +180,7 @@ def first_row(
 
 
 def _decimal_mark(rows: list[tuple[int, str]], delimiter: str | None, first: str) -> str:
-    """The mark of most numbers: a first row of whole ones (0;0;0;0) has either."""
+    """Return the mark that gives the most numbers: a row of integers (0;0;0;0) fits either."""
     if delimiter == ",":
         return first
 

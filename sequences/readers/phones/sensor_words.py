@@ -1,8 +1,8 @@
-"""What names say: which sensor a file or a column is of, along which axis, in which unit.
+"""Sensor, axis and unit of a file or a column, determined by its name.
 
 Apps spell the same things in many ways (`TotalAcceleration.csv`, `gyr_walk1.txt`, `magneticFieldX`,
-`ACCELEROMETER X (m/s²)`, `gFx`). A name is cut into words at case changes and at what is no letter,
-and the words decide, so that order, case and what stands around them do not matter.
+`ACCELEROMETER X (m/s²)`, `gFx`). A name is split into words at case changes and at non-letters, and
+the words decide, so that order, case and surrounding characters do not matter.
 """
 
 from __future__ import annotations
@@ -67,20 +67,20 @@ _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a name in lower case, brackets left out."""
+    """Return the words of a name in lower case, without text in brackets."""
     plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", name))
     plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain))
     return [word.lower() for word in _WORD.findall(plain)]
 
 
 def unit_of(name: str) -> str:
-    """The unit in brackets, in the tables' spelling; empty without one."""
+    """Return the unit in brackets, in the unit tables' spelling; empty without one."""
     match = _BRACKETS.search(name)
     return unit_named(match[1]) if match else ""
 
 
 def sensor_of(words: Iterable[str]) -> Sensor | None:
-    """The one sensor that words tell of; None where they tell of none, of several or no samples."""
+    """Return the one sensor that words name; None if they name none, several or no samples."""
     words = list(words)
     if set(words) & _NOT_SAMPLES:
         return None
@@ -105,18 +105,18 @@ def is_sensor_word(word: str) -> bool:
 
 
 def without_sensor(stem: str) -> str:
-    """What a file's name says besides its sensor, as it is spelt: `Eight_gyr` becomes `Eight`."""
+    """Remove the sensor from a file's name, otherwise unchanged: `Eight_gyr` becomes `Eight`."""
     kept = _WORD.sub(lambda match: "" if is_sensor_word(match[0].lower()) else match[0], stem)
     return re.sub(r"[_\W]*$|^[_\W]*", "", re.sub(r"([_\W])[_\W]+", r"\1", kept))
 
 
 def is_uncalibrated(words: Iterable[str]) -> bool:
-    """Whether words tell of a sensor's raw variant."""
+    """Whether words name a sensor's raw variant."""
     return any(word.startswith(("uncal", "raw")) for word in words)
 
 
 def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
-    """A column's axis and the words besides it; None where it is no axis of samples."""
+    """Return a column's axis and its other words; None if it is not an axis of samples."""
     words = words_of(name)
     if set(words) & _NOT_SAMPLES:
         return None
@@ -130,14 +130,14 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
 
 
 def bias_axis_of(name: str) -> str | None:
-    """The axis along which a column says how far a raw sensor is off; None for another column."""
+    """Return the axis of a column with a raw sensor's bias; None for other columns."""
     words = words_of(name)
     alone = [word for word in words if word in ("x", "y", "z")]
     return alone[0] if len(alone) == 1 and {"bias", "drift", "offset"} & set(words) else None
 
 
 def quaternion_of(name: str) -> str | None:
-    """Which of x, y, z, w of a quaternion a column is; None for another."""
+    """Return the component x, y, z or w of a quaternion in a column; None for other columns."""
     words = words_of(name)
     last = "".join(words[-2:]) if words[-1:] and len(words[-1]) == 1 else "".join(words[-1:])
     match = re.fullmatch(r"(?:q|quat|quaternion|rv|ori|orientation|attitude)([wxyz])", last)
@@ -151,9 +151,9 @@ def is_time(name: str) -> bool:
 
 
 def time_unit_of(name: str) -> str:
-    """The unit of a clock's column, in brackets or in its words; empty where it names none.
+    """Return the unit of a clock's column, in brackets or in its words; empty if it names none.
 
-    What stands in brackets is returned as it is, so that an unknown unit can be refused.
+    Text in brackets is returned as it is, so that an unknown unit can be rejected.
     """
     if (named := unit_of(name)) and (named in TIME_UNITS or named not in ("", "since")):
         return named

@@ -1,8 +1,8 @@
 """Whether a phone's accelerometer reports specific force or, as Apple's do, its opposite.
 
-The sign does not show in the accelerometer and the gyroscope: a world upside down moves alike. It
-is known by the system that an app names, or by the phone's own attitude where that was logged:
-specific force points up.
+The accelerometer and the gyroscope do not reveal the sign: a world upside down moves the same way.
+It is determined from the phone's own attitude if that was logged, since specific force points up,
+or from the operating system that an app names.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ _log = logging.getLogger(__name__)
 
 _G_RANGE = (0.7, 1.4)
 _STEADY = 0.4
-"""Gravity keeps a tenth of the samples from falling below this share of their median."""
+"""With gravity, fewer than a tenth of the samples fall below this share of their median."""
 
 _CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
-"""How files begin that only loggers on iOS write."""
+"""Beginnings of names of files that only loggers on iOS write."""
 
 _SURE = 0.7
-"""Mean cosine between an attitude's vertical and the force from which it decides."""
+"""Minimum mean cosine between an attitude's vertical and the force for it to decide."""
 
 
 def is_in_g(values: FloatArray) -> bool:
-    """Whether an accelerometer's samples (N, 3) are about one long: gravity in g."""
+    """Whether an accelerometer's samples (N, 3) have norms of about one: gravity in g."""
     size = np.linalg.norm(values, axis=1)
     low, median = np.percentile(size, [10, 50])
     return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
@@ -46,13 +46,13 @@ def accel_sign(
     attitude: tuple[IntArray, Rotation] | None,
     gravity_apart: bool = False,
 ) -> float:
-    """1.0, or -1.0 where the accelerometer has Apple's sign.
+    """Return 1.0, or -1.0 if the accelerometer has Apple's sign.
 
     Args:
-        files: the recording's.
-        accel: its accelerometer's samples.
-        attitude: the phone's own, as `logged_attitude` returns it.
-        gravity_apart: whether gravity was added from a file of its own.
+        files: files of the recording.
+        accel: samples of its accelerometer.
+        attitude: the phone's own attitude, as `logged_attitude` returns it.
+        gravity_apart: whether gravity was added from a separate file.
     """
     folder = files.gyro.parent
     in_g = is_in_g(accel.values)
@@ -63,25 +63,25 @@ def accel_sign(
         sign = -1.0
     if sign is None and in_g and not accel.unit:
         _log.warning(
-            "%s: an accelerometer in g: pass `--accel-unit g`, and if an iPhone wrote it "
-            "`--accel-sign apple` as well", folder,
+            "%s: the accelerometer seems to be in g: pass `--accel-unit g` and, if the files are "
+            "from an iPhone, `--accel-sign apple`", folder,
         )  # fmt: skip
     elif sign is None and gravity_apart:
         _log.warning(
-            "%s: gravity stands in a file of its own, as Sensor Logger writes it on iPhones, whose "
-            "sign is the opposite: if one wrote it, pass `--accel-sign apple`", folder,
+            "%s: gravity is in a separate file, as Sensor Logger writes it on iPhones, whose sign "
+            "is inverted: if the files are from an iPhone, pass `--accel-sign apple`", folder,
         )  # fmt: skip
     if sign == -1.0:
-        _log.info("%s: the accelerometer has Apple's sign, turned over", folder)
+        _log.info("%s: inverted the accelerometer, which has Apple's sign", folder)
     return sign or 1.0
 
 
 def _by_system(folder: Path, in_g: bool) -> float | None:
-    """By the system that an app names, or that its files show it ran on; None where neither does.
+    """Return the sign by the system that an app or its files indicate; None if neither does.
 
     Sensor Logger's `Metadata.csv` names it: iOS has Apple's sign unless the app standardised it.
     SensLogs writes `record.properties` on Android, `description.txt` on iOS; files of ARKit and of
-    Core Motion come from iOS, their numbers as Apple has them where they are in g.
+    Core Motion come from iOS and have Apple's sign if they are in g.
     """
     names = {file.name.lower(): file for file in sorted(folder.glob("*"))}
     if "metadata.csv" in names:
@@ -107,7 +107,7 @@ def _by_metadata(file: Path) -> float | None:
 
 
 def _has_core_motion(files: PhoneFiles) -> bool:
-    """Whether a wide file has columns that apps call after Apple's CMDeviceMotion."""
+    """Whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
     titles = [
         place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
     ]
@@ -115,7 +115,7 @@ def _has_core_motion(files: PhoneFiles) -> bool:
 
 
 def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> float | None:
-    """By the phone's own attitude: the mean cosine between its vertical and the force."""
+    """Return the sign of the mean cosine between an attitude's vertical and the force, or None."""
     if attitude is None:
         return None
     stamps_ns, attitude_WB = attitude

@@ -1,1 +1,1 @@
-"""Published data sets in their own form."""
+"""Published data sets in their original formats."""

@@ -1,9 +1,9 @@
-"""ADVIO: `<name>/iphone/*.csv` with `ground-truth/pose.csv` beside (Cortés et al., ECCV 2018).
+"""ADVIO: `<name>/iphone/*.csv` with `ground-truth/pose.csv` alongside (Cortés et al., ECCV 2018).
 
-No headers: time [s] and values; the gyroscope in rad/s, the magnetometer in uT, the accelerometer
-in m/s^2 or, in some copies, in g with Apple's sign. Poses are time, position [m] and quaternion,
-w first, in a world with y up; `iphone/arkit.csv` has ARKit's own, taken where there is no ground
-truth. Poses that do not agree with the gyroscope are left out with a warning.
+Rows without headers are time [s] and values; the gyroscope in rad/s, the magnetometer in uT, the
+accelerometer in m/s^2 or, in some copies, in g with Apple's sign. Poses are time, position [m] and
+quaternion, w first, in a world with y up; `iphone/arkit.csv` has ARKit's, used if there is no
+ground truth. Poses that do not agree with the gyroscope are rejected with a warning.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _POSES = ("ground-truth/pose.csv", "iphone/arkit.csv")
 
 
 def read_advio(path: Path) -> ImuSequence:
-    """Read a recording by its folder.
+    """Read a recording from its folder.
 
     Raises:
         ReadError: a file is missing or malformed.
@@ -34,7 +34,7 @@ def read_advio(path: Path) -> ImuSequence:
 
 
 def is_advio(path: Path) -> bool:
-    """Whether a folder holds a phone's files in `iphone` and poses in one of their places."""
+    """Whether a folder holds a phone's files in `iphone` and one of the pose files."""
     return any((path / name).is_file() for name in _POSES) and _files(path) is not None
 
 

@@ -1,10 +1,10 @@
-"""EuRoC and TUM-VI folders: `mav0/imu0/data.csv` with truth beside it (Burri et al., 2016).
+"""EuRoC and TUM-VI folders: `mav0/imu0/data.csv`, ground truth alongside (Burri et al., 2016).
 
 IMU rows: time [ns], gyroscope xyz [rad/s], accelerometer xyz [m/s^2]. Truth rows, in
 `state_groundtruth_estimate0` (EuRoC) or `mocap0` (TUM-VI, Schubert et al., 2018): time [ns],
 position xyz [m], quaternion w x y z, IMU to world; EuRoC adds velocity xyz. Time is returned as
-seconds since the first IMU row. Truth may start later, end earlier and have gaps; a pose whose
-quaternion is none, as captures write while they see nothing, is left out with a warning.
+seconds since the first IMU row. Truth may start later, end earlier and have gaps; a pose without a
+unit quaternion, as captures write when they lose track, is marked invalid with a warning.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from stario.sequences.time_order import advancing
 _log = logging.getLogger(__name__)
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
-"""Poses of the IMU; EuRoC's `leica0` is a position alone and `vicon0` the markers' pose."""
+"""Folders with the IMU's poses; EuRoC's `leica0` has only positions, `vicon0` the markers' pose."""
 
 
 def read_euroc(path: Path) -> ImuSequence:
-    """Read a recording by its folder, its `mav0` folder or its `imu0/data.csv`.
+    """Read a recording from its folder, its `mav0` folder or its `imu0/data.csv`.
 
     Raises:
         ReadError: the IMU's file is missing or malformed.
@@ -54,7 +54,7 @@ def is_euroc(path: Path) -> bool:
 
 
 def imu_file(path: Path) -> Path | None:
-    """The recording's `imu0/data.csv`, or None if `path` does not lead to one."""
+    """Return the recording's `imu0/data.csv`, or None if `path` does not lead to one."""
     if path.is_file():
         return path if path.name == "data.csv" and path.parent.name.startswith("imu") else None
     candidates = (path / "mav0/imu0/data.csv", path / "imu0/data.csv", path / "data.csv")
@@ -72,7 +72,7 @@ def _truth_file(mav: Path) -> Path | None:
 
 
 def _holds_velocity(path: Path) -> bool:
-    """Some copies of EuRoC's truth are cut to the pose's eight columns."""
+    """Whether the truth has velocity: some copies of EuRoC's have only the pose's eight columns."""
     if not path.parent.name.startswith("state_groundtruth"):
         return False
     rows = (line for line in read_lines(path) if not line.lstrip().startswith("#"))
@@ -88,7 +88,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if not valid.all():
-        _log.warning("%s: %d of %d poses are none, left out", path, (~valid).sum(), len(valid))
+        _log.warning("%s: rejected %d of %d poses as invalid", path, (~valid).sum(), len(valid))
     quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])
     return Trajectory(
         time=time,

@@ -1,16 +1,16 @@
-"""IMUNet, raw: `acce.txt`, `gyro.txt`, `orientation.txt`, `pose.txt` in a folder (Zeinali, 2022).
+"""Raw IMUNet: `acce.txt`, `gyro.txt`, `orientation.txt`, `pose.txt` in a folder (Zeinali, 2022).
 
-Rows of blank-separated numbers below `#` comments, each file at its own clock: time [ns] and
-values; specific force xyz [m/s^2], rate xyz [rad/s], game rotation vector xyzw, and of ARCore's
-pose at 30 Hz position xyz [m] and quaternion xyzw in a world with y up. Positions are turned
-upright as the authors do, (x, -z, y), and the attitude is theirs as well:
-pose[0] conj(orientation[0]) orientation, turned likewise. RIDI's raw folders have the same files in
-a world with z up already: the specific force tells them apart.
+Rows of blank-separated numbers below `#` comments, each file at its own times. They hold time [ns]
+and specific force xyz [m/s^2], rate xyz [rad/s], game rotation vector xyzw or, at 30 Hz, ARCore's
+pose, position xyz [m] and quaternion xyzw in a world with y up. As the authors do, positions are
+rotated upright, (x, -z, y), and the attitude is pose[0] conj(orientation[0]) orientation, rotated
+likewise. RIDI's raw folders have the same files in a world that already has z up: the specific
+force distinguishes them.
 
-Its authors' later recorder writes several files of poses (of the camera, the display, the sensor);
-of them the one is taken that agrees with the gyroscope, see `poses`.
+The authors' later recorder writes several pose files (of the camera, the display, the sensor); the
+one that agrees with the gyroscope is used, see `poses`.
 
-A processed recording, `processed/data.csv`, is read instead where there is one.
+A processed recording, `processed/data.csv`, is read instead if present.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 
 def read_imunet(path: Path) -> ImuSequence:
-    """Read a recording by its folder, processed or raw.
+    """Read a recording from its folder, processed or raw.
 
     Raises:
         ReadError: a file is missing or malformed.
@@ -80,7 +80,7 @@ def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray
     game_rv = rotations(folder / "orientation.txt", "quaternion", rv[kept], "xyzw")
     inside = (pose_ns >= rv_ns[kept[0]]) & (pose_ns <= rv_ns[kept[-1]])
     if not inside.any() or len(kept) < 2:
-        raise ReadError(folder / "pose.txt", "time", "no pose", "poses while orientation.txt lasts")
+        raise ReadError(folder / "pose.txt", "time", "no pose", "poses during orientation.txt")
     pose_ns, pose = pose_ns[inside], pose[inside]
     known = Slerp(seconds(rv_ns[kept], start_ns), game_rv)
     pose_time = seconds(pose_ns, start_ns)
@@ -93,5 +93,5 @@ def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray
 
 
 def _force_attitude(R_WU: Rotation, known: Slerp, time: FloatArray) -> Rotation:
-    """The attitude at the IMU's samples, for the direction of its force alone."""
+    """Return the attitude at the IMU's samples, used only for the force's direction."""
     return R_WU * known(np.clip(time, known.times[0], known.times[-1]))

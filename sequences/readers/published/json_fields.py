@@ -1,4 +1,4 @@
-"""Numbers out of JSON files that stand beside a recording."""
+"""Numbers from JSON files that accompany a recording."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stario.sequences.sequence import FloatArray
 
 
 class JsonFields:
-    """A JSON file's object.
+    """The object in a JSON file.
 
     Args:
         path: the file.
 
     Raises:
-        ReadError: there is no such file or it holds no JSON object.
+        ReadError: the file does not exist or holds no JSON object.
     """
 
     def __init__(self, path: Path) -> None:
@@ -27,7 +27,7 @@ class JsonFields:
         try:
             self.fields = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise ReadError(path, "file", "nothing there", "the recording's JSON file") from None
+            raise ReadError(path, "file", "no such file", "the recording's JSON file") from None
         except (OSError, ValueError) as error:
             found = " ".join(str(error).split())
             raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
@@ -35,7 +35,7 @@ class JsonFields:
             raise ReadError(path, "file", type(self.fields).__name__, "a JSON object")
 
     def get(self, name: str, default: Any = None) -> Any:
-        """What stands at a dotted name, `Gyroscope.Bias.Offset`, or the default."""
+        """Return the value at a dotted name, `Gyroscope.Bias.Offset`, or the default."""
         value: Any = self.fields
         for part in name.split("."):
             if not isinstance(value, dict) or part not in value:
@@ -44,7 +44,7 @@ class JsonFields:
         return value
 
     def array(self, name: str, *shape: int) -> FloatArray:
-        """Finite numbers of a shape; a single number where no shape is given.
+        """Return finite numbers of a shape; a single number if no shape is given.
 
         Raises:
             ReadError: the field is missing or holds anything else.
@@ -53,10 +53,10 @@ class JsonFields:
 
 
 def as_array(path: Path, name: str, value: Any, *shape: int) -> FloatArray:
-    """What JSON gave for a field of a file, as finite numbers of a shape.
+    """Convert the JSON value of a field to finite numbers of a shape.
 
     Raises:
-        ReadError: it is anything else, or None because the field is missing.
+        ReadError: the value is anything else, or None because the field is missing.
     """
     expected = f"{' x '.join(map(str, shape)) or 'a'} finite number{'s' if shape else ''}"
     if value is None:

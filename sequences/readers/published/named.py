@@ -1,4 +1,4 @@
-"""Columns of a CSV by the names in its header."""
+"""Columns of a CSV, by their names in the header."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stario.sequences.sequence import FloatArray
 
 
 def header_names(path: Path) -> list[str]:
-    """The cells of a file's first line, empty for a file that is no text; never raises."""
+    """Return the cells of a file's first line, [""] for a file that is not text; never raises."""
     return [cell.strip().strip('"') for cell in (first_line(path) or "").split(",")]
 
 
@@ -24,20 +24,20 @@ class NamedColumns:
     Args:
         path: the file.
         names: the columns to read.
-        optional: stems whose x, y and z are read where they are; they need not be finite.
+        optional: stems whose x, y and z are read if present; they need not be finite.
 
     Raises:
-        ReadError: the file or a column is missing, a row is cut short, or a cell is no finite
-            number.
+        ReadError: the file or a column is missing, a row is cut short, or a cell is not a
+            finite number.
     """
 
     def __init__(self, path: Path, names: Collection[str], optional: Collection[str] = ()) -> None:
         header = header_names(path)
         if header == [""]:
-            read_lines(path)  # a missing or empty file is told from a missing column
+            read_lines(path)  # raises if the file itself is missing or empty
         missing = [name for name in names if name not in header]
         if missing:
-            raise ReadError(path, "header", f"no {', '.join(missing)}", "one column of that name")
+            raise ReadError(path, "header", f"no {', '.join(missing)}", "columns of these names")
         self._stems = [stem for stem in optional if set(axes_of(stem)) <= set(header)]
         read = [*names, *(name for stem in self._stems for name in axes_of(stem))]
         self._places = {name: k for k, name in enumerate(read)}
@@ -48,22 +48,22 @@ class NamedColumns:
                 checked(path, name, self[name], self.table.first_row)
 
     def __getitem__(self, name: str) -> FloatArray:
-        """A column (N,)."""
+        """Return a column (N,)."""
         return self.table.values[:, self._places[name]]
 
     def stack(self, stem: str, axes: str = "xyz") -> FloatArray:
-        """The columns `stem_x`, `stem_y`, ... side by side (N, K)."""
+        """Return the columns `stem_x`, `stem_y`, ... side by side (N, K)."""
         return self.table.values[:, [self._places[f"{stem}_{axis}"] for axis in axes]]
 
     def optional(self) -> FloatArray | None:
-        """The first of the optional stems' columns that there is (N, 3)."""
+        """Return the columns (N, 3) of the first optional stem present, None if none is."""
         return self.stack(self._stems[0]) if self._stems else None
 
     def file_column(self, name: str) -> int:
-        """Where a column stands in the file."""
+        """Return the index of a column in the file."""
         return self._columns[self._places[name]]
 
 
 def axes_of(stem: str, axes: str = "xyz") -> list[str]:
-    """The names `stem_x`, `stem_y`, ..."""
+    """Return the names `stem_x`, `stem_y`, ..."""
     return [f"{stem}_{axis}" for axis in axes]

@@ -1,4 +1,4 @@
-"""OxIOD: `<carriage>/<dataN>/{syn,raw}/imuN.csv` with the capture beside it (Chen et al., 2018).
+"""OxIOD: `<carriage>/<dataN>/{syn,raw}/imuN.csv` with the capture alongside (Chen et al., 2018).
 
 `imuN.csv` has no header: time, roll, pitch, yaw [rad], gyroscope xyz [rad/s], gravity xyz [g],
 user acceleration xyz [g], magnetic field xyz [uT], in Apple's signs: the specific force is
@@ -6,15 +6,14 @@ user acceleration xyz [g], magnetic field xyz [uT], in Apple's signs: the specif
 folder) or, at large scale, `tangoN.csv`: time, frame, position xyz [m], quaternion xyzw of the
 tracked body.
 
-In `syn` the printed times are rounded to uselessness; the rows of both files are synchronous at
-100 Hz. In `raw` each file has its own clock, in ns, us, ms or s: the rate tells which. There the
-IMU's rows are sorted (neighbours are swapped now and then), and the capture is brought onto the
-phone's clock by what both see of the turning. The Nexus 5 of `multi devices` writes other rows in
-`raw`: time, code of the sensor (1 accelerometer [m/s^2], 2 magnetometer [uT], 4 gyroscope [rad/s])
-and xyz.
+In `syn` the printed times are too coarsely rounded to use; the rows of both files are synchronous
+at 100 Hz. In `raw` each file has its own clock, in ns, us, ms or s as its rate indicates. There the
+IMU's rows are sorted (neighbours are occasionally swapped), and the capture is brought onto the
+phone's clock by matching the rotation in both. The Nexus 5 of `multi devices` writes other rows in
+`raw`: time, a code (1 accelerometer [m/s^2], 2 magnetometer [uT], 4 gyroscope [rad/s]) and xyz.
 
-The phone sits turned in the tracked body, the capture glitches and flips, and its world is not
-quite level: see `stario.sequences.truth.alignment`.
+The phone is rotated relative to the tracked body, the capture has glitches and flips, and its world
+is not quite level: see `stario.sequences.truth.alignment`.
 """
 
 from __future__ import annotations
@@ -58,15 +57,15 @@ _CAPTURES = ("vi", "hand", "tango")
 _ACCELEROMETER, _MAGNETIC, _GYROSCOPE = 1, 2, 4
 
 _JUMP_M_S = 4.0
-"""A tracked body that moves faster than this from row to row is a glitch."""
+"""Maximum speed of a tracked body from row to row; anything faster is a glitch."""
 
 _SPIKE_M = 0.1
-"""Nor is it ever this far from the median of the half second around it."""
+"""Maximum distance of a tracked body from the median of the half second around it."""
 
 
 @dataclass(frozen=True)
 class _Phone:
-    """Its samples; the stamps [ns] are None where rows are all there is to go by."""
+    """Samples of the phone; the stamps [ns] are None if only the row numbers give the time."""
 
     time: FloatArray
     gyro: FloatArray
@@ -76,12 +75,12 @@ class _Phone:
 
 
 def read_oxiod(path: Path) -> ImuSequence:
-    """Read `imuN.csv` and, where it lies beside it, the capture.
+    """Read `imuN.csv` and, if it lies alongside, the capture.
 
-    Truth is None, with a warning logged, where too little of it agrees with the gyroscope.
+    Truth is None, with a warning logged, if too little of it agrees with the gyroscope.
 
     Raises:
-        ReadError: a file is missing, cut short, or two of `syn` do not have as many rows.
+        ReadError: a file is missing or cut short, or two of `syn` differ in their number of rows.
     """
     phone = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
     capture = capture_file(path)
@@ -96,7 +95,7 @@ def read_oxiod(path: Path) -> ImuSequence:
 
 
 def is_oxiod(path: Path) -> bool:
-    """Whether a file starts with 16 numbers whose gravity is one g long; there is no header."""
+    """Whether a file starts with 16 numbers whose gravity is 1 g, or with rows of sensor codes."""
     row = first_numbers(path)
     apple = len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
     return apple or _is_sensor_rows(path)
@@ -132,7 +131,7 @@ def _phone(path: Path) -> _Phone:
 
 
 def _sensor_rows(path: Path) -> _Phone:
-    """A row for each sample of each sensor, at its own time."""
+    """Read a file with a row for each sample of each sensor, at its own time."""
     table = read_table(path, columns=5)
     stamps, code = _stamps_ns(table), table.values[:, 1]
     gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
@@ -147,7 +146,7 @@ def _stamps_ns(table: Table) -> IntArray:
 
 
 def capture_file(path: Path) -> Path | None:
-    """The capture of the same number beside the IMU's file, or in a folder `tango` beside its."""
+    """Return the capture with the IMU file's number, from its folder or the sibling `tango`."""
     if not path.name.startswith("imu"):
         return None
     number = path.name.removeprefix("imu")
@@ -161,7 +160,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
     norm = np.linalg.norm(quat_xyzw, axis=1)
     valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
-    valid &= (position != 0.0).any(axis=1)  # written while nothing was seen
+    valid &= (position != 0.0).any(axis=1)  # written while the body was out of sight
     quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
     attitude_WV = Rotation.from_quat(quat_xyzw)
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
@@ -176,7 +175,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     except InputError as error:
         if isinstance(error, ReadError):
             raise
-        _log.warning("%s: left out: %s", path, error)
+        _log.warning("%s: ground truth rejected: %s", path, error)
         return None
     return Trajectory(
         time=time + aligned.lag,
@@ -187,7 +186,7 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
 
 
 def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
-    """Seconds since the phone's first sample by the capture's clock, and the rows they are of."""
+    """Return the capture's times since the phone's first sample [s], and their rows."""
     rows = np.arange(len(table.values))
     if phone.stamps_ns is None:
         if len(rows) != len(phone.time):
@@ -199,7 +198,7 @@ def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
 
 
 def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
-    """Rows at either end of an impossible step or far from the median around them, widened."""
+    """Return rows next to an impossible step or far from the median around them, dilated by two."""
     if len(time) < 2:
         return np.zeros(len(time), dtype=np.bool_)
     half = max(1, round(0.25 / float(np.median(np.diff(time)))))

@@ -1,13 +1,13 @@
-"""RIDI and IMUNet, processed: `<sequence>/processed/data.csv`, 200 Hz (Yan et al., ECCV 2018).
+"""RIDI and processed IMUNet: `<sequence>/processed/data.csv`, 200 Hz (Yan et al., ECCV 2018).
 
-Columns by name: `time` [ns], `gyro_x..` [rad/s], `acce_x..` [m/s^2], `pos_x..` [m], `ori_w..z` and
-`rv_w..z`, and `magnet_x..` [uT] where
-there are; others are left alone. The attitude is that of RIDI's and RoNIN's authors, the game
-rotation vector turned so that it starts at the pose's attitude: ori[0] conj(rv[0]) rv.
+Columns by name: `time` [ns], `gyro_x..` [rad/s], `acce_x..` [m/s^2], `pos_x..` [m], `ori_w..z`,
+`rv_w..z` and, if present, `magnet_x..` [uT]; others are ignored. The attitude is that of RIDI's and
+RoNIN's authors, the game rotation vector rotated to start at the pose's attitude:
+ori[0] conj(rv[0]) rv.
 
 IMUNet (Zeinali et al., 2022) writes the same columns from ARCore's poses, whose world has y up. Its
-authors turn the positions upright, (x, -z, y), but not the attitudes: where the specific force
-points along y, the attitude is turned likewise.
+authors rotate the positions upright, (x, -z, y), but not the attitudes: where the specific force
+points along y, the attitude is rotated likewise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from stario.sequences.sequence import FloatArray, ImuSequence
 _log = logging.getLogger(__name__)
 
 UPRIGHT = Rotation.from_euler("x", 90.0, degrees=True)
-"""From a world with y up to one with z up: (x, y, z) becomes (x, -z, y)."""
+"""Rotation from a world with y up to one with z up: (x, y, z) becomes (x, -z, y)."""
 
 _COLUMNS = (
     "time",
@@ -38,14 +38,14 @@ _COLUMNS = (
     *axes_of("rv", "wxyz"),
 )
 _OWN = ("rv_x", "rv_w", "ori_w", "linacce_x", "grav_x")
-"""Names that tell this header from others with a gyroscope and an accelerometer."""
+"""Names that distinguish this header from others with a gyroscope and an accelerometer."""
 
 _PICKLES = ("data.pkl", "data.pickle")
 _MAX_TILT_RAD = np.deg2rad(20.0)
 
 
 def read_ridi(path: Path) -> ImuSequence:
-    """Read a recording by its folder, its `processed` folder or its `data.csv`.
+    """Read a recording from its folder, its `processed` folder or its `data.csv`.
 
     Raises:
         ReadError: the file is missing or malformed, or there is a pickle instead.
@@ -54,7 +54,7 @@ def read_ridi(path: Path) -> ImuSequence:
     if file is None:
         raise ReadError(path, "processed/data.csv", "no such file", "a RIDI or IMUNet recording")
     if file.name in _PICKLES:
-        fix = "write the table as data.csv beside it, with pandas' to_csv"
+        fix = "write the table to data.csv next to it with pandas' to_csv"
         raise ReadError(file, "file", "a pickle, which may run code", "processed/data.csv", fix)
     columns = NamedColumns(file, _COLUMNS, optional=("magnet",))
     stamps = columns.table.stamps_ns(columns.file_column("time"))
@@ -76,7 +76,7 @@ def read_ridi(path: Path) -> ImuSequence:
 
 
 def is_ridi(path: Path) -> bool:
-    """Whether a path leads to a CSV with the columns, or to the pickle that may replace it."""
+    """Whether a path leads to a CSV with these columns, or to a pickle in its place."""
     file = data_file(path)
     if file is None or file.name in _PICKLES:
         return file is not None
@@ -84,7 +84,7 @@ def is_ridi(path: Path) -> bool:
 
 
 def data_file(path: Path) -> Path | None:
-    """The recording's `data.csv`, else a pickle in its place, else None."""
+    """Return the recording's `data.csv`, else a pickle in its place, else None."""
     if path.is_file():
         return path if path.suffix == ".csv" or path.name in _PICKLES else None
     inside = path if path.name == "processed" else path / "processed"
@@ -93,7 +93,7 @@ def data_file(path: Path) -> Path | None:
 
 
 def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
-    """Whether the world of an attitude has y up instead of z, by where the specific force points.
+    """Whether the world of an attitude has y up instead of z, from the mean specific force.
 
     Args:
         path: the file, for the warning.
@@ -104,7 +104,7 @@ def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
     cosines = up / max(float(np.linalg.norm(up)), 1e-9)
     if max(cosines[1], cosines[2]) < np.cos(_MAX_TILT_RAD):
         tilt = np.degrees(np.arccos(np.clip(cosines[2], -1.0, 1.0)))
-        _log.warning("%s: the pose leaves the specific force %.0f degrees off upright", path, tilt)
+        _log.warning("%s: with its poses, specific force is %.0f degrees off vertical", path, tilt)
     return bool(cosines[1] > cosines[2])
 
 

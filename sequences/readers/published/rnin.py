@@ -1,10 +1,10 @@
 """RNIN: `{data_train,data_val,data_test}/<n>/SenseINS.csv` (Chen et al., ISMAR 2021), 200 Hz.
 
-Columns by name: `times` (or `time`) [s], `gyro_x..` [rad/s], `acce_x..` [m/s^2], the pose by motion
-capture `gt_q_w..z`, `gt_p_x..` [m] and by visual-inertial odometry `vio_q_w..z`, `vio_p_x..` [m],
-both of the IMU in a world with z up, and the biases that odometry estimated. As the authors do, the
-biases of the last row are subtracted, and the odometry's pose is the truth where there is no
-motion capture, which leaves `gt_q` constant.
+Columns by name: `times` (or `time`) [s], `gyro_x..` [rad/s], `acce_x..` [m/s^2], poses from motion
+capture, `gt_q_w..z`, `gt_p_x..` [m], and visual-inertial odometry, `vio_q_w..z`, `vio_p_x..` [m],
+both of the IMU in a world with z up, and the odometry's bias estimates. As the authors do, the
+biases of the last row are subtracted, and the odometry's pose is the ground truth if there is no
+motion capture, in which case `gt_q` is constant.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ _COLUMNS = (
     *axes_of("vio_acce_bias"),
 )
 _MAGNETIC = ("magnet", "mag", "magn")
-"""Stems of the field's columns [uT], in copies that have some."""
+"""Stems of the magnetic field's columns [uT], which only some copies have."""
 
 _OWN = ("gt_q_w", "gt_p_x", "vio_q_w", "vio_p_x")
 
 
 def read_rnin(path: Path) -> ImuSequence:
-    """Read a recording by its folder or its `SenseINS.csv`.
+    """Read a recording from its folder or its `SenseINS.csv`.
 
     Raises:
         ReadError: the file is missing or malformed.
     """
     file = path / _FILE if path.is_dir() else path
     if not file.is_file():
-        raise ReadError(file, "file", "nothing there", f"a recording's {_FILE}")
+        raise ReadError(file, "file", "no such file", f"a recording's {_FILE}")
     time_name = "times" if "times" in header_names(file) else "time"
     columns = NamedColumns(file, (time_name, *_COLUMNS), optional=_MAGNETIC)
     stamps = columns.table.stamps_ns(columns.file_column(time_name), per_second=1)
@@ -72,6 +72,6 @@ def is_rnin(path: Path) -> bool:
 
 
 def _name(file: Path) -> str:
-    """`data_train/12/SenseINS.csv` becomes `data_train-12`: the numbers start anew in each."""
+    """`data_train/12/SenseINS.csv` becomes `data_train-12`: numbers restart in each folder."""
     folder = file.resolve().parent
     return f"{folder.parent.name}-{folder.name}" if folder.name.isdecimal() else folder.name

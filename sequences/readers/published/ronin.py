@@ -1,18 +1,18 @@
-"""RoNIN: `<sequence>/data.hdf5` with `info.json` beside it (Herath et al., ICRA 2020), 200 Hz.
+"""RoNIN: `<sequence>/data.hdf5` with `info.json` alongside (Herath et al., ICRA 2020), 200 Hz.
 
-`synced/time` [s], `synced/gyro_uncalib` [rad/s], `synced/acce` [m/s^2] and, where there is one,
-`synced/magnet` [uT] are those of a phone carried anyhow; `pose/tango_pos` [m] and `pose/tango_ori`
-those of a second device on the chest, in a world with z up. Quaternions are w x y z. As the authors
-do, `imu_init_gyro_bias` is subtracted from the gyroscope, the specific force is
-`imu_acce_scale (acce - imu_acce_bias)`, what comes before `start_frame` is left out, and the
-phone's attitude in the Tango's world is
+`synced/time` [s], `synced/gyro_uncalib` [rad/s], `synced/acce` [m/s^2] and, if present,
+`synced/magnet` [uT] are from a phone carried in any way; `pose/tango_pos` [m] and `pose/tango_ori`
+from a second device on the chest, in a world with z up. Quaternions are w x y z. As the authors do,
+`imu_init_gyro_bias` is subtracted from the gyroscope, the specific force is
+`imu_acce_scale (acce - imu_acce_bias)`, rows before `start_frame` are skipped, and the phone's
+attitude in the Tango's world is
 
     tango_ori[0] start_calibration conj(source[0]) source
 
 where the source is the game rotation vector unless its error at the recording's end,
-`grv_ori_error`, exceeds 20 degrees: then the one of lowest error of the integrated gyroscope, the
-game rotation vector and `pose/ekf_ori`. So the truth's position is the chest's, its attitude the
-phone's.
+`grv_ori_error`, exceeds 20 degrees: then it is whichever of the integrated gyroscope, the game
+rotation vector and `pose/ekf_ori` has the lowest error. The ground truth's position is therefore
+that of the chest, its attitude that of the phone.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ _MAGNETIC = "synced/magnet"
 _OPTIONAL = {_EKF: (4,), _MAGNETIC: (3,)}
 
 _TRUSTED_DEG = 20.0
-"""The game rotation vector is taken if its error is not above this, whatever the others'."""
+"""Maximum error at which the game rotation vector is used, whatever the other errors."""
 
 
 def read_ronin(path: Path) -> ImuSequence:
-    """Read a recording by its folder or its `data.hdf5`.
+    """Read a recording from its folder or its `data.hdf5`.
 
     Raises:
         ReadError: a file is missing or cut short, or a field is missing or malformed.
@@ -89,12 +89,12 @@ def is_ronin(path: Path) -> bool:
 def _data_file(path: Path) -> Path:
     file = path / "data.hdf5" if path.is_dir() else path
     if not file.is_file():
-        raise ReadError(file, "file", "nothing there", "the recording's HDF5 file")
+        raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
     return file
 
 
 def _fields(file: Path) -> dict[str, FloatArray]:
-    """The fields needed, finite and of one length; the optional ones where there are."""
+    """Return the required fields, finite and of one length, and the optional ones present."""
     h5py = optional_package("h5py", "readers")
     try:
         with h5py.File(file, "r") as data:
@@ -107,12 +107,12 @@ def _fields(file: Path) -> dict[str, FloatArray]:
         if isinstance(error, ReadError):
             raise
         found = " ".join(str(error).split())
-        raise ReadError(file, "file", found, "HDF5", "is the download complete?") from None
+        raise ReadError(file, "file", found, "HDF5 data", "is the download complete?") from None
     count = len(fields["synced/time"]) if fields["synced/time"].ndim == 1 else 0
     for name, values in fields.items():
         shape = (count, *(_FIELDS | _OPTIONAL)[name])
         if values.shape != shape or not count:
-            raise ReadError(file, name, f"shape {values.shape}", f"{shape} as synced/time")
+            raise ReadError(file, name, f"shape {values.shape}", f"{shape} as for synced/time")
         if name not in _OPTIONAL:
             checked(file, name, values, first_row=0)
     return fields
@@ -121,7 +121,7 @@ def _fields(file: Path) -> dict[str, FloatArray]:
 def _device_attitude(
     file: Path, info: JsonFields, fields: dict[str, FloatArray], gyro: FloatArray
 ) -> Rotation:
-    """Attitude of the phone in the Tango's world, from the source that the authors would take."""
+    """Return the phone's attitude in the Tango's world, from the source the authors would use."""
     game_rv = rotations(file, "synced/game_rv", fields["synced/game_rv"], first_row=0)
     name = _source(info, _EKF in fields)
     if name == "game_rv":

@@ -1,16 +1,17 @@
-"""TLIO, the golden set: `<id>/imu0_resampled.npy`, and the raw `imu_samples_0.csv` beside it.
+"""TLIO's golden set: `<id>/imu0_resampled.npy` and, alongside, the raw `imu_samples_0.csv`.
 
 Resampled (Liu et al., RA-L 2020; 200 Hz): `imu0_resampled_description.json` names the columns and
 their widths: time [us], gyroscope [rad/s] and specific force [m/s^2], compensated and already
-turned into the world, attitude `qxyzw_World_Device` (`qwxyz_...` in some copies: the name says),
-position [m] and, in most copies, velocity [m/s]. They are turned back into the device's axes by the
-attitude, unless they are in these already, as in copies of other data sets: the attitude tells.
+rotated to the world, attitude `qxyzw_World_Device` (`qwxyz_...` in some copies, in that order),
+position [m] and, in most copies, velocity [m/s]. The attitude rotates the samples back to the
+device's axes, unless its rate shows that they are in these already, as in copies of other data
+sets.
 
-Raw: time [ns], temperature, gyroscope [rad/s], accelerometer [m/s^2] at about 1 kHz. With
-`calibration.json`, and as the authors' filter does, R^-1 x - b: R is the `RectificationMatrix`, b
-the bias's `Offset`. Truth is the resampled pose where that lies beside. `T_Device_Imu` takes the
-IMU's axes to those of the pose; in copies whose pose is that of the IMU itself it would turn them
-away. The gyroscope decides, by the attitude it agrees with.
+Raw: time [ns], temperature, gyroscope [rad/s], accelerometer [m/s^2] at about 1 kHz. As in the
+authors' filter, `calibration.json` corrects them to R^-1 x - b: R is the `RectificationMatrix`, b
+the bias's `Offset`. Ground truth is the resampled pose if present. `T_Device_Imu` takes the IMU's
+axes to those of the pose, but must not be applied in copies whose pose is that of the IMU itself.
+The gyroscope decides: the rotation that matches the resampled rates better is used.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
 
 def read_tlio(path: Path) -> ImuSequence:
-    """Read a recording by its folder (resampled where there is both) or by one of its files.
+    """Read a recording from its folder (resampled if both exist) or from one of its files.
 
     Raises:
         ReadError: a file is missing or malformed, or holds pickled objects.
@@ -67,12 +68,12 @@ def _file(path: Path) -> Path | None:
 
 
 def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
-    """The times as written [us], and the recording in the device's axes."""
+    """Return the times as written [us], and the recording in the device's axes."""
     places = _places(file.with_name(_DESCRIPTION))
     table = _array(file)
     width = max(place.stop for place in places.values())
     if table.ndim != 2 or table.shape[1] < width or not len(table):
-        raise ReadError(file, "array", f"shape {table.shape}", f"(N, {width}) as {_DESCRIPTION}")
+        raise ReadError(file, "array", f"shape {table.shape}", f"(N, {width}) as in {_DESCRIPTION}")
     quat_name = next(name for name in _QUATERNIONS if name in places)
     checked(file, "array", table[:, :width], first_row=0)
     order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
@@ -95,9 +96,9 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
 
 
 def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
-    """Whether rates (N, 3) are those of the body's axes, whatever their name says.
+    """Whether rates (N, 3) are in the body's axes, whatever their column's name.
 
-    Over a step the attitude turns by R_k^T R_k+1 in the body's axes, R_k+1 R_k^T in the world's.
+    Over a step the attitude rotates by R_k^T R_k+1 in the body's axes, R_k+1 R_k^T in the world's.
     """
     if len(time) < 2:
         return False
@@ -121,7 +122,7 @@ def _array(file: Path) -> FloatArray:
 
 
 def _places(description: Path) -> dict[str, slice]:
-    """Where each column stands, from a list such as ["ts_us(1)", ...]; the list's key may vary."""
+    """Return the columns' places from a list such as ["ts_us(1)", ...] under any key."""
     fields = JsonFields(description).fields
     lists = (x for x in fields.values() if isinstance(x, list) and x)
     names = next((x for x in lists if all(isinstance(c, str) for c in x)), [])
@@ -169,7 +170,7 @@ def _calibrated(calibration: JsonFields, sensor: str, raw: FloatArray) -> FloatA
     name = f"{sensor}.Model.RectificationMatrix"
     matrix = calibration.array(name, 3, 3)
     if abs(np.linalg.det(matrix)) < 1e-6:
-        raise ReadError(calibration.path, name, "a singular matrix", "one that can be inverted")
+        raise ReadError(calibration.path, name, "a singular matrix", "an invertible one")
     bias = calibration.array(f"{sensor}.Bias.Offset", 3)
     return np.asarray(raw @ np.linalg.inv(matrix).T - bias, dtype=np.float64)
 
@@ -181,13 +182,13 @@ def _imu_pose(
     posed: ImuSequence,
     start_ns: int,
 ) -> Trajectory | None:
-    """The IMU's pose on the raw samples' clock, from the device's."""
+    """Return the IMU's pose on the raw samples' clock, computed from the device's."""
     offset = (int(stamps_us[0]) * 1000 - start_ns) * 1e-9
     time = posed.time + offset
     R_DI, p_DI = _device_imu(calibration)
     inside = (time >= sequence.time[0]) & (time <= sequence.time[-1])
     if posed.truth is None or not inside.any():
-        found = f"times {offset:.3f} s off"
+        found = f"times offset by {offset:.3f} s"
         raise ReadError(calibration.path.with_name(_RESAMPLED), "ts_us", found, f"those of {_RAW}")
     rate_I = interpolated(time[inside], sequence.time, sequence.gyro)
     misfit = [
@@ -206,7 +207,7 @@ def _imu_pose(
 
 
 def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
-    """R_DI and p_DI [m]; the quaternion is [w, [x, y, z]] or flat, w first; identity if missing."""
+    """Return R_DI and p_DI [m], identity if missing, from [w, [x, y, z]] or [w, x, y, z]."""
     quat = calibration.get("T_Device_Imu.UnitQuaternion")
     if quat is None:
         return Rotation.identity(), np.zeros(3)

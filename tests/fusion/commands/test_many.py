@@ -248,7 +248,7 @@ def test_a_recording_is_not_learned_from_and_kept(stario, recording: Path, tmp_p
 
 
 def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
-    stario("train", "missing.csv").assert_one_line_error("missing.csv", "nothing there")
+    stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
     assert not (tmp_path / "runs").exists()
 
 

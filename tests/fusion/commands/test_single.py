@@ -253,7 +253,7 @@ def test_recordings_go_into_an_archive_and_are_chosen_from_it(
     for arguments in (["run", "all.h5"], ["convert", "all.h5", "out.csv"]):
         stario(*arguments, "--where", "person=eve").assert_one_line_error("person=eve", "none")
     stario("run", "all.h5", "--where", "eve").assert_one_line_error("--where", "attribute=value")
-    stario("convert", "all.h5", "out.csv").assert_one_line_error("2 of them", "all.h5:walk")
+    stario("convert", "all.h5", "out.csv").assert_one_line_error("2 recordings", "all.h5:walk")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -391,8 +391,8 @@ def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["run", "missing.csv"], ["missing.csv", "nothing there"]),
-        (["compare", "missing"], ["missing", "nothing there"]),
+        (["run", "missing.csv"], ["missing.csv", "no such file"]),
+        (["compare", "missing"], ["missing", "no such file"]),
         (["evaluate", "--data", "missing"], ["missing", "--data"]),
         (["evaluate", "--data", ".", "--split", "practice"], ["split", "practice"]),
         (["evaluate"], ["PATH", "--data"]),
@@ -404,7 +404,7 @@ def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: P
         (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
         (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
-        (["convert", "missing.csv", "a.csv"], ["missing.csv", "nothing there"]),
+        (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
         (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
         (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),

@@ -63,9 +63,9 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
     assert [text.split(", expected")[0] for text in told] == [
         "/list.txt: line 2: found an empty entry",
         "/list.txt: line 3: found an empty entry",
-        "/list.txt: line 4: found gone.csv, not there",
+        "/list.txt: line 4: found no gone.csv",
         "/empty: folder: found no recording",
-        "/list.txt: list: found the list list.txt",
+        "/list.txt: list: found another list, list.txt",
     ]
     path.write_text("# nothing\n\n")
     with pytest.raises(ReadError, match="no entry"):

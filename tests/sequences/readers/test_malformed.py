@@ -103,7 +103,7 @@ def test_an_info_that_is_missing_or_no_json(ronin) -> None:
     (ronin / "info.json").write_text("[1]")
     refused(ronin, "info.json: file: found list, expected a JSON object")
     (ronin / "info.json").unlink()
-    refused(ronin, "info.json: file: found nothing there")
+    refused(ronin, "info.json: file: found no such file")
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_an_npy_that_does_not_fit_its_description(tmp_path, walks, formats) -> N
     description.write_text(text.replace("pos_World_Device(3)", "pos_World_Device"))
     refused(path, "found 'pos_World_Device', expected a name with its width")
     description.unlink()
-    refused(path, "imu0_resampled_description.json: file: found nothing there")
+    refused(path, "imu0_resampled_description.json: file: found no such file")
 
 
 def test_raw_samples_without_their_calibration(tmp_path, walks, formats) -> None:
@@ -188,7 +188,7 @@ def test_raw_samples_without_their_calibration(tmp_path, walks, formats) -> None
     calibration.write_text(json.dumps(fields))
     refused(path, "Gyroscope.Model.RectificationMatrix: found a singular matrix")
     calibration.unlink()
-    refused(path, "calibration.json: file: found nothing there")
+    refused(path, "calibration.json: file: found no such file")
 
 
 def test_a_bag_cut_short_or_with_bad_values(tmp_path, formats) -> None:
@@ -196,7 +196,7 @@ def test_a_bag_cut_short_or_with_bad_values(tmp_path, formats) -> None:
     path = formats.bag(tmp_path / "b", walk)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    refused(path, "b.bag: file: found ", "expected a whole bag")
+    refused(path, "b.bag: file: found ", "expected an intact bag")
     value = struct.pack("<d", walk.gyro[20, 1])
     path.write_bytes(whole.replace(value, struct.pack("<d", np.nan)))
     refused(path, "row 20, /imu, values: found nan")
@@ -208,7 +208,7 @@ def test_a_bag_cut_short_or_with_bad_values(tmp_path, formats) -> None:
     folder = formats.bag(tmp_path / "two", walk, "sqlite3")
     database = next(folder.glob("*.db3"))
     database.write_bytes(database.read_bytes()[:5000])
-    refused(folder, "two: file: found ", "expected a whole bag")
+    refused(folder, "two: file: found ", "expected an intact bag")
 
 
 def test_a_loggers_files_that_do_not_fit(tmp_path, walks, formats) -> None:
@@ -222,11 +222,11 @@ def test_a_loggers_files_that_do_not_fit(tmp_path, walks, formats) -> None:
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",nan", *lines[31:]]))
     refused(path, "Gyroscope.csv: row 31, x, y, z: found nan")
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",1e15", *lines[31:]]))
-    refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected what a sensor can give, in rad/s")
+    refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected a plausible value in rad/s")
     gyro.write_text("\n".join(lines).replace(",x", ",x [rpm]", 1))
     refused(path, "Gyroscope.csv: header: found unit 'rpm', expected rad/s, deg/s")
     gyro.unlink()
-    refused(path, "sensors: found accel and mag alone, expected a gyroscope")
+    refused(path, "sensors: found only accel and mag, expected a gyroscope")
     with pytest.raises(ReadError, match=r"files: found Accelerometer\.csv, .*, expected a gyrosc"):
         read_recording(path, format="phone")
 

@@ -220,7 +220,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         ([HEADER.replace("gx [rad/s]", "gx [rpm]"), *GOOD[1:]], "gx: found unit 'rpm', expected"),
         ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "t: found unit 'min', expected s, ms"),
         ([HEADER.replace("ax [m/s^2]", "ax [deg/s]"), *GOOD[1:]], "ax: found unit 'deg/s'"),
-        ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found wx beside gx"),
+        ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found both wx and gx"),
         ([HEADER + ",px,py,pz,qx", *GOOD[1:]], "found no qy, qz, qw"),
         ([HEADER + ",px [mm],py,pz,qx,qy,qz,qw", *GOOD[1:]], "px: found unit 'mm', expected m"),
         ([HEADER.replace(",", ";"), *GOOD[1:]], "line 2: found 1 values, expected 7; separate"),
@@ -299,7 +299,7 @@ def test_columns_like_truth_that_are_not_read_are_warned_of(
     path = written(tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1))
     assert read_own_csv(path).truth is None
     (record,) = (r for r in caplog.records if r.levelno == logging.WARNING)
-    assert f"no truth is read from {names.replace(',', ', ')}: " in record.getMessage()
+    assert f"no ground truth is read from {names.replace(',', ', ')}: " in record.getMessage()
 
 
 def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path) -> None:

@@ -298,7 +298,7 @@ def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
             read_recording(path)
         assert seen in str(caught.value)
         assert all(name in str(caught.value) for name in FORMATS)
-    with pytest.raises(ReadError, match="nothing there"):
+    with pytest.raises(ReadError, match="no such file"):
         read_recording(tmp_path / "none.csv")
     with pytest.raises(ReadError, match=r"found a folder with imu\.csv, expected one of"):
         read_recording(tmp_path)
@@ -326,7 +326,7 @@ def test_find_walks_through_folders_in_order(
     (tmp_path / "nothing").mkdir()
     with pytest.raises(ReadError, match="no recording"):
         find_recordings(tmp_path / "nothing")
-    with pytest.raises(ReadError, match="nothing there"):
+    with pytest.raises(ReadError, match="no such file"):
         find_recordings(tmp_path / "none")
 
 

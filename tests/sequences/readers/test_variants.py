@@ -143,7 +143,7 @@ def test_several_topics_are_named_with_the_option_that_chooses(tmp_path, formats
     with pytest.raises(ReadError, match="imu topic: found '/vio', expected one of /imu, /imu_old"):
         read_recording(path, imu_topic="/vio")
     (tmp_path / "a.csv").write_text("t,gx,gy,gz,ax,ay,az\n")
-    with pytest.raises(InputError, match="imu_topic: found an option of a csv recording"):
+    with pytest.raises(InputError, match="imu_topic: found an option that format csv does"):
         read_recording(tmp_path / "a.csv", imu_topic="/imu")
 
 

@@ -314,13 +314,13 @@ def test_where_no_one_tells_the_sign_it_is_asked_for(
     iphone(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
     read_recording(tmp_path / "s")
-    assert "if one wrote it, pass `--accel-sign apple`" in caplog.text
+    assert "from an iPhone, pass `--accel-sign apple`" in caplog.text
     caplog.clear()
     ios_logger(tmp_path / "t", walk)
     for name in ("Motion.txt", "MotMagnFull.txt"):
         (tmp_path / "t" / name).unlink()
     read_recording(tmp_path / "t")
-    assert "`--accel-unit g`, and if an iPhone wrote it `--accel-sign apple`" in caplog.text
+    assert "g` and, if the files are from an iPhone, `--accel-sign apple`" in caplog.text
 
 
 @pytest.mark.parametrize("code", ["TYPE", "AHRS"])
@@ -372,7 +372,7 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
         for one in (tmp_path / "s").iterdir():
             file.write(one, f"a/{one.name}")
             file.write(one, f"b/{one.name}")
-    expected = r"two\.zip: content: found 2 recordings, a, b, expected one; unpack it"
+    expected = r"two\.zip: content: found 2 recordings \(a, b\), expected one; unpack the zip"
     with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
         read_recording(tmp_path / "two.zip")
 

@@ -390,23 +390,21 @@ def test_poses_alone_are_told_as_such(walk: ImuSequence, tmp_path: Path) -> None
     rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
     save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, joint=" ")
     for read in (read_recording, find_recordings):
-        with pytest.raises(
-            ReadError, match=r"poses alone, ARCore_sensor_pose\.txt, expected a gyr"
-        ):
+        with pytest.raises(ReadError, match=r"only poses, ARCore_sensor_pose\.txt, expected a gyr"):
             read(tmp_path / "s")
 
 
 def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
     save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
     save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
-    told = "accel and mag alone, expected a gyroscope and an accelerometer"
+    told = "only accel and mag, expected a gyroscope and an accelerometer"
     for read in (read_recording, find_recordings):
         with pytest.raises(ReadError, match=told):
             read(tmp_path / "s")
     header = ";".join(f"ACCELEROMETER {axis} (m/s²)" for axis in "XYZ")
     header += ";Time since start in ms "
     save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), joint=";")
-    with pytest.raises(ReadError, match="accel alone"):
+    with pytest.raises(ReadError, match="only accel"):
         read_recording(tmp_path / "a.csv")
 
 
@@ -432,7 +430,7 @@ def test_a_clock_among_the_values_is_named_with_its_file_and_column(
     for name in ("accel", "gyro"):
         values = np.column_stack([ns(walk), walk.gyro[:, :2]])
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
-    told = r"gyro\.csv: x, y, z: found 1\.72e\+18, expected what a sensor can give, in rad/s"
+    told = r"gyro\.csv: x, y, z: found 1\.72e\+18, expected a plausible value in rad/s"
     with pytest.raises(ReadError, match=told):
         read_recording(tmp_path / "s")
 
