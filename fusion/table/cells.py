@@ -1,7 +1,7 @@
-"""One cell of the table, a network on a data set with a seed: filled once, kept as files.
+"""One cell of the table: a network on a data set with a seed, filled once and kept as files.
 
-`<out>/<set>/<network>/<n>-steps/seed-<n>/` holds `trained.json` with the model, once the training
-is done, then `errors.json` and `tracks.npz`. A cell that is asked for again does what is missing.
+`<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
+done, then `errors.json` and `tracks.npz`. Filling a cell again does only what is missing.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from stario.sequences.errors import ConfigError, ReadError
 from stario.sequences.files import write_json, write_npz
 
 LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
-"""Networks that come first, and with several seeds."""
+"""Networks that are filled first, and with several seeds."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What fills it, as plain values that travel to any machine.
+    """Definition of a cell, as plain values that can be sent to any machine.
 
     Attributes:
-        dataset: with the recordings of each part.
-        network: an architecture, which is trained; else `pdr` or weights as `load_model` takes.
-        seed: of the training.
-        recipe: of the training; None where nothing is trained.
+        dataset: data set, with the recordings of each part.
+        network: architecture to train; otherwise `pdr` or weights as `load_model` accepts them.
+        seed: seed of the training.
+        recipe: training recipe; None where nothing is trained.
     """
 
     dataset: DataSet
@@ -49,7 +49,7 @@ class Cell:
         return f"{self.dataset.name}, {self.network}, seed {self.seed}"
 
     def folder(self, out: Path) -> Path:
-        """Its folder below that of all results; runs of more or fewer steps have others."""
+        """Return its folder below `out`; each number of training steps has a folder of its own."""
         above = out / self.dataset.name / self.network.replace("/", "_")
         if self.recipe is None:
             return above
@@ -57,27 +57,27 @@ class Cell:
 
     @property
     def digest(self) -> str:
-        """Of what its figures depend on besides the code."""
+        """Digest of everything that its results depend on except the code."""
         test = [str(one.path) for one in self.dataset.test]
         trained = "" if self.recipe is None else recipe_digest(self.recipe, self.dataset)
         return hashlib.sha256(json.dumps([self.network, trained, test]).encode()).hexdigest()
 
 
 def reference_rows(dataset: DataSet) -> tuple[str, ...]:
-    """What stands beside the networks that are trained on a set.
+    """Return the references that are compared with the networks trained on a set.
 
-    The default weights have learned from the groups that `ALL` leaves out; those before them,
-    of the same form, have not.
+    The default weights were trained on the groups that `ALL` holds out; the first-stage weights,
+    of the same architecture, were not.
     """
     return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
 
 
 def fill_cell(cell: Cell, out: Path, reading: Reading) -> Cell:
-    """Train and evaluate what of a cell is not done yet.
+    """Train and evaluate a cell, except for what is already done.
 
     Raises:
-        ConfigError: what is there was made with another recipe or other recordings.
-        InputError: nothing can be learned or tested.
+        ConfigError: existing results were made with another recipe or other recordings.
+        InputError: the network cannot be trained.
     """
     folder = cell.folder(out)
     if not _is_done(cell, folder / "errors.json"):
@@ -89,7 +89,7 @@ def fill_cell(cell: Cell, out: Path, reading: Reading) -> Cell:
 
 
 def read_cell(cell: Cell, out: Path) -> dict[str, object] | None:
-    """The content of a cell's `errors.json` and `trained.json`; None where it is not filled.
+    """Return the content of a cell's `errors.json` and `trained.json`; None if it is not filled.
 
     Raises:
         ConfigError: it was filled with another recipe or other recordings.
@@ -102,7 +102,7 @@ def read_cell(cell: Cell, out: Path) -> dict[str, object] | None:
 
 
 def read_tracks(cell: Cell, out: Path) -> dict[str, Shown]:
-    """Tracks of some recordings, by their names."""
+    """Return the tracks of some recordings, by recording name."""
     path = cell.folder(out) / "tracks.npz"
     if not path.exists():
         return {}
@@ -155,7 +155,7 @@ def _is_done(cell: Cell, path: Path) -> bool:
             str(path),
             "made with another recipe or other recordings",
             "those of this table",
-            "give the settings it was made with, or another folder: --out",
+            "use the settings it was made with, or another folder (--out)",
         )
     return True
 
@@ -164,6 +164,6 @@ def _read(path: Path) -> dict[str, object]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ReadError(path, "file", str(error), "a whole JSON file") from error
-    assert isinstance(content, dict)  # nobody else writes it
+        raise ReadError(path, "file", str(error), "a complete JSON file") from error
+    assert isinstance(content, dict)  # written only by this module
     return content

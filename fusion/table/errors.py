@@ -1,4 +1,4 @@
-"""Errors of a network on the recordings that test it, whatever kind of truth they have.
+"""Errors of a network on its test recordings, for every kind of ground truth.
 
 With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
 own attitude, by `stario.fusion.evaluation.judging.displacement_error`.
@@ -27,13 +27,13 @@ from stario.sequences.errors import StarioError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
-"""Tracks of a recording with poses, as everywhere."""
+"""Names of the tracks of a recording with poses, as in the rest of the package."""
 
 CONVENTION: Convention = "ronin"
-"""Of averaging errors: the paper's."""
+"""How errors are averaged: as in the paper."""
 
 _SHOWN = 4
-"""Recordings of a cell whose tracks are kept for figures."""
+"""Number of recordings per cell whose tracks are kept for figures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +51,13 @@ Model = DisplacementModel | PedestrianDeadReckoning
 def test_errors(
     model: Model, test: Sequence[Listed], reading: Reading
 ) -> tuple[list[dict[str, object]], dict[str, Shown], list[Skipped]]:
-    """Errors on every recording, tracks of the first ones, and what could not be used.
+    """Return the errors on every recording, tracks of the first ones, and skipped recordings.
 
     Returns:
-        of each recording plain values: `recording`, `path`, `group`, `kind` of truth, `path_m`;
-        `tracks` with ATE, RTE and PDE by track; `figures` as of `displacement_error.FIGURES`;
-        `blocks` [sum of squares, count] of 30 s, of the position error under the paper's protocol
-        ("ate") and of displacements over 10 s ("10").
+        Plain values for each recording: `recording`, `path`, `group`, `kind` of truth, `path_m`;
+        `tracks` with ATE, RTE and PDE by track; `figures` as in `displacement_error.FIGURES`;
+        `blocks` of 30 s, [sum of squares, count], of the position error under the paper's protocol
+        ("ate") and of the displacement error over 10 s ("10").
     """
     found: list[dict[str, object]] = []
     shown: dict[str, Shown] = {}
@@ -95,7 +95,7 @@ def _recording(
     if prepared.kind != "poses":
         return row, None
     sequence = reading.read(prepared.path)
-    assert sequence.truth is not None  # its kind says so
+    assert sequence.truth is not None  # guaranteed by its kind
     tracks = _tracks(model, sequence)
     row["tracks"] = {name: _errors(track, sequence.truth) for name, track in tracks.items()}
     known = tracks.get(TRUE_ATTITUDE)
@@ -125,7 +125,7 @@ def _errors(track: Trajectory, truth: Trajectory) -> dict[str, float]:
 
 
 def _blocks(track: Trajectory, truth: Trajectory) -> list[list[float]]:
-    """Sums of squared horizontal position errors, first pose aligned, and their counts."""
+    """Return [sum, count] of squared horizontal position errors per block, first pose aligned."""
     errors = pose_errors(align(track, truth, "first"), truth)
     squares = (errors.position_W[:, :2] ** 2).sum(axis=1)
     time = errors.estimate.time

@@ -1,4 +1,4 @@
-"""What a filling leaves in its folder besides the cells: tables and figures."""
+"""The tables and figures that are written next to the cells."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from stario.sequences.sequence import FloatArray, Trajectory
 
 
 def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
-    """Parameters, FLOPs, memory and time, measured once for a folder; a new network fills in."""
+    """Return parameters, FLOPs, memory and time, measured once per folder and network."""
     path = out / "costs.json"
     known = {}
     if path.exists():
@@ -50,14 +50,14 @@ def write_results(
     learned: Mapping[str, frozenset[Path]],
     drawn: bool = True,
 ) -> str:
-    """Write `table.md`, `table.json`, `table.csv` and the figures of each set; returns the text.
+    """Write `table.md`, `table.json`, `table.csv` and the figures of each set; return the text.
 
     Args:
-        cells: that the table has, filled or not.
+        cells: cells of the table, filled or not.
         out: folder of all results.
-        costs: of the networks.
-        learned: recordings that weights of the package have learned from, by their name.
-        drawn: figures as well.
+        costs: costs of the networks.
+        learned: recordings that packaged weights were trained on, by the weights' name.
+        drawn: whether to draw the figures.
     """
     filled = filled_cells(cells, out)
     datasets = {cell.dataset.name: cell.dataset for cell in cells}
@@ -80,7 +80,7 @@ def write_results(
 
 
 def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
-    """A line for each network on each set: means over seeds."""
+    """Return a row for each network on each set: means over seeds."""
     return [
         {"set": table.dataset.name, "network": row.network, "seeds": len(row.seeds)}
         | {key: row.figures[key].value if key in row.figures else "" for key in COLUMNS}
@@ -91,7 +91,7 @@ def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
 
 
 def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
-    """The networks' errors on recordings with poses, for the figures."""
+    """Return the networks' errors on recordings with poses, for the figures."""
     names = [name for name in ARCHITECTURES if name in filled]
     table = NetworkTable(
         CONVENTION, {name: table_cost(name).parameters for name in names}, samples=samples
@@ -108,7 +108,7 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
 
 
 def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
-    """Tracks of some recordings, each network's of its first seed."""
+    """Return tracks of some recordings, by each network's first seed."""
     samples: dict[str, Sample] = {}
     for cell in cells:
         content = filled.get(cell.network, {}).get(cell.seed)
@@ -126,7 +126,7 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
 
 
 def _number(value: float | None) -> float:
-    """JSON has no nan."""
+    """Replace None, which stands for nan in JSON."""
     return float("nan") if value is None else value
 
 

@@ -1,4 +1,4 @@
-"""Which cells the table has, in the order of what matters, and filling them in parallel."""
+"""The cells of the table, the most important first, and filling them in parallel."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def table_cells(
     networks: Sequence[str] | None = None,
     seeds: int = 3,
 ) -> list[Cell]:
-    """The cells: the sets of `FIRST` with one seed, then the other seeds, then the other sets.
+    """Return the cells: the sets of `FIRST` with one seed, their other seeds, the other sets.
 
     Args:
-        sets: of recordings.
-        recipe: settings of the training that all have in common.
-        steps: of every training; None for the recipe's.
-        networks: to train; all of the paper's table if None.
-        seeds: of the networks of `LEADING`; the others have one.
+        sets: data sets.
+        recipe: training settings common to all cells.
+        steps: steps of every training; None for the recipe's.
+        networks: networks to train; None for all of the paper's table.
+        seeds: number of seeds for the networks of `LEADING`; the others have one.
 
     Raises:
         InputError: a network is unknown.
-        ConfigError: the recipe does not fit.
+        ConfigError: a setting of the recipe is unknown or out of range.
     """
     names = list(networks or [*LEADING, *(n for n in ARCHITECTURES if n not in LEADING)])
     for name in names:
@@ -62,26 +62,26 @@ def table_cells(
 def fill(
     cells: Sequence[Cell], out: Path, reading: Reading, jobs: int | None = 1
 ) -> Iterator[Cell | Skipped]:
-    """Fill what is missing; each cell comes as soon as it is filled, or with why it is not.
+    """Fill what is missing; yield each cell once it is filled, or the reason why it is not.
 
     Args:
-        cells: in the order in which they are begun.
-        out: folder of all results, which every process that takes part can write to.
+        cells: cells in the order in which they are started.
+        out: folder of all results, writable by every participating process.
         reading: how recordings are read.
-        jobs: processes, as for `stario.sequences.datasets.batch.each`.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
     """
     yield from each(partial(fill_cell, out=out, reading=reading), cells, jobs)
 
 
 def backend(name: str) -> AbstractContextManager[object]:
-    """Joblib's backend within a block: "loky", processes of this machine; "dask" or "ray".
+    """Select joblib's backend within a block: "loky" (processes on this machine), "dask" or "ray".
 
-    Dask's scheduler is the one that its configuration names (`DASK_SCHEDULER_ADDRESS`), Ray's
-    cluster the one of `RAY_ADDRESS`; without them both start on this machine.
+    Dask uses the scheduler named in its configuration (`DASK_SCHEDULER_ADDRESS`), Ray the cluster
+    at `RAY_ADDRESS`; without these, both start on this machine.
 
     Raises:
-        ConfigError: another name.
-        InputError: its package is not installed.
+        ConfigError: the name is unknown.
+        InputError: the backend's package is not installed.
     """
     known: dict[str, Callable[[], AbstractContextManager[object]]] = {
         "loky": nullcontext,

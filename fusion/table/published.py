@@ -1,4 +1,4 @@
-"""The paper's results [m], by data set and network: ATE, RTE."""
+"""ATE and RTE [m] published in the paper, by data set and network."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ROWS = {
 
 
 def published(dataset: str, network: str) -> tuple[float, float] | None:
-    """ATE and RTE [m] of the paper; None where it has none."""
+    """Return ATE and RTE [m] from the paper; None if it gives none."""
     if dataset not in _ROWS or network not in ARCHITECTURES:
         return None
     ate, rte = _ROWS[dataset]

@@ -1,7 +1,7 @@
 """Ranks of networks and ratios of their errors, with intervals by a paired bootstrap.
 
-Every replicate draws recordings, and blocks of 30 s in each, alike for all networks, so that what
-is hard for all of them cancels. Sets of recordings count alike and are not drawn.
+Every replicate draws the same recordings, and the same blocks of 30 s in each, for all networks, so
+that difficulty common to all of them cancels. Sets have equal weights and are not resampled.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, I
 from stario.sequences.sequence import FloatArray
 
 Recordings = Sequence[tuple[str, str, FloatArray]]
-"""Of each recording: the set that it belongs to, its name, (B, 2) sums of squares and counts."""
+"""For each recording: its set, its name, (B, 2) sums of squares and counts per block."""
 
 
 @dataclass(frozen=True)
 class Rank:
-    """Where a network stands.
+    """Rank of a network.
 
     Attributes:
         rank: 1 for the smallest error.
-        low: of the interval.
-        high: of the interval.
-        ratio: of its error to that of the network that all are compared with; None of itself.
+        low: lower bound of the rank's interval.
+        high: upper bound of the rank's interval.
+        ratio: its error over the reference network's; None for the reference or without one.
     """
 
     rank: int
@@ -41,12 +41,12 @@ def ranks(
     """Rank networks by the geometric mean of their errors over the recordings common to all.
 
     Args:
-        networks: by name, of each seed of the training its errors on every recording.
-        against: the network that ratios are to; there are none where it is missing.
-        seed: of the bootstrap.
+        networks: errors on every recording for each training seed, by network name.
+        against: reference network of the ratios; if it is missing, there are no ratios.
+        seed: seed of the bootstrap.
 
     Returns:
-        By name; empty where no recording is common to all.
+        Ranks by network name; empty if no recording is common to all.
     """
     common = _common(networks)
     if not common:
@@ -73,7 +73,7 @@ def ranks(
 
 
 def _common(networks: Mapping[str, Sequence[Recordings]]) -> dict[str, list[str]]:
-    """Names of the recordings that every network has errors on, by their set."""
+    """Return the names of the recordings that every network has errors on, by set."""
     runs = [one for seeds in networks.values() for one in seeds]
     known = [{(stratum, name) for stratum, name, _ in one} for one in runs]
     strata: dict[str, list[str]] = {}
@@ -83,7 +83,7 @@ def _common(networks: Mapping[str, Sequence[Recordings]]) -> dict[str, list[str]
 
 
 def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
-    """Mean over sets of the mean log error over their recordings."""
+    """Return the mean over sets of the mean log error over their recordings."""
     blocks = {(stratum, name): value for stratum, name, value in run}
     means = [
         np.mean([_log_error(blocks[stratum, name].sum(axis=0)) for name in names])
@@ -93,7 +93,7 @@ def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
 
 
 def _drawn(run: Recordings, common: Mapping[str, Sequence[str]], seed: int) -> FloatArray:
-    """The same of every replicate (R,); the draws depend on seed and recordings alone."""
+    """Return the score of every replicate (R,); draws depend only on seed and recordings."""
     blocks = {(stratum, name): value for stratum, name, value in run}
     strata = []
     for s, (stratum, names) in enumerate(common.items()):
@@ -110,5 +110,5 @@ def _drawn(run: Recordings, common: Mapping[str, Sequence[str]], seed: int) -> F
 
 
 def _log_error(sums: FloatArray) -> FloatArray:
-    """Log of the root mean square of (..., 2) sums of squares and counts."""
+    """Return the log of the root mean square from (..., 2) sums of squares and counts."""
     return np.asarray(0.5 * np.log(np.maximum(sums[..., 0], 1e-12) / sums[..., 1]))

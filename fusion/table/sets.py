@@ -1,4 +1,4 @@
-"""The data sets of the table, and which of their recordings train, validate and test."""
+"""The data sets of the table and their split into training, validation and test recordings."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _MEMBERS = {
     "kipd": ("kipd", "rfbr"),
     "ilc": ("ilc",),
 }
-"""Sets among the development recordings, and the first words of their recordings' groups."""
+"""Sets among the development recordings, with the first words of their recordings' groups."""
 
 ALL = "all"
-"""All development recordings together, the groups of the package's list `holdout` left out."""
+"""All development recordings together, with the groups of the list `holdout` held out."""
 
 FIRST = ("oxiod", "ridi", ALL)
 """The sets that are filled first."""
@@ -36,13 +36,13 @@ TITLES = {
     "tyrex": "tyrex",
     "kipd": "KIPD and rfbr",
     "ilc": "Indoor Location",
-    ALL: "All together, left out by group",
+    ALL: "All together, held out by group",
 }
 
 Key = TypeVar("Key")
 
 _VALIDATION_SHARE = 0.05
-"""Of each set's recordings outside the groups that are left out."""
+"""Share of each set's walks outside the held-out groups that is used for validation."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class DataSet:
     """One set of the table.
 
     Attributes:
-        name: short, a folder's name.
-        training: recordings that networks learn from.
-        validation: recordings that choose among a run's epochs and calibrate sigma.
-        test: recordings that the table tells of, with the group of each; a network's errors in
-            different groups count alike where there are several.
-        words: how they were split.
+        name: short name, also of its folder.
+        training: recordings to train on.
+        validation: recordings that select a run's epoch and calibrate sigma.
+        test: recordings that the table reports on, each with its group; where there are several
+            groups, each has the same weight.
+        words: description of the split.
     """
 
     name: str
@@ -66,23 +66,23 @@ class DataSet:
 
     @property
     def title(self) -> str:
-        """What a person calls it."""
+        """Title for readers."""
         return TITLES.get(self.name, self.name)
 
 
 def development_sets(
     data: Path, seed: int, per_group: int, chosen: Sequence[str] | None = None
 ) -> list[DataSet]:
-    """The sets among the development recordings, those that matter most first.
+    """Return the sets among the development recordings, the most important first.
 
     Args:
         data: folder of the development recordings.
-        seed: of the splits.
-        per_group: of `ALL`, most recordings of a group that test.
-        chosen: names; all if None.
+        seed: seed of the splits.
+        per_group: maximum number of test recordings per group of `ALL`.
+        chosen: names of the sets; None for all.
 
     Raises:
-        InputError: a name is unknown, or a recording of the package's lists is not there.
+        InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
     known = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
     for name in chosen or ():
@@ -97,10 +97,10 @@ def development_sets(
 
 
 def folder_set(name: str, folder: Path, seed: int) -> DataSet:
-    """A published data set as it lies in a folder, split 8:1:1.
+    """Return a published data set from its folder, split 8:1:1.
 
     Raises:
-        InputError: there are fewer than three recordings in it.
+        InputError: it has fewer than three recordings.
         ReadError: it cannot be read.
     """
     return _split(name, [Listed(path, name) for path in find_recordings(folder)], seed)
@@ -111,7 +111,7 @@ def _single(name: str, recordings: Iterable[Listed], seed: int) -> DataSet:
 
 
 def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
-    """The paper's split, by walks: two phones on one walk stay together."""
+    """Apply the paper's split, by walks: two phones on one walk stay together."""
     walks = _by(recordings, _walk)
     split = random_split(walks, seed)
 
@@ -123,17 +123,17 @@ def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
         tuple(one.path for one in members(split.training)),
         tuple(one.path for one in members(split.validation)),
         tuple(Listed(one.path, _set_of(one)) for one in members(split.test)),
-        f"8:1:1 at random by recordings, seed {seed}",
+        f"random 8:1:1 split by recording, seed {seed}",
     )
 
 
 def _walk(one: Listed) -> Path:
-    """KIPD's S9 and S20 recordings of one name are two phones on one walk."""
+    """Return the walk: KIPD's S9 and S20 recordings of one name are two phones on one walk."""
     return one.path.with_name(re.sub(r"(?<=\w)S(9|20)$", "", one.path.name))
 
 
 def _together(data: Path, seed: int, per_group: int) -> DataSet:
-    """All sets, tested on people, devices and places that no network of the cell has met."""
+    """Combine all sets, tested on people, devices and places unseen in training."""
     held_out = listed("holdout", data)
     held = {one.path for one in held_out}
     outside = [one for one in listed("all", data) if one.path not in held]
@@ -154,9 +154,9 @@ def _together(data: Path, seed: int, per_group: int) -> DataSet:
         tuple(one.path for one in outside if one.path not in validation),
         tuple(one.path for one in outside if one.path in validation),
         tuple(Listed(one.path, _set_of(one)) for one in test),
-        f"people, devices and places of the list `holdout` test, at most {per_group} recordings "
-        f"of each; of the others {_VALIDATION_SHARE:.0%} of each set's walks at random, "
-        f"seed {seed}, validate",
+        f"tested on people, devices and places of the list `holdout`, at most {per_group} "
+        f"recordings of each; validated on a random {_VALIDATION_SHARE:.0%} of each set's other "
+        f"walks, seed {seed}",
     )
 
 
@@ -165,7 +165,7 @@ def _set_of(one: Listed) -> str:
 
 
 def _some(walks: list[list[Listed]], rng: np.random.Generator) -> list[list[Listed]]:
-    """Those that validate."""
+    """Return those used for validation."""
     count = max(1, round(_VALIDATION_SHARE * len(walks)))
     return [walks[k] for k in rng.permutation(len(walks))[:count]]
 
@@ -178,17 +178,17 @@ def _by(recordings: Iterable[Listed], key: Callable[[Listed], Key]) -> dict[Key,
 
 
 def _spread(members: Sequence[Listed], most: int) -> list[Listed]:
-    """At most so many of them, evenly from the first to the last."""
+    """Return up to `most` of them, evenly spaced from the first to the last."""
     count = min(most, len(members))
     at = np.linspace(0, len(members) - 1, count).round().astype(int)
     return [members[k] for k in at]
 
 
 def learned_from(data: Path) -> dict[str, frozenset[Path]]:
-    """Recordings that the weights in the package have learned from, by the weights' name.
+    """Return the recordings that the packaged weights were trained on, by the weights' name.
 
     Raises:
-        InputError: a recording of the package's lists is not there.
+        InputError: a recording of the packaged lists is missing.
     """
     known = frozenset(one.path for one in listed("all", data))
     held = frozenset(one.path for one in listed("holdout", data))

@@ -1,4 +1,4 @@
-"""From cells to the rows of the table: means, standard errors, ranks."""
+"""The rows of the table, computed from its cells: means, standard errors, ranks."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from stario.fusion.table.sets import DataSet
 from stario.network.architectures import ARCHITECTURES
 
 AGAINST = "StarIO"
-"""The network that the others' errors are compared with."""
+"""Reference network that the others' errors are compared with."""
 
 Content = Mapping[str, Any]
-"""What `read_cell` returns."""
+"""Result of `read_cell`."""
 
 Recording = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of every recording, averaged over them, or one of the training.
+    """A quantity of each recording, averaged over recordings.
 
     Attributes:
-        title: of the column.
-        value: of a recording; nan where it has none.
+        title: title of the column.
+        value: function that returns a recording's value; nan if it has none.
     """
 
     title: str
@@ -67,12 +67,12 @@ COLUMNS = {
     "waypoints_length": Column("length ratio", _figure("waypoints", "length_ratio")),
     "positions_percent": Column("positions, 20 s [%]", _figure("positions", "stretch_percent")),
 }
-"""Of the table, in its order; one without any value on a set is left out there."""
+"""Columns of the table, in order; a column without any value on a set is omitted there."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over seeds of means over recordings; its standard error where there are several."""
+    """Mean over seeds of means over recordings, with its standard error if there are several."""
 
     value: float
     error: float | None
@@ -83,13 +83,13 @@ class Row:
     """A network on a data set.
 
     Attributes:
-        network: its name, or that of weights.
-        seeds: that are filled.
-        figures: by the name of the column.
-        training_error: mean squared error of the last epoch's windows [m^2]; None of weights.
-        validation_error: likewise, of the recordings that validate.
-        rank: among the networks of the set; None where it has no error of the measure.
-        learned: test recordings that given weights have learned from.
+        network: name of the network or of the weights.
+        seeds: filled seeds.
+        figures: means by column key.
+        training_error: mean squared error of the last epoch's windows [m^2]; None for weights.
+        validation_error: the same on the validation recordings.
+        rank: rank among the networks of the set; None without an error in the measure.
+        learned: number of test recordings that given weights were trained on.
     """
 
     network: str
@@ -106,12 +106,12 @@ class SetTable:
     """A data set's part of the table.
 
     Attributes:
-        dataset: its name, recordings and split.
-        tested: recordings that the rows tell of.
-        path_m: their true paths together [m].
-        rows: networks with at least one seed filled.
-        measure: what ranks are of.
-        skipped: why recordings could not be used, each reason once.
+        dataset: name, recordings and split.
+        tested: number of tested recordings.
+        path_m: total length of their true paths [m].
+        rows: networks with at least one filled seed.
+        measure: the error that networks are ranked by, in words.
+        skipped: reasons why recordings were skipped, each once.
     """
 
     dataset: DataSet
@@ -127,7 +127,7 @@ Filled = dict[str, dict[int, Content]]
 
 
 def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
-    """What is filled of the cells, by set.
+    """Return the contents of the filled cells, by set.
 
     Raises:
         ConfigError: a cell was filled with another recipe or other recordings.
@@ -142,12 +142,12 @@ def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
 
 
 def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[Path]]) -> SetTable:
-    """The rows of a set.
+    """Return the table of a set.
 
     Args:
         dataset: the set.
-        filled: its cells.
-        learned: recordings that weights of the package have learned from, by their name.
+        filled: contents of its filled cells.
+        learned: recordings that packaged weights were trained on, by the weights' name.
     """
     poses = all(one["kind"] == "poses" for c in _contents(filled) for one in c["recordings"])
     measure = "ate" if poses else "10"
@@ -174,14 +174,14 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
         rows,
         "position error under the paper's protocol"
         if poses
-        else "displacement error over 10 s, "
-        "waypoint residuals instead where there are waypoints, along the own attitude",
+        else "displacement error over 10 s along the own attitude (waypoint residuals where "
+        "there are waypoints)",
         list(dict.fromkeys(skipped)),
     )
 
 
 def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float, float]]:
-    """Seconds of training, of evaluation, and windows per second of a training step, by network."""
+    """Return seconds of training and of evaluation, and training windows per second, by network."""
     sums: dict[str, list[float]] = {}
     for filled in tables:
         for name, seeds in filled.items():

@@ -1,4 +1,4 @@
-"""The table for a person, as Markdown, and as plain values."""
+"""The table as Markdown and as plain values."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 
 Work = Mapping[str, tuple[float, float, float]]
-"""As `stario.fusion.table.summary.seconds_by_network` gives it."""
+"""Result of `stario.fusion.table.summary.seconds_by_network`."""
 
 
 def table_text(
     tables: Sequence[SetTable], costs: Sequence[ModelRow], work: Work, recipe: TrainingConfig
 ) -> str:
-    """Every set's table, the costs, and what was done for them.
+    """Return the tables of all sets, the costs and the conventions as Markdown.
 
     Args:
-        tables: of the sets.
-        costs: of the networks.
-        work: computing time.
-        recipe: of the training, but for network and seed.
+        tables: tables of the sets.
+        costs: costs of the networks.
+        work: computing time by network.
+        recipe: training recipe, common to all except for network and seed.
     """
     parts = [_recipe_words(recipe)]
     parts += [_set_text(table) for table in tables if table.rows]
@@ -39,7 +39,7 @@ def table_text(
 def table_dict(
     tables: Sequence[SetTable], costs: Sequence[ModelRow], work: Work, recipe: TrainingConfig
 ) -> dict[str, object]:
-    """The same as plain values."""
+    """Return the content of `table_text` as plain values."""
     return {
         "recipe": asdict(recipe),
         "sets": {
@@ -66,11 +66,11 @@ _WORK = ("training_s", "evaluation_s", "windows_per_s")
 
 def _recipe_words(recipe: TrainingConfig) -> str:
     return (
-        f"Every network: steps of the training {recipe.steps}, windows in each {recipe.batch}, "
-        f"peak rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. Where a set "
-        f"has any, each step learns from stretches besides, of {recipe.waypoint_seconds} s between "
-        f"waypoints {recipe.waypoint_stretches} and of {recipe.track_seconds} s along positions "
-        f"{recipe.track_stretches}."
+        f"All networks: {recipe.steps} training steps of {recipe.batch} windows, peak learning "
+        f"rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. On sets with weak "
+        f"truth, each step also learns from stretches of {recipe.waypoint_seconds} s between "
+        f"waypoints ({recipe.waypoint_stretches} per step) and of {recipe.track_seconds} s along "
+        f"positions ({recipe.track_stretches} per step)."
     )
 
 
@@ -79,9 +79,9 @@ def _set_text(table: SetTable) -> str:
     lines = [
         f"### {dataset.title}",
         "",
-        f"{len(dataset.training)} recordings train, {len(dataset.validation)} validate, "
-        f"{table.tested} test ({table.path_m:.0f} m); {dataset.words}. Ranks and ratios by "
-        f"{table.measure}, geometric mean over recordings.",
+        f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
+        f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. Ranks "
+        f"and ratios are based on the geometric mean over recordings of the {table.measure}.",
         "",
     ]
     keys = [key for key in COLUMNS if any(key in row.figures for row in table.rows)]
@@ -99,16 +99,16 @@ def _set_text(table: SetTable) -> str:
             cells.append("" if known is None else f"{known[0]:.3f}, {known[1]:.3f}")
         lines.append(f"| {' | '.join(cells)} |")
     if table.skipped:
-        lines += ["", f"Left out: {len(table.skipped)} recordings, named in `table.json`."]
+        lines += ["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
     return "\n".join(lines)
 
 
 def _title(row: Row, tested: int) -> str:
     if row.network == PDR:
-        return "steps alone (`pdr`)"
+        return "pedestrian dead reckoning (`pdr`)"
     if row.network in ARCHITECTURES:
         return row.network
-    known = f", learned from {row.learned} of these {tested}" if row.learned else ""
+    known = f", trained on {row.learned} of these {tested}" if row.learned else ""
     return f"weights `{row.network}`{known}"
 
 
@@ -148,9 +148,9 @@ def _cost_text(costs: Sequence[ModelRow], work: Work) -> str:
     whole = [sum(times[k] for times in work.values()) / 3600.0 for k in (0, 1)]
     lines += [
         "",
-        f"In all {sum(whole):.2f} core hours: {whole[0]:.2f} of training, {whole[1]:.2f} of "
-        "evaluation. Time per window on this machine, one thread per core that PyTorch uses; "
-        "memory is that of weights and of an inference's results (`stario check models`).",
+        f"Total: {sum(whole):.2f} core hours, {whole[0]:.2f} for training and {whole[1]:.2f} for "
+        "evaluation. Time per window: on this machine, one thread per core that PyTorch uses; "
+        "memory: weights and results of one inference (`stario check models`).",
     ]
     return "\n".join(lines)
 
@@ -161,14 +161,16 @@ def _markdown_head(titles: Sequence[str]) -> list[str]:
 
 def _words() -> str:
     return (
-        "ATE, RTE and PDE: horizontal, means over recordings, yaw and position of the first pose; "
+        "ATE, RTE and PDE: horizontal, means over recordings, first poses aligned in yaw and "
+        "position; "
         f"{CONVENTIONS['ate_m']}; {CONVENTIONS['rte_m']}; {CONVENTIONS['pde']}. "
-        "Squares are averaged over coordinates too, as in RoNIN's code and the paper: times "
-        "sqrt(2) for the norm's. The first three columns are the paper's protocol, windows turned "
+        "Squares are also averaged over coordinates, as in RoNIN's code and the paper: multiply by "
+        "sqrt(2) for the norm. The first three columns follow the paper's protocol: windows turned "
         "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
-        "of the path, and the track's length over the truth's. Positions: error within 20 s, each "
-        "fitted, in % of the path. Training and validation error: mean squared displacement error "
-        "of windows in the last epoch [m^2] (of validation, legs count as m^2/s). +-: standard "
-        "error over seeds of the training; the split is one. Intervals (95 %): bootstrap over "
-        "recordings and blocks of 30 s, alike for all networks; seeds are averaged."
+        "of the path, and the length of the track over that of the truth. Positions: error within "
+        "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
+        "squared displacement error of windows in the last epoch [m^2] (in validation, legs count "
+        "in m^2/s). +-: standard error over training seeds, for one split. Intervals (95 %): "
+        "bootstrap over recordings and blocks of 30 s, with the same draws for all networks; seeds "
+        "are averaged."
     )

@@ -1,4 +1,4 @@
-"""A cell's training: one recipe, as many steps for every network, resumed from its checkpoint."""
+"""Training of a cell: one recipe and number of steps for all networks, resumable."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
 
 _EPOCH_STEPS = 250
-"""Most steps between two checkpoints: what a killed run loses."""
+"""Maximum steps between two checkpoints: what an interrupted run loses."""
 
 _VALIDATION_SAMPLES = 60 * WINDOW_SAMPLES
-"""Most of each stretch that validates: all are asked after every epoch."""
+"""Maximum samples of each validation stretch: all are evaluated after every epoch."""
 
 SPARE = ("checkpoint.safetensors", "clock.json")
-"""Files of a training that nobody needs once its end is noted."""
+"""Files of a training run that are not needed once its result is recorded."""
 
 _WALKS, _VALIDATION_WALKS = 40, 8
-"""Simulated walks that teach and test windows where no recording has poses: alike for every cell,
-since what differs are the networks."""
+"""Simulated walks for training and validation windows where no recording has poses: the same for
+every cell, so that only the networks differ."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How recordings are read, on whatever machine a cell is filled.
+    """How recordings are read, on any machine that fills a cell.
 
     Attributes:
-        read: a path's recording; can be pickled.
-        options: what it depends on besides the path, as plain values.
+        read: function that reads the recording at a path; must be picklable.
+        options: what `read` depends on besides the path, as plain values.
         cache: folder that keeps windows for the next cell.
     """
 
@@ -54,13 +54,13 @@ class Reading:
 def cell_recipe(
     values: dict[str, object], network: str, seed: int, steps: int | None
 ) -> TrainingConfig:
-    """The recipe of a cell: the common one with a network, a seed and a number of steps.
+    """Return the recipe of a cell: the common one with a network, a seed and a number of steps.
 
     Args:
-        values: settings in common, as of a parsed JSON file.
+        values: common settings, such as from a parsed JSON file.
         network: name of the architecture.
-        seed: of initial weights and draws.
-        steps: about so many, in epochs of equal length; None for the common recipe's.
+        seed: seed of initial weights and draws.
+        steps: approximate number, in epochs of equal length; None for the common recipe's.
 
     Raises:
         ConfigError: a setting is unknown or out of range.
@@ -76,14 +76,14 @@ def cell_recipe(
 def train_cell(
     dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: Reading
 ) -> dict[str, object]:
-    """Train a cell's network, from its checkpoint on; the folder receives the model and `SPARE`.
+    """Train a cell's network, resuming from its checkpoint; write the model and `SPARE`.
 
     Returns:
-        Plain values: errors of the last epoch [m^2], steps, windows in each, seconds of computing
-        time, of a step's in the mean, the recipe, and the recordings that could not be used.
+        Plain values: errors of the last epoch [m^2], number of steps, windows per step, total and
+        mean computing time per step [s], the recipe, and the skipped recordings.
 
     Raises:
-        InputError, ConfigError: as of `stario.network.training.train.train`.
+        InputError, ConfigError: as for `stario.network.training.train.train`.
     """
     streams, skipped = _streams(dataset.training, recipe, reading)
     held_out, missing = _streams(dataset.validation, recipe, reading)
@@ -125,7 +125,7 @@ def train_cell(
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
-    """Digest of what a cell's figures depend on besides the code."""
+    """Return the digest of all that a cell's training depends on except the code."""
     told = [
         asdict(recipe),
         [[str(path) for path in part] for part in (dataset.training, dataset.validation)],
@@ -136,7 +136,7 @@ def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
 def _streams(
     files: Sequence[Path], recipe: TrainingConfig, reading: Reading
 ) -> tuple[list[Recorded], list[Skipped]]:
-    """Of each recording; the next cells of a set find them open."""
+    """Return the streams of each recording; later cells of the same set reuse them."""
     key = (tuple(files), recipe.attitude, reading.cache)
     if key not in _open:
         outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, recipe.attitude)
@@ -150,7 +150,7 @@ def _streams(
 
 
 _MOST_OPEN = 2
-"""Parts of sets whose streams a process keeps open: those of one cell."""
+"""Maximum parts of sets whose streams a process keeps open: the two of one cell."""
 
 _open: dict[object, tuple[list[Recorded], list[Skipped]]] = {}
 
@@ -163,7 +163,7 @@ def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
 
 
 class _Clock:
-    """Computing time of a training [s], over all the processes that took part one after another."""
+    """Computing time of a training run [s], over all processes that continued it in turn."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -179,19 +179,19 @@ class _Clock:
 
     @property
     def step_seconds(self) -> float:
-        """Mean of the steps that were seen whole; nan where there was none."""
+        """Mean over the steps that were timed from start to end; nan if there are none."""
         return sum(self._steps) / len(self._steps) if self._steps else float("nan")
 
     def step(self) -> None:
-        """A step is done."""
+        """Record that a step is done."""
         if self._last is not None:
             self._steps.append(process_time() - self._last)
         self._last = process_time()
 
     def pause(self) -> None:
-        """What follows is no step."""
+        """Exclude the time until the next call of `step`."""
         self._last = None
 
     def keep(self) -> None:
-        """Note the time so far."""
+        """Write the time so far."""
         write_json(self._path, self.seconds)

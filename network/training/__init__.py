@@ -1,1 +1,1 @@
-"""How a network is trained: material, augmentation, losses, checkpoints."""
+"""Training of networks: data, augmentation, losses, checkpoints."""

@@ -1,9 +1,9 @@
-"""Random windows cut from world-frame streams, and what is done to them before a network learns.
+"""Random windows cut from world-frame streams, and their augmentation for training.
 
-Everything works on whole batches: a training step draws start points, a replay speed, a yaw, a
-tilt, biases, noise and a mirror image for each window at once. Sources: yaw, tilt and biases after
-TLIO (Liu et al. 2020); replay and mirror are exact symmetries of the mechanics, and so is a device
-that is swung about a point beside it (`stario.network.training.lever_arm`).
+Everything works on whole batches: a training step draws start points, replay speed, yaw, tilt,
+biases, noise and mirroring for all windows at once. Sources: yaw, tilt and biases follow TLIO
+(Liu et al. 2020); replay and mirroring are exact symmetries of the mechanics, and so is a swing of
+the device about a nearby point (`stario.network.training.lever_arm`).
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How far windows are varied.
+    """Extent of the random variation of windows.
 
     Attributes:
         speeds: range of the replay speed; a window replayed s times as fast has angular rates x s,
             linear accelerations x s^2, and covers s seconds of the recording.
-        replayed: share of windows that are replayed; the others keep speed 1.
-        swung: share of windows in which the device is swung besides.
-        swing_rate: largest angular rate of a swing [rad/s].
-        lever: largest distance of the device from the point it is swung about [m].
-        mirrored: share of windows that are shown as their mirror image, left to right.
-        yaw: deviation of the error of the device's heading [rad].
-        any_yaw: share of windows that are shown at any yaw instead.
-        tilt: largest error of the gravity direction [rad], about a random horizontal axis.
+        replayed: share of windows replayed at such a speed; the others keep speed 1.
+        swung: share of windows to which a swing of the device is added.
+        swing_rate: maximum angular rate of a swing [rad/s].
+        lever: maximum distance of the device from the pivot of the swing [m].
+        mirrored: share of windows mirrored left to right.
+        yaw: standard deviation of the error of the device's heading [rad].
+        any_yaw: share of windows turned by a uniformly random yaw instead.
+        tilt: maximum error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
-        gyro_noise: largest deviation of white noise on the 200 Hz samples [rad/s].
-        accel_noise: largest deviation of white noise on the 200 Hz samples [m/s^2].
+        gyro_noise: maximum standard deviation of white noise on the 200 Hz samples [rad/s].
+        accel_noise: maximum standard deviation of white noise on the 200 Hz samples [m/s^2].
     """
 
     speeds: tuple[float, float] = (0.6, 1.8)
@@ -59,11 +59,11 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         if not _is_range(self.speeds):
-            raise ConfigError("speeds", repr(self.speeds), "two factors, slow then fast, above 0")
+            raise ConfigError("speeds", repr(self.speeds), "two factors in (0, 10], slow then fast")
         for item in fields(self)[1:]:
             value = getattr(self, item.name)
             if not (isinstance(value, int | float) and 0.0 <= value < 100.0):
-                raise ConfigError(item.name, repr(value), "a finite number >= 0")
+                raise ConfigError(item.name, repr(value), "a number of 0 or more and below 100")
 
 
 def _is_range(speeds: object) -> bool:
@@ -74,22 +74,22 @@ def _is_range(speeds: object) -> bool:
 
 
 def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
-    """Samples that a stream must have for windows in a row at the fastest replay."""
+    """Return the minimum samples of a stream for successive windows at the fastest replay."""
     # Windows that are not replayed keep speed 1.
     return math.ceil(successive * WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
 
 
 class WindowSampler:
-    """Draws augmented training batches from streams, each stream weighted.
+    """Sampler of augmented training batches from weighted streams.
 
-    Streams may be memory-mapped: a batch reads the stretches it is cut from, nothing is kept.
+    Streams may be memory-mapped: a batch reads the stretches it is cut from and keeps nothing.
 
     Args:
-        streams: at least one, each longer than a window at the fastest replay.
-        weights: relative frequency of each stream per second of it.
-        augmentation: how far windows are varied.
-        seed: of all randomness.
-        successive: windows in a row, one second apart, that are drawn and varied as one.
+        streams: one or more, each longer than the windows at the fastest replay.
+        weights: relative frequency of each stream, per second of its length.
+        augmentation: extent of the random variation.
+        seed: seed of all draws.
+        successive: consecutive windows, one second apart, that are drawn and varied as one.
 
     Raises:
         InputError: a stream is too short.
@@ -109,7 +109,7 @@ class WindowSampler:
         for stream in streams:
             if len(stream) < reach:
                 found = f"a stretch of {len(stream)} samples"
-                raise InputError(stream.name, found, f"at least {reach}, the fastest replay's")
+                raise InputError(stream.name, found, f"at least {reach}, for the fastest replay")
         self._streams = streams
         self._reach = reach
         self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
@@ -118,13 +118,13 @@ class WindowSampler:
         self.generator = torch.Generator().manual_seed(seed)
 
     def batch(self, size: int) -> tuple[Tensor, Tensor]:
-        """Windows (size, 6, 200) and displacements (size, 3) [m], augmented.
+        """Draw augmented windows (size, 6, 200) and displacements (size, 3) [m].
 
-        More than one in a row come as (size, K, 6, 200) and (size, K, 3).
+        K > 1 successive windows have shapes (size, K, 6, 200) and (size, K, 3).
         """
         uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
         stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._streams) - 1)
-        # Whole samples: at speed 1 interpolation would smooth what is not smoothed in use.
+        # Whole samples: at speed 1, interpolation would smooth data that is not smoothed in use.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
         speed = self._speeds(size)
         steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
@@ -140,7 +140,7 @@ class WindowSampler:
         return windows.transpose(2, 3).contiguous(), displacement
 
     def _pieces(self, streams: list[int], offsets: list[int]) -> list[Tensor]:
-        """IMU, position, facing (B, reach, K): all that is read from a memory-mapped file."""
+        """Return IMU, position, facing (B, reach, K): the only read from memory-mapped files."""
         arrays = [np.empty((len(streams), self._reach, k), dtype=np.float32) for k in (6, 3, 2)]
         for row, (index, offset) in enumerate(zip(streams, offsets, strict=True)):
             stream, part = self._streams[index], slice(offset, offset + self._reach)
@@ -156,12 +156,12 @@ class WindowSampler:
         return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
 
     def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
-        """Swing imu (B, 200 K, 6) in W, then show each second in its frame H, mirrored and so on.
+        """Add swings in W, then rotate each second into its frame H and apply `show`.
 
         Args:
-            imu: gyroscope and specific force.
-            displacement: (B, K, 3).
-            facing: (B, 10 K, 2) which way the device faces in W.
+            imu: (B, 200 K, 6) gyroscope and specific force in W.
+            displacement: (B, K, 3) in W [m].
+            facing: (B, 10 K, 2) direction in which the device faces in W.
         """
         a, size, seconds = self.augmentation, len(imu), self._successive
         swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
@@ -178,7 +178,7 @@ class WindowSampler:
 
 
 def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
-    """Rates x s; linear accelerations x s^2 with gravity as it is."""
+    """Scale rates by s and linear accelerations by s^2; gravity is unchanged."""
     s = speed[:, None, None]
     gravity = torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
     accel = (imu[..., 3:] - gravity) * s**2 + gravity
@@ -187,11 +187,11 @@ def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Windows as the network is shown them.
+    """Windows as presented to the network.
 
     Attributes:
         imu: (B, 200, 6).
-        R_HW: (B, 3, 3) takes W to the frame that they are shown in, before the mirror.
+        R_HW: (B, 3, 3) rotation from W to the frame of presentation, before mirroring.
         mirror: (B, 6) signs of the mirror image for axial vectors, then for polar ones.
     """
 
@@ -207,17 +207,17 @@ def show(
     generator: torch.Generator,
     together: int = 1,
 ) -> Shown:
-    """Windows (B, 200, 6) in W in the device's frame H, as an imperfect device may give them.
+    """Turn windows (B, 200, 6) from W into the frame H, as an imperfect device would measure them.
 
-    Turned by minus the heading (B,) and an error; mirrored left to right, which in H is the same
-    person with the device in the other hand; tilted, biased and noisy.
+    They are turned by minus the heading (B,) plus an error; mirrored left to right, which in H is
+    the same person with the device in the other hand; tilted, biased and made noisy.
 
     Args:
-        imu: in W.
-        heading: of the device in W, averaged over the window [rad].
-        augmentation: how far windows are varied.
-        generator: of all draws.
-        together: windows in a row that share mirror, tilt and biases.
+        imu: windows in W.
+        heading: heading of the device in W, averaged over the window [rad].
+        augmentation: extent of the random variation.
+        generator: generator of all draws.
+        together: consecutive windows that share mirroring, tilt, biases and noise level.
     """
     a, groups = augmentation, len(imu) // together
 
@@ -230,7 +230,7 @@ def show(
     def of_each(values: Tensor) -> Tensor:
         return values.repeat_interleave(together, dim=0)
 
-    # Drawn for every window: an error in common would be taken out of a stretch of weak truth.
+    # Drawn for every window: the yaw fit of a stretch of weak truth removes a common error.
     error = a.yaw * torch.randn(len(imu), generator=generator)
     anywhere = uniform(len(imu)) < a.any_yaw
     R_HW = _about_z(torch.where(anywhere, symmetric(len(imu)) * torch.pi, error) - heading)
@@ -249,7 +249,7 @@ def show(
 
 
 def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:
-    """Heading (B, K) [rad] of windows from which way the device faces (B, K, 10, 2), swung."""
+    """Return headings (B, K) [rad] from facing directions (B, K, 10, 2), with swings added."""
     size, seconds, instants, _ = facing.shape
     angle = torch.atan2(facing[..., 1], facing[..., 0])
     if swings is not None:
@@ -267,7 +267,7 @@ def _about_z(yaw: Tensor) -> Tensor:
 
 
 def _small_tilt(angles: Tensor) -> Tensor:
-    """Rotation by the horizontal rotation vector (B, 2) [rad]."""
+    """Return the rotations by horizontal rotation vectors (B, 2) [rad]."""
     zero = torch.zeros_like(angles[:, 0])
     x, y = angles[:, 0], angles[:, 1]
     skew = torch.stack([zero, zero, y, zero, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
@@ -276,7 +276,7 @@ def _small_tilt(angles: Tensor) -> Tensor:
 
 
 def _lerp(pieces: Tensor, start: Tensor, at: Tensor) -> Tensor:
-    """Rows of pieces (B, reach, K), which begin at `start` (B,), at indices `at` (B, M).
+    """Interpolate pieces (B, reach, K), which begin at `start` (B,), at indices `at` (B, M).
 
     Returns:
         (B, M, K).

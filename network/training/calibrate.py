@@ -1,9 +1,9 @@
-"""Calibration of predicted standard deviations on recordings kept from training.
+"""Calibration of predicted standard deviations on held-out recordings.
 
-A network knows better which windows are hard than how hard they are: its log sigma is stretched
-and shifted, sigma = scale * exp(exponent * log_sigma), by the pair of highest likelihood on the
-errors of validation windows. A few windows are wrong beyond what any sigma explains; the squared
-normalised error counts up to a limit, so that these do not rule.
+A network predicts which windows are hard better than how hard they are. Its log sigma is therefore
+stretched and shifted, sigma = scale * exp(exponent * log_sigma), with the pair of highest
+likelihood on the errors of validation windows. No sigma explains the errors of a few windows; the
+squared normalised error is clipped so that these do not dominate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _STEEPEST = 4.0
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
-    """Fit to errors (M, 3) [m] and log sigmas (M, 3); x and y share their pair."""
+    """Fit to errors (M, 3) [m] and log sigmas (M, 3); x and y share scale and exponent."""
     scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
     scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
     return Calibration(
@@ -31,7 +31,7 @@ def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
 
 
 def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
-    """Scale and exponent of least clipped negative log-likelihood."""
+    """Return the scale and exponent that minimise the clipped negative log-likelihood."""
 
     def cost(parameters: FloatArray) -> float:
         log_scale, exponent = parameters
@@ -39,7 +39,7 @@ def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
         normalised = np.minimum(error**2 / variance, _CLIP)
         return float(np.mean(normalised + np.log(variance)))
 
-    # A sigma that says nothing is ignored (exponent 0), never believed the wrong way round.
+    # An uninformative sigma is ignored (exponent 0), never used with its sign reversed.
     bounds = [(-10.0, 10.0), (0.0, _STEEPEST)]
     log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead", bounds=bounds).x
     return float(np.exp(log_scale)), float(exponent)

@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: one safetensors file, written whole or not at all."""
+"""Checkpoints of a training run: one safetensors file, written atomically."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def write_checkpoint(
     history: list[dict[str, Any]],
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write everything that a run needs to go on.
+    """Write everything that a run needs to resume.
 
     Args:
-        path: of the file.
+        path: path of the file.
         config: the run's recipe.
-        material: what tells the recordings it learns from and the weights it began with.
-        step: steps done.
+        material: identifier of the run's recordings and initial weights.
+        step: number of steps done.
         history: reports of the epochs so far, as plain values.
-        tensors: by name.
+        tensors: tensors by name.
     """
     metadata = {
         "config": json.dumps(asdict(config)),
@@ -49,10 +49,10 @@ def write_checkpoint(
 def read_checkpoint(
     path: Path, config: TrainingConfig, material: str
 ) -> tuple[int, list[dict[str, Any]], dict[str, Tensor]]:
-    """The steps done, the history and the tensors of a run with this recipe and material.
+    """Return the number of steps, the history and the tensors of a run.
 
     Raises:
-        ConfigError: the file was written by another recipe, or by one that learned from others.
+        ConfigError: the file belongs to another recipe or to other material.
         ReadError: it cannot be read.
     """
     try:
@@ -60,15 +60,15 @@ def read_checkpoint(
             metadata = file.metadata()
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except safetensors.SafetensorError as error:
-        raise ReadError(path, "checkpoint", str(error), "a whole checkpoint") from error
+        raise ReadError(path, "checkpoint", str(error), "a complete checkpoint") from error
     if not metadata or "config" not in metadata:
-        raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of this command")
+        raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of a training run")
     _check_same(path, json.loads(metadata["config"]), config)
-    # Checkpoints older than this do not tell.
+    # Older checkpoints have no such entry.
     if metadata.get("material", material) != material:
         raise ConfigError(
             str(path),
-            "a run on other recordings, or from other first weights",
+            "a run with other recordings or other initial weights",
             "those of this run",
             "resume with the same ones or train into another folder (--out)",
         )
@@ -77,13 +77,13 @@ def read_checkpoint(
 
 def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
     expected = json.loads(json.dumps(asdict(config)))
-    # Checkpoints older than these settings are of runs without them.
+    # Checkpoints older than these settings come from runs without them.
     found = {"successive": 1, "attitude": "true", **found}
     for name in expected:
         if found.get(name) != expected[name]:
             raise ConfigError(
                 f"{path}: {name}",
                 repr(found.get(name)),
-                f"{expected[name]!r} as in this run",
+                f"{expected[name]!r}, as in this run",
                 "resume with the same settings or train into another folder",
             )

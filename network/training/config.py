@@ -1,12 +1,12 @@
-"""The training recipe: one for every network, its loss and its schedule.
+"""The training recipe, common to all networks: its loss and its schedule.
 
-The mean is learned by squared error from first to last. Sigma joins later, by the Gaussian
-likelihood e^2 / (2 sigma^2) + log sigma of the mean's error as it stands (detached): the joint
-likelihood, also weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
-sigma is large, and it is the large errors that a track is made of.
+The mean is learned by squared error throughout. Sigma joins later, through the Gaussian
+likelihood e^2 / (2 sigma^2) + log sigma of the mean's current error (detached): the joint
+likelihood, even weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
+sigma is large, and the large errors dominate the error of a track.
 
-The rate warms up and falls along a cosine as a function of the step alone, so a run that is killed
-and resumed follows the same schedule.
+The learning rate warms up and falls along a cosine as a function of the step alone, so a run that
+is interrupted and resumed follows the same schedule.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import Attitude
 
 NETWORK_SETTINGS: dict[str, dict[str, object]] = {
-    # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 walks of ten seconds.
-    # Stretches of weak truth are as many windows in a row, or twice as many.
+    # Its LSTM runs over successive windows (Chen et al. 2021); 250 are 25 stretches of ten seconds.
+    # Stretches of weak truth have the same number of windows, or twice that.
     "RNIN": {"successive": 10, "batch": 250, "track_seconds": 10},
 }
-"""Settings that a network's own paper asks for, over the recipe's defaults."""
+"""Settings from a network's own paper that override the recipe's defaults."""
 
 SIMULATED = "simulated"
-"""What a recipe's shares call the simulated walks."""
+"""Name of the simulated walks in a recipe's shares."""
 
 SIGMA_WEIGHT = 0.05
-"""Of the likelihood beside the squared error [m^2]: as large as a good error's square."""
+"""Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
 
 LEAST_SECONDS = 4
-"""Windows in a row of weak truth: two changes of velocity over two seconds."""
+"""Minimum windows per stretch of weak truth: two changes of velocity over two seconds."""
 
 _COUNTS = {
     "epochs": 1,
@@ -68,35 +68,35 @@ class TrainingConfig:
 
     Attributes:
         architecture: name of the network.
-        epochs: passes of `epoch_windows` windows.
+        epochs: number of epochs, of `epoch_windows` windows each.
         epoch_windows: windows drawn between two validations.
         batch: windows per step.
         rate: peak learning rate (Adam with decoupled weight decay).
         warm_up: share of the steps with a rising rate.
-        weight_decay: decoupled.
-        dropout: share of the head's features that is silenced; None leaves it to the network.
+        weight_decay: decoupled weight decay.
+        dropout: share of the head's features that is dropped; None for the network's own value.
         likelihood_from: share of the steps after which sigma is learned too.
-        clip: largest norm of the gradient.
-        average: decay of the running average of the weights per step.
+        clip: maximum norm of the gradient.
+        average: decay per step of the running average of the weights.
         patience: epochs without a better validation error after which training stops.
-        precision: "float32" or "bfloat16" (mixed; nearly twice as fast where there is support).
+        precision: "float32" or "bfloat16" (mixed; nearly twice as fast where supported).
         device: "auto", "cpu" or "cuda".
-        attitude: by which windows are turned into the world: "levelled" by the IMU, as in use, or
-            "true", the papers' protocol.
-        successive: windows in a row, one second apart, that a step draws from one place; more than
-            one only for a network that remembers earlier windows.
-        seed: of initial weights, draws and dropout.
-        waypoint_stretches: stretches between waypoints that a step learns from, where recordings
-            have them (`stario.network.training.weak_truth`).
+        attitude: attitude that turns windows into the world frame: "levelled" by the IMU, as in
+            use, or "true", the papers' protocol.
+        successive: consecutive windows, one second apart, that a step draws from one place; more
+            than one only for a recurrent network.
+        seed: seed of initial weights, draws and dropout.
+        waypoint_stretches: stretches between waypoints per step, where recordings have them
+            (`stario.network.training.weak_truth`).
         waypoint_seconds: windows in each of them.
-        track_stretches: the same of stretches along a track of positions without attitude.
-        track_seconds: windows in each; short, as heads and phones drift apart in yaw.
-        shares: of the windows that each source makes up, by a part of its recordings' path;
-            those that none names are drawn by their length and liveliness. What is named but not
-            there leaves its share to the other recordings. "simulated" is the share of simulated
-            walks among all windows.
-        compiled: compile the network for training (torch.compile; needs a C++ compiler on CPUs,
-            which saves a third of the time).
+        track_stretches: stretches along a track of positions without attitude, per step.
+        track_seconds: windows in each; few, because heads and phones drift apart in yaw.
+        shares: share of the windows for each source, given by a part of its recordings' path;
+            recordings of no named source are drawn by their length and liveliness. The share of
+            a source that is absent goes to the other recordings. "simulated" is the share of
+            simulated walks among all windows.
+        compiled: compile the network for training (torch.compile; on CPUs, it needs a C++
+            compiler and saves a third of the time).
         augmentation: how windows are varied.
 
     Raises:
@@ -132,7 +132,7 @@ class TrainingConfig:
         for name, least in _COUNTS.items():
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= least):
-                raise ConfigError(name, repr(value), f"a count of at least {least}")
+                raise ConfigError(name, repr(value), f"an integer of {least} or more")
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
         for name, share in self.shares.items():
@@ -140,14 +140,12 @@ class TrainingConfig:
                 raise ConfigError(f"shares, {name}", repr(share), "a share from 0 to 1")
         recorded = sum(share for name, share in self.shares.items() if name != SIMULATED)
         if recorded > 1.0 + 1e-9:
-            raise ConfigError(
-                "shares", f"{recorded:g} of the recordings' windows in all", "1 or less"
-            )
+            raise ConfigError("shares", f"a sum of {recorded:g} over recorded sources", "1 or less")
         if self.architecture not in ARCHITECTURES:
             known = f"one of {', '.join(ARCHITECTURES)}"
             raise ConfigError("architecture", repr(self.architecture), known)
         if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
-            raise ConfigError("seed", repr(self.seed), "a count from 0 to below 2^31")
+            raise ConfigError("seed", repr(self.seed), "an integer from 0 to 2^31 - 1")
         dropout = 0.0 if self.dropout is None else self.dropout
         if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
             raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
@@ -164,7 +162,7 @@ class TrainingConfig:
 
     @property
     def reach(self) -> int:
-        """Samples that a stream must have to be drawn from."""
+        """Minimum samples of a stream to draw from."""
         return reach_of(self.augmentation, self.successive)
 
     @property
@@ -174,18 +172,18 @@ class TrainingConfig:
 
     @property
     def steps(self) -> int:
-        """Steps of the whole run."""
+        """Maximum steps of the whole run."""
         return self.epochs * self.steps_per_epoch
 
 
 def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
-    """Squared errors (B, 3) [m^2] and the likelihood of sigma given them, side by side."""
+    """Return the mean of squared errors (B, 3) [m^2] plus the weighted likelihood of sigma."""
     likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
     return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Linear warm-up, then a cosine down to a hundredth of the peak."""
+    """Return the rate at a step: linear warm-up, then a cosine to a hundredth of the peak."""
     warm = config.warm_up * config.steps
     if step < warm:
         return config.rate * (step + 1) / max(warm, 1.0)
@@ -194,7 +192,7 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 
 def training_config(values: dict[str, object]) -> TrainingConfig:
-    """A recipe from plain values (a parsed JSON file), unknown keys refused.
+    """Return a recipe from plain values (a parsed JSON file); unknown keys are rejected.
 
     Raises:
         ConfigError: a key is unknown or a value out of range.

@@ -1,4 +1,4 @@
-"""Training material: recordings and generated walks."""
+"""Training data: recordings and simulated walks."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_s
 log = logging.getLogger(__name__)
 
 _SIMULATED_SHARE = 0.4
-"""Of all windows, where none is said."""
+"""Default share of simulated walks among all windows."""
 
 _WALK_SECONDS = 60.0
 
 _SHORTEST = 400
-"""Samples of the shortest stretch that is kept, 2 s."""
+"""Minimum samples of a stretch, 2 s; shorter ones are dropped."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording's streams, and the licence that its file names."""
+    """Streams of a recording, and the licence named in its file."""
 
     path: Path
     streams: Sequence[Stream]
@@ -43,13 +43,13 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Material:
-    """Streams with how often each is drawn, per second of it.
+    """Streams to learn from and how often each is drawn.
 
     Attributes:
-        streams: stretches with full truth to learn from.
-        weights: relative frequency of each.
+        streams: stretches with full ground truth.
+        weights: relative frequency of each stream, per second of its length.
         legs: stretches of weak truth.
-        words: what they are, for the card.
+        words: description of the sources, for the card.
     """
 
     streams: list[WorldStream]
@@ -69,13 +69,13 @@ def gather(
     Args:
         recorded: streams of each recording.
         generated: simulated walks.
-        shares: of the sources among the recordings' windows, by a part of their path; recordings
-            that none names make up what is left of 1. What is named but not there leaves its
-            share to the others. `SIMULATED` is that of the simulated walks among all windows.
-        reach: samples that a stream must have to be drawn from (`TrainingConfig.reach`).
+        shares: share of each source among the recordings' windows, by a part of their path;
+            other recordings make up the rest of 1. The share of a source that is absent goes to
+            the others. `SIMULATED` is the share of simulated walks among all windows.
+        reach: minimum samples of a stream to draw from (`TrainingConfig.reach`).
 
     Raises:
-        ConfigError: nothing is left for recordings that none names, or for anything at all.
+        ConfigError: nothing is left for recordings of no named source, or all shares are 0.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []
@@ -96,7 +96,7 @@ def gather(
         weights += [share * v / whole if whole else 0.0 for v in lively]
         words.append(f"{name}: {_minutes(members):.0f} min")
     if any(len(s) >= reach for s in streams) and not any(weights):
-        raise ConfigError("shares", "0 for all that is there to learn from", "some above 0")
+        raise ConfigError("shares", "0 for every source present", "at least one above 0")
     legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
@@ -104,7 +104,7 @@ def gather(
 
 
 def _licences(recorded: Sequence[Recorded]) -> list[str]:
-    """What each archive's licences are, and how much of it was learned from under them."""
+    """Describe each archive's licences and how much training data is under each."""
     known: dict[str, list[Recorded]] = {}
     for one in recorded:
         if one.licence:
@@ -120,7 +120,7 @@ def _licences(recorded: Sequence[Recorded]) -> list[str]:
 def _sources(
     recorded: Sequence[Recorded], shares: Mapping[str, float]
 ) -> list[tuple[str, float, list[WorldStream]]]:
-    """Name, share and streams of each source among the recordings with full truth."""
+    """Return name, share and streams of each source of recordings with full truth."""
     shares = {name: share for name, share in shares.items() if name != SIMULATED}
     members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
     for one in recorded:
@@ -129,7 +129,7 @@ def _sources(
     left = 1.0 - sum(shares.values())
     if members[""] and left < 1e-9:
         raise ConfigError(
-            "shares", "1 or more in all", "less than 1", f"{members[''][0].name} is of no source"
+            "shares", "a sum of 1 or more", "less than 1", f"{members[''][0].name} matches no share"
         )
     return [(name or "others", shares.get(name, left), found) for name, found in members.items()]
 
@@ -139,13 +139,13 @@ def _minutes(streams: Sequence[Stream]) -> float:
 
 
 def _liveliness(stream: WorldStream) -> float:
-    """Root mean square of the linear acceleration [m/s^2]: errors are large where it is."""
+    """Return the root mean square linear acceleration [m/s^2]: errors are large where it is."""
     linear = stream.imu_W[::10, 3:] - np.array([0.0, 0.0, STANDARD_GRAVITY], np.float32)
     return float(np.sqrt(np.square(linear).sum(axis=1).mean()))
 
 
 def split_off(recordings: Sequence[Recorded]) -> tuple[list[Recorded], list[Recorded]]:
-    """Recordings without their last fifth, and that; scraps too short to learn from are lost."""
+    """Split the last fifth off each recording; drop parts that are too short to learn from."""
     first, last = [], []
     for one in recordings:
         left = round(0.8 * sum(len(stream) for stream in one.streams))
@@ -166,7 +166,7 @@ def _is_long(stream: Stream) -> bool:
 def cached_walks(
     count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
 ) -> list[WorldStream]:
-    """`generated_streams` of walks of a minute, from the cache in `folder`."""
+    """Return `generated_streams` of walks of one minute, cached in `folder`."""
     build = partial(generated_streams, count, _WALK_SECONDS, seed, attitude)
     module = Path(__file__).read_text(encoding="utf-8")
     key = {"kind": "generated", "values": [count, seed, attitude], "module": module}
@@ -176,7 +176,7 @@ def cached_walks(
 def generated_streams(
     count: int, seconds: float, seed: int, attitude: Attitude = "levelled"
 ) -> list[WorldStream]:
-    """Stretches of a simulated phone's IMU along generated walks."""
+    """Return stretches of a simulated phone's IMU along generated walks."""
     rng = np.random.default_rng(seed)
     streams = []
     for index in range(count):

@@ -1,10 +1,10 @@
-"""A device swung about a point beside it, added to windows that were recorded otherwise.
+"""Swings of a device about a nearby point, added to windows that were recorded without them.
 
-Hands turn a device while its owner walks on. The device's point moves with the walk plus
+Hands turn a device while its owner walks on. The device then moves with the walk plus
 r_W(t) = exp(alpha(t) [n]x) r_0, a lever arm turned about a fixed axis n; rotating the device about
-its own point leaves its specific force in the world untouched and adds its rate. All of it is
+its own centre leaves its specific force in the world unchanged and adds its rate. All of this is
 exact: rate, acceleration and displacement follow from the same angle alpha(t), a sum of sines.
-It teaches that turning says nothing of the way that was walked.
+The network learns that rotation carries no information about the path walked.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from torch import Tensor
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 
 _SINES = 2
-"""Sines in the angle of a swing."""
+"""Number of sines in the angle of a swing."""
 
 _FREQUENCIES = (0.1, 1.0)
-"""Of those sines [Hz]: sweeps and shakes of hands."""
+"""Range of their frequencies [Hz]: sweeps and shakes of hands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Sines:
     phase: Tensor
 
     def at(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Value and first and second derivative (B, T) at times (T,) [s]."""
+        """Return value, first and second derivative (B, T) at times (T,) [s]."""
         argument = self.frequency[..., None] * time + self.phase[..., None]
         a, w = self.amplitude[..., None], self.frequency[..., None]
         sine = a * argument.sin()
@@ -52,8 +52,8 @@ class Swing:
 
     Attributes:
         axis: (B, 3) unit vectors in W.
-        lever: (B, 3) from the point that walks to the device at angle zero [m].
-        angle: about the axis (B, K) [rad].
+        lever: (B, 3) from the pivot to the device at angle zero [m].
+        angle: angle about the axis [rad].
     """
 
     axis: Tensor
@@ -64,14 +64,14 @@ class Swing:
 def draw_swing(
     size: int, share: float, rate: float, lever: float, generator: torch.Generator
 ) -> Swing:
-    """Random swings about axes near the vertical, as arms and hips make them.
+    """Draw swings about axes near the vertical, like those of arms and hips.
 
     Args:
-        size: of the batch B.
-        share: of windows that are swung at all.
-        rate: largest angular rate [rad/s].
-        lever: longest lever arm [m].
-        generator: of the draws.
+        size: batch size B.
+        share: share of windows that receive a swing.
+        rate: maximum angular rate [rad/s].
+        lever: maximum lever arm [m].
+        generator: generator of the draws.
     """
 
     def uniform(*shape: int) -> Tensor:
@@ -89,7 +89,7 @@ def draw_swing(
 
 
 def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
-    """Seconds (B, 200 K, 6) in W and displacements (B, K, 3) [m] with the swing added."""
+    """Add a swing to the IMU (B, 200 K, 6) in W and to displacements (B, K, 3) [m]."""
     length = imu.shape[1]
     time = torch.arange(length + 1) / WINDOW_RATE
     angle, rate, growth = (values[..., None] for values in swing.angle.at(time))
@@ -106,7 +106,7 @@ def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tens
 
 
 def _turned(vectors: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
-    """Rodrigues' rotation of vectors (B, T, 3) about unit axes by angles (B, T, 1)."""
+    """Rotate vectors (B, T, 3) about unit axes by angles (B, T, 1), by Rodrigues' formula."""
     along = axis * (axis * vectors).sum(2, keepdim=True)
     across = torch.linalg.cross(axis, vectors)
     turned: Tensor = along + angle.cos() * (vectors - along) + angle.sin() * across

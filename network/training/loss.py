@@ -18,16 +18,16 @@ def loss_of_all(
     legs: Sequence[LegBatch],
     with_sigma: bool,
 ) -> tuple[Tensor, float]:
-    """Loss of windows with full truth and of legs, and the windows' mean squared error [m^2].
+    """Return the loss of windows and legs, and the windows' mean squared error [m^2].
 
-    All sources go through the network in one batch, so that its normalisation sees them all.
+    All sources pass through the network in one batch, so that its normalisation covers them all.
 
     Args:
-        answers: of the network, displacements and log sigmas (B, 3) of windows (B, 6, 200).
+        answers: function from windows (B, 6, 200) to displacements and log sigmas (B, 3).
         windows: (..., 6, 200) with full truth.
-        target: (..., 3) their displacements [m].
+        target: (..., 3) displacements of the windows [m].
         legs: stretches of weak truth.
-        with_sigma: whether sigma is learned by now.
+        with_sigma: whether sigma is learned in this step.
     """
     parts = [windows.flatten(0, -3), *(part.windows.flatten(0, 1) for part in legs)]
     sizes = [len(part) for part in parts]

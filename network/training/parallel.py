@@ -1,10 +1,10 @@
-"""Training in several processes, as torch's launcher starts them.
+"""Training in several processes, as started by torch's launcher.
 
-`torchrun --nproc-per-node 2 --no-python stario train ...` starts the command twice and tells each
-process its number in the environment. Every process draws the same windows and takes its share of
-them, of stretches between waypoints likewise where they share out evenly; gradients are averaged,
-so that a step is that of one process with the whole batch, but for the batch norms, which see a
-share, and for legs, which count alike within each.
+`torchrun --nproc-per-node 2 --no-python stario train ...` starts the command twice and numbers the
+processes in their environment. Every process draws the same windows and takes its share of them,
+and of the stretches of weak truth where they divide evenly. Gradients are averaged, so that a step
+equals that of one process with the whole batch, except for batch norms, which cover one share,
+and for legs, which are averaged within each process.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from stario.sequences.errors import ConfigError
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes of a run, seen from one of them.
+    """The processes of a run, as seen by one of them.
 
     Attributes:
-        rank: number of this one; number 0 writes and reports.
-        count: of all.
-        device: that this one computes on.
+        rank: number of this process; number 0 writes and reports.
+        count: number of processes.
+        device: device of this process.
     """
 
     rank: int
@@ -41,16 +41,16 @@ class Workers:
         return self.rank == 0
 
     def share(self, batch: Tensor) -> Tensor:
-        """This process's rows of a batch that all have drawn."""
+        """Return this process's rows of a batch that all have drawn."""
         return batch[self.rank :: self.count]
 
     def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
-        """The network with gradients averaged over the processes.
+        """Return the network with gradients averaged over the processes.
 
         Args:
-            network: on this process's device.
-            idle: whether some parameters get no gradient in some steps, as a head of its own for
-                sigma before sigma is learned.
+            network: network on this process's device.
+            idle: whether some parameters get no gradient in some steps, such as a separate head
+                for sigma before sigma is learned.
         """
         if self.count == 1:
             return network
@@ -58,7 +58,7 @@ class Workers:
         return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=idle)
 
     def mean(self, value: float) -> float:
-        """A number averaged over the processes."""
+        """Return a number averaged over the processes."""
         if self.count == 1:
             return value
         total = torch.tensor(value, dtype=torch.float64, device=self.device)
@@ -66,7 +66,7 @@ class Workers:
         return float(total) / self.count
 
     def agreed(self, value: float) -> float:
-        """A number of the leading process, told to all."""
+        """Return the leading process's number in all processes."""
         if self.count == 1:
             return value
         told = torch.tensor(value, dtype=torch.float64, device=self.device)
@@ -75,20 +75,20 @@ class Workers:
 
 
 def leads() -> bool:
-    """Whether this process is the only one or the first one of the launcher's."""
+    """Return whether this process is the only one or the launcher's first one."""
     return os.environ.get("RANK", "0") == "0"
 
 
 @contextmanager
 def workers(device: str, batch: int) -> Iterator[Workers]:
-    """The processes that the launcher started, connected; one process without it.
+    """Connect the processes that the launcher started; one process without it.
 
     Args:
-        device: "auto", "cpu" or "cuda", of which each process takes its own.
-        batch: rows that are shared out evenly.
+        device: "auto", "cpu" or "cuda"; each process uses its own GPU.
+        batch: rows to divide evenly among the processes.
 
     Raises:
-        ConfigError: no GPU is there though asked for, or the batch cannot be shared out.
+        ConfigError: no GPU is available for "cuda", or the batch cannot be divided evenly.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device)
@@ -111,6 +111,6 @@ def _device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda":
         if not torch.cuda.is_available():
-            raise ConfigError("device", "cuda, but torch sees no GPU", "cpu or auto")
+            raise ConfigError("device", "cuda, but torch finds no GPU", "cpu or auto")
         return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
     return torch.device(name)

@@ -1,6 +1,6 @@
-"""A training run: network, optimiser, averaged weights, history, and its checkpoint.
+"""A training run: network, optimiser, averaged weights, history and checkpoint.
 
-What is evaluated and saved is the running average of the weights.
+The running average of the weights is what is evaluated and saved.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What one epoch ended with; errors are mean squared displacement errors [m^2].
+    """Result of one epoch; errors are mean squared displacement errors [m^2].
 
     Attributes:
         epoch: its number, from 1.
-        training_error: of its augmented windows.
-        validation_error: mean over recordings and kinds of weak truth.
-        validation_by_recording: of each of them.
-        windows_per_second: learned from, of this process, with and without full truth.
-        drawing_share: of the time that went into drawing them, the network waiting.
+        training_error: error on its augmented windows.
+        validation_error: the error that selects weights (`ValidationSet.deciding`).
+        validation_by_recording: error of each recording, and of each kind of weak truth [m^2/s].
+        windows_per_second: training windows of this process, with full or weak truth.
+        drawing_share: share of the time spent drawing them while the network waits.
     """
 
     epoch: int
@@ -63,11 +63,11 @@ class TrainingRun:
 
     Args:
         config: the recipe.
-        sampler: of windows with full truth.
-        legs: samplers of weak truth, each with how many stretches a step draws.
-        material: digest of what it learns from and began with, for the checkpoint.
-        folder: receives checkpoint, model and log.
-        workers: the processes that it is shared out to.
+        sampler: sampler of windows with full truth.
+        legs: samplers of weak truth, each with the number of stretches per step.
+        material: digest of the recordings and initial weights, for the checkpoint.
+        folder: folder for checkpoint, model and log.
+        workers: the processes that share the run.
     """
 
     def __init__(
@@ -97,21 +97,21 @@ class TrainingRun:
         self._shared: Any = torch.compile(shared) if config.compiled else shared
         self._mixed = config.precision == "bfloat16"
         if not workers.leads:
-            torch.manual_seed(config.seed + workers.rank)  # dropout of its own
+            torch.manual_seed(config.seed + workers.rank)  # independent dropout
         self.step = 0
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         self.history: list[EpochReport] = []
         folder.mkdir(parents=True, exist_ok=True)
 
     def start_from(self, model: DisplacementModel) -> None:
-        """Begin with a model's weights.
+        """Start from a model's weights.
 
         Raises:
-            ConfigError: it is of another architecture.
+            ConfigError: the model has another architecture.
         """
         if model.card.architecture != self.config.architecture:
             raise ConfigError(
-                "architecture", model.card.architecture, f"{self.config.architecture} as trained"
+                "architecture", model.card.architecture, f"{self.config.architecture}, the recipe's"
             )
         state = model.training_form.state_dict()
         self.network.load_state_dict(state)
@@ -119,7 +119,7 @@ class TrainingRun:
         self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
 
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
-        """One epoch; returns the mean squared error on its (augmented) windows."""
+        """Train for one epoch; return the mean squared error on its (augmented) windows."""
         self.network.train()
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         errors = []
@@ -152,9 +152,9 @@ class TrainingRun:
         return error
 
     def _answers(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Displacements and log sigmas (B, 3) of windows (B, 6, 200).
+        """Return displacements and log sigmas (B, 3) of windows (B, 6, 200).
 
-        A network that remembers is shown as many of them in a row as the recipe says.
+        A recurrent network receives them as rows of `config.successive` windows.
         """
         successive = self.config.successive
         if self.network.remembers:
@@ -164,10 +164,10 @@ class TrainingRun:
         return mean.view(-1, 3), log_sigma.view(-1, 3)
 
     def _check_finite(self, loss: float, norm: float) -> None:
-        """Stop before a step that would spoil every weight.
+        """Stop before a step that would corrupt every weight.
 
-        The gradient's norm is looked at as well: it is infinite one step before the loss is, and
-        the processes have it in common, so that all of them stop.
+        The gradient's norm is checked as well: it is infinite one step before the loss is, and all
+        processes have the same norm, so that all of them stop.
         """
         if math.isfinite(loss) and math.isfinite(norm):
             return
@@ -189,10 +189,10 @@ class TrainingRun:
                 value.copy_(current[name])
 
     def epochs_since_best(self) -> int:
-        """Epochs since the smallest validation error; one that is not finite is never smaller.
+        """Return the epochs since the smallest validation error; nan and inf are never smallest.
 
-        Before the likelihood has begun sigma means nothing: once it has, only epochs that learned
-        with it count.
+        Sigma is meaningless until the likelihood is part of the loss: from then on, only epochs
+        trained with it count.
         """
         first = self._first_with_sigma
         errors = [_or_infinite(r.validation_error) for r in self.history]
@@ -201,18 +201,18 @@ class TrainingRun:
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
 
     def has_settled(self) -> bool:
-        """Whether nothing is gained any more, once sigma is being learned: without it no model."""
+        """Whether validation stopped improving; False until sigma is learned: models need it."""
         learned = len(self.history) >= self._first_with_sigma
         return learned and self.epochs_since_best() >= self.config.patience
 
     @property
     def _first_with_sigma(self) -> int:
-        """The first epoch that learns sigma in every step; of a short run the last one."""
+        """First epoch that learns sigma in every step; the last epoch of a short run."""
         first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
         return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
 
     def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
-        """Validate an epoch: the leading process alone, the others are told."""
+        """Validate an epoch in the leading process and share the error with the others."""
         errors = held_out.errors(self.averaged) if self.workers.leads else {}
         return EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
@@ -224,7 +224,7 @@ class TrainingRun:
         )
 
     def record(self, report: EpochReport) -> None:
-        """Keep the best weights and write checkpoint and log."""
+        """Keep the weights if they are the best so far; write checkpoint and log."""
         self.history.append(report)
         if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
@@ -249,11 +249,11 @@ class TrainingRun:
         """Continue from the folder's checkpoint, if there is one.
 
         Raises:
-            ConfigError: it was written by another recipe, or learned from other recordings.
+            ConfigError: it belongs to another recipe, or to other recordings or initial weights.
             ReadError: it cannot be read.
         """
         if self.workers.leads:
-            for left in self.folder.glob(".*.tmp"):  # of a writer that was killed
+            for left in self.folder.glob(".*.tmp"):  # from an interrupted write
                 left.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
@@ -288,13 +288,13 @@ class TrainingRun:
         kept: Calibration | None,
         known: KnownMotion | None,
     ) -> Path:
-        """Calibrate the best weights, unless a calibration is to be kept, and write the model."""
+        """Calibrate the best weights, unless a calibration is given, and write the model."""
         path = self.folder / "model.safetensors"
         if not self.workers.leads:
             return path
         self.averaged.load_state_dict(self.best)
         residuals, log_sigma = held_out.residuals(self.averaged)
-        # Predictions for what is not known are widened besides: not once more by the calibration.
+        # Sigma is also widened for unknown motion: the calibration must not widen it again.
         widened = 1.0 if known is None else held_out.variance_factors(known)[:, None]
         card = Card(
             architecture=self.config.architecture,
@@ -309,7 +309,7 @@ class TrainingRun:
 
 
 def _or_infinite(error: float) -> float:
-    """NumPy takes what is not a number for the smallest."""
+    """Replace a non-finite error by inf: `np.argmin` takes nan for the smallest."""
     return error if math.isfinite(error) else math.inf
 
 

@@ -42,32 +42,33 @@ def train(
     """Train a network, continuing from the folder's checkpoint where there is one.
 
     Args:
-        config: the recipe; a checkpoint made with another one is refused.
-        streams: training stretches.
-        weights: relative frequency of each stretch per second of it.
-        validation: stretches that choose the weights and calibrate the covariance.
-        folder: receives `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
-        on_step: called after each step with the step and its loss, for a progress bar.
+        config: the recipe; a checkpoint made with another one is rejected.
+        streams: training stretches with full truth.
+        weights: relative frequency of each stretch, per second of its length.
+        validation: stretches that select the weights and calibrate the covariance.
+        folder: folder for `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
+        on_step: called after each step with the step and its mean squared error [m^2], for a
+            progress bar.
         on_epoch: called after each validation.
-        trained_on: words for the card.
-        start_from: a model whose weights are the first ones.
-        calibration: of other weights, taken over where errors of `validation` say nothing:
-            a last stage learns from it as well, and weak truth alone has no windows to tell by.
-        legs: stretches of weak truth, positions or waypoints, to learn from besides.
-        validation_legs: some that choose the weights besides.
-        chosen_by_legs: whether they alone do, as where `validation` is but simulated.
+        trained_on: description of the training data, for the card.
+        start_from: model that provides the initial weights.
+        calibration: calibration of other weights, used where the errors on `validation` mean
+            nothing: a last stage also trains on it, and weak truth alone has no such windows.
+        legs: additional stretches of weak truth, positions or waypoints.
+        validation_legs: additional stretches of weak truth that select the weights.
+        chosen_by_legs: whether these alone do, for example if `validation` is only simulated.
 
     Returns:
         Path of the model's weights.
 
     Raises:
         InputError: no stretch to learn from or to validate on, or the loss of a step is not
-            finite. The folder then holds the last epoch's checkpoint, as it was.
+            finite. In the latter case the folder keeps the last epoch's checkpoint.
         ConfigError: the checkpoint belongs to another recipe or other recordings, or the batch
-            cannot be shared out to the processes that the launcher started.
+            cannot be divided evenly among the processes that the launcher started.
     """
     if not streams or not validation:
-        fix = "positions and waypoints are learned beside them" if legs else ""
+        fix = "positions and waypoints can only be learned alongside them" if legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
     with workers(config.device, config.batch // config.successive) as these:
         sampler = _sampler(config, streams, weights)
@@ -79,7 +80,7 @@ def train(
             run.start_from(start_from)
         run.resume()
         if run.step >= config.steps:
-            log.warning("%s: all %d epochs are done, nothing is trained", folder, config.epochs)
+            log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
         held_out = ValidationSet(
             validation, run.device, validation_legs, config, chosen_by_legs, run.network.remembers
         )
@@ -94,14 +95,14 @@ def train(
 def _sampler(
     config: TrainingConfig, streams: Sequence[WorldStream], weights: Sequence[float]
 ) -> WindowSampler:
-    """Of the streams that are long enough for as many windows in a row as the recipe draws."""
+    """Return a sampler of the streams that are long enough for the recipe's windows."""
     pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= config.reach]
     if not pairs:
-        found = f"none of {config.reach} samples at 200 Hz"
-        raise InputError("streams", found, "one as long as windows reach at the fastest replay")
+        found = f"none with {config.reach} samples at 200 Hz"
+        raise InputError("streams", found, "one long enough for the windows at the fastest replay")
     if len(pairs) < len(streams):
         log.warning(
-            "nothing is drawn from %d of %d stretches, shorter than the %.1f s that windows reach",
+            "skipping %d of %d stretches, shorter than the %.1f s that windows span",
             len(streams) - len(pairs), len(streams), config.reach / WINDOW_RATE,
         )  # fmt: skip
     kept, weights = [s for s, _ in pairs], [w for _, w in pairs]
@@ -113,7 +114,7 @@ def _material(
     weights: Sequence[float],
     start_from: DisplacementModel | None,
 ) -> str:
-    """Digest of what a run learns from, is validated on and begins with."""
+    """Return the digest of training data, validation data and initial weights."""
     told = [
         [[(stream.name, len(stream)) for stream in part] for part in streams],
         [f"{weight:.6g}" for weight in weights],

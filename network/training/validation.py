@@ -1,4 +1,4 @@
-"""How well a network in training does on recordings kept from it."""
+"""Validation of a network in training on held-out recordings."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ from stario.sequences.windows import (
 log = logging.getLogger(__name__)
 
 VALIDATION_STRIDE = 20
-"""Samples from the start of a window to the next one's."""
+"""Samples between the starts of successive windows."""
 
 _STRIDES = (20, 40, 50, 100, 200)
-"""For networks that remember: so, a window follows one a second before, as in use."""
+"""Strides for recurrent networks: each window follows one from a second before, as in use."""
 
 _DENSE_SAMPLES = 200 * 60 * 15
-"""Of so many samples or less every window at that stride is asked."""
+"""For N times this many samples in total, windows are cut at N times that stride."""
 
 _AT_ONCE = 256
-"""Windows in a batch."""
+"""Windows per batch."""
 
 _STRETCHES = 48
-"""Of each kind of weak truth."""
+"""Number of stretches for each kind of weak truth."""
 
 
 class ValidationSet:
-    """Windows kept from training, cut anew each time: all at once would fill the memory.
+    """Held-out windows, cut again for each evaluation because all of them would fill the memory.
 
     Args:
-        streams: of recordings kept from training, with full truth.
-        device: of the networks that are asked.
-        legs: of recordings kept from training, with weak truth.
-        config: says how stretches of them are drawn.
-        chosen_by_legs: whether weights are chosen by the legs alone, where there are some.
-        remembers: whether the networks that are asked remember earlier windows.
+        streams: held-out streams with full truth.
+        device: device of the evaluated networks.
+        legs: held-out streams with weak truth.
+        config: recipe that determines how their stretches are drawn.
+        chosen_by_legs: whether legs alone select the weights, if there are any.
+        remembers: whether the evaluated networks are recurrent.
 
     Raises:
         InputError: no stream is longer than a second.
@@ -72,7 +72,7 @@ class ValidationSet:
     ) -> None:
         self.device, self._chosen_by_legs = device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
-        # Hours of them are cut sparsely: what matters is the kinds of motion.
+        # Hours of data are cut sparsely: what matters is the variety of motion.
         length = sum(len(stream) for stream in streams)
         self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
         if remembers:
@@ -87,7 +87,7 @@ class ValidationSet:
 
     @torch.inference_mode()
     def residuals(self, network: DisplacementNetwork) -> tuple[np.ndarray, np.ndarray]:
-        """Errors (M, 3) [m] and log sigmas (M, 3); the network is left in evaluation mode."""
+        """Return errors (M, 3) [m] and log sigmas (M, 3); leave the network in evaluation mode."""
         network.eval()
         errors, log_sigmas = [], []
         for stream in self.streams:
@@ -99,7 +99,7 @@ class ValidationSet:
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
 
     def variance_factors(self, known: KnownMotion) -> FloatArray:
-        """By which predictions for the windows (M,) of `residuals` are widened."""
+        """Return the factors (M,) on the predicted variance of the windows of `residuals`."""
         return np.concatenate(
             [
                 known.variance_factor(windows)
@@ -111,7 +111,7 @@ class ValidationSet:
     def _cut(
         self, stream: WorldStream, batch: int
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Windows (B, 6, 200) and displacements (B, 3) [m] in H, in order of time."""
+        """Yield windows (B, 6, 200) and displacements (B, 3) [m] in H, in order of time."""
         starts = window_starts(stream, self.stride)
         for first in range(0, len(starts), batch):
             windows, target = windows_at(stream, starts[first : first + batch])
@@ -122,11 +122,11 @@ class ValidationSet:
     def errors(
         self, network: DisplacementNetwork, residuals: np.ndarray | None = None
     ) -> dict[str, float]:
-        """Mean squared error by recording [m^2], and of legs by their kind [m^2/s].
+        """Return the mean squared error by recording [m^2] and by kind of legs [m^2/s].
 
         Args:
-            network: is left in evaluation mode.
-            residuals: (M, 3) [m], where they are known already.
+            network: network to evaluate; left in evaluation mode.
+            residuals: (M, 3) [m], if already known.
         """
         found = self.residuals(network)[0] if residuals is None else residuals
         squared = (found**2).sum(axis=1)
@@ -134,7 +134,7 @@ class ValidationSet:
         return means | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
 
     def deciding(self, errors: Mapping[str, float]) -> float:
-        """The one number of `errors` by which weights are chosen; 0 where there are none."""
+        """Return the mean of the `errors` that select the weights; 0 if there are none."""
         by_legs = [errors[kind] for kind in self.legs if kind in errors]
         chosen = by_legs if self._chosen_by_legs and by_legs else list(errors.values())
         return float(np.mean(chosen or [0.0]))
@@ -149,7 +149,7 @@ class ValidationSet:
 
 
 def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
-    """The first minute of each stream, and each so many minutes the next."""
+    """Return one minute out of every `every` of each stream, starting with the first."""
     minute = 60 * WINDOW_SAMPLES
     return [
         stream.part(first, first + minute)
@@ -159,33 +159,33 @@ def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
 
 
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
-    """The same stretches for every epoch, as the device gives them."""
+    """Return the same stretches for every epoch, without augmentation."""
     found = {}
     plain = replace(
         config.augmentation, mirrored=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
         accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
     )  # fmt: skip
     for kind, members, usual, _ in by_kind(legs, config):
-        # What is kept of a short walk is shorter than what is learned from.
+        # The held-out part of a short walk is shorter than a training stretch.
         longest = (max(len(stream) for stream in members) - 1) // WINDOW_SAMPLES
         seconds = min(usual, longest - longest % config.successive)
         if seconds < LEAST_SECONDS:
             continue
         try:
             sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
-        except InputError as error:  # an error of nothing would be the least of all
-            log.warning("validation goes without %s", error)
+        except InputError as error:  # the error 0 of no legs would be the smallest
+            log.warning("validation skips %s", error)
             continue
         found[kind] = sampler.batch(_STRETCHES)
     return found
 
 
 class _Answers:
-    """A network's answers to the windows of one stream, in order of time."""
+    """Predictions of a network for the windows of one stream, in order of time."""
 
     def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
-        # Windows that begin within one second belong to series of their own, as in use.
+        # Windows that begin within the same second belong to separate series, as in use.
         self.batch = max(1, WINDOW_SAMPLES // stride) if network.remembers else _AT_ONCE
         self._state = network.first_state(self.batch) if network.remembers else None
 

@@ -1,34 +1,36 @@
-"""Learning from weak truth: positions without attitude, and waypoints that were passed.
+"""Learning from weak ground truth: positions without attitude, and waypoints.
 
 A stretch of levelled IMU is cut into windows one second apart; the network's displacements d_k are
 chained along the gyroscope's yaw. A leg m lies between two instants of known position, D_m apart.
-With a_mk the seconds that window k and leg m have in common,
+With a_mk the time [s] shared by window k and leg m,
 
     D^_m = sum_k a_mk d_k,   psi = arg sum_m conj(D^_m) D_m / T_m,   r_m = exp(i psi) D^_m - D_m
 
-(horizontal vectors as complex numbers). psi takes out the unknown yaw between levelled frame and
-map; no gradient goes through it. The known positions are uncertain, so neighbouring legs err with
-opposite signs: r is whitened by C = A diag(s^2) A' + q T, in which A takes positions to legs, s is
-a position's deviation and q the variance that a second of displacement adds. A robust loss of the
-whitened residuals times q is then on the scale of the windows' squared error.
+(horizontal vectors as complex numbers). psi removes the unknown yaw between levelled frame and
+map; no gradient flows through it. The known positions are uncertain, so the errors of neighbouring
+legs have opposite signs: r is whitened by C = A diag(s^2) A' + q T, in which A maps positions to
+legs, s is a position's standard deviation, T the diagonal of the legs' durations T_m and q the
+variance that a second of displacement adds. A robust loss of the whitened residuals, times q, is
+then on the scale of the windows' squared error.
 
-psi leaves the direction of the displacements open: a network that learns so alone may walk
-backwards, and no track that is fitted in yaw shows it. The accelerometer closes it. The mean
-velocities of two seconds in a row differ by
+psi leaves the direction of the displacements undetermined: a network trained on legs alone may
+walk backwards, and no track that is fitted in yaw shows it. The accelerometer determines it. The
+mean velocities of two successive seconds differ by
 
     d_k+1 - d_k = integral of w(t) a(t) dt,   w rising from 0 to 1 and falling to 0 again,
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
-the error of levelling hardly change within a stretch and are taken out by the mean. Two such
-integrals in a row are a_k = d_k+2 - d_k. (From one second to the next a walk sways with its steps:
-a network learned from scratch with those told the sway rightly and still walked backwards.) The
-angle of c = mean_k conj(d_k+2 - d_k) a_k is how far a stretch is walked another way. It costs
+the levelling error hardly change within a stretch and are removed with the mean. Two successive
+integrals give a_k = d_k+2 - d_k. (From one second to the next, a walk sways with its steps: a
+network trained from scratch on those changes predicted the sway correctly and still walked
+backwards.) The angle of c = mean_k conj(d_k+2 - d_k) a_k is a stretch's direction error. Its loss
 
-    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+2 - d_k| rms |a_k| / 4:
+    2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+2 - d_k| rms |a_k| / 4,
 
-nothing below 60 degrees and where chance could make the angle, else a part of what turning the
-stretch would take from the mean of |d_k+2 - d_k - a_k|^2. With that whole mean for a loss a network
-that cannot tell every second shortens them all (Indoor Location left out: errors 10 % larger).
+is zero below 60 degrees and where chance could produce the angle; otherwise it is a part of what
+turning the stretch would take from the mean of |d_k+2 - d_k - a_k|^2. With that whole mean as the
+loss, a network that cannot predict every second shortens all of them (errors 10 % larger on Indoor
+Location, held out).
 """
 
 from __future__ import annotations
@@ -59,20 +61,20 @@ from stario.sequences.windows import (
 log = logging.getLogger(__name__)
 
 VARIANCE_RATE = 0.05
-"""Variance that a second of the network's displacements adds per axis, q [m^2/s]."""
+"""Variance per axis that a second of the network's displacements adds, q [m^2/s]."""
 
 VELOCITY_SIGMA = 0.1
-"""Deviation per axis of a change of velocity that the accelerometer tells, s_a [m/s]."""
+"""Standard deviation per axis of the accelerometer's changes of velocity, s_a [m/s]."""
 
 _COS_TURNED, _CHANCE = 0.5, 0.25
-"""Of the angle beyond which a stretch is walked another way than the accelerometer says, and what
-chance makes of the correlation of a dozen changes of velocity."""
+"""Cosine of the angle beyond which a stretch contradicts the accelerometer's direction, and the
+correlation that chance produces among a dozen changes of velocity."""
 
 _SECONDS = {"waypoints": "waypoint_seconds", "positions": "track_seconds"}
-"""The setting of a recipe that says how long stretches of each kind are."""
+"""Recipe setting for the length of stretches of each kind."""
 
 _HUBER = 3.0
-"""Whitened residuals beyond this many deviations count linearly."""
+"""Whitened residuals beyond this many standard deviations count linearly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,16 +82,16 @@ class LegBatch:
     """S stretches of K windows with up to M legs each.
 
     Attributes:
-        windows: (S, K, 6, 200) as the network is shown them.
-        R_NH: (S, K, 3, 3) takes the network's answers to N, the mirror image undone.
-        share: (S, M, K) seconds that a leg and a window have in common.
-        displacement: (S, M, 3) of the legs [m]; zero where there is none.
-        whitening: (S, M, M) takes residuals to ones of unit variance; zero where there is no leg.
-        variance: (S, M) of the legs by their ends alone [m^2].
-        seconds: (S, M) of the legs, 1 where there is none.
+        windows: (S, K, 6, 200) as presented to the network.
+        R_NH: (S, K, 3, 3) maps the network's predictions to N and undoes the mirroring.
+        share: (S, M, K) time shared by a leg and a window [s].
+        displacement: (S, M, 3) of the legs [m]; zero where there is no leg.
+        whitening: (S, M, M) maps residuals to unit variance; zero where there is no leg.
+        variance: (S, M) of the legs, due to their ends alone [m^2].
+        seconds: (S, M) duration of the legs [s]; 1 where there is no leg.
         known: (S, M) whether there is a leg.
-        velocity_change: (S, K - 2, 2) of the mean velocity in N from each second to the next but
-            one, by the accelerometer [m/s].
+        velocity_change: (S, K - 2, 2) change of the mean velocity in N over two seconds, by the
+            accelerometer, as returned by `velocity_change` [m/s].
     """
 
     windows: Tensor
@@ -103,24 +105,24 @@ class LegBatch:
     velocity_change: Tensor
 
     def to(self, device: torch.device) -> LegBatch:
-        """The same on another device."""
+        """Return the batch on another device."""
         return LegBatch(**{name: value.to(device) for name, value in vars(self).items()})
 
     def shared(self, among: Workers) -> LegBatch:
-        """One process's stretches; all of them where they cannot be shared out evenly."""
+        """Return this process's stretches; all of them if they cannot be divided evenly."""
         if len(self.known) % among.count:
             return self
         return LegBatch(**{name: among.share(value) for name, value in vars(self).items()})
 
 
 class LegSampler:
-    """Draws stretches of consecutive windows with two legs at least.
+    """Sampler of stretches of consecutive windows with two or more legs.
 
     Args:
-        streams: of one kind, at least one; those without two legs within `seconds` are left out.
-        seconds: windows in a row, K.
-        augmentation: how windows are shown.
-        generator: of all randomness; shared with the sampler of windows with full truth.
+        streams: one or more, of one kind; those without two legs within `seconds` are skipped.
+        seconds: number of consecutive windows, K.
+        augmentation: how windows are varied.
+        generator: generator of all draws; shared with the sampler of windows with full truth.
 
     Raises:
         InputError: no stream has two legs within `seconds`.
@@ -140,7 +142,7 @@ class LegSampler:
             raise _too_far_apart(streams, seconds)
         if not all(found):
             log.warning(
-                "%s: nothing is drawn from %d of %d stretches, which hold no two legs within %d s",
+                "%s: skipping %d of %d stretches, which hold no two legs within %d s",
                 streams[0].kind, sum(not runs for runs in found), len(found), seconds,
             )  # fmt: skip
         self._runs = [
@@ -153,7 +155,7 @@ class LegSampler:
         self._generator = generator
 
     def batch(self, size: int) -> LegBatch:
-        """Stretches that hold two legs each."""
+        """Draw stretches that hold two or more legs each."""
         drawn = [self._draw() for _ in range(size)]
         imu_N = torch.from_numpy(np.stack([s.imu_N[o : o + self._length] for s, o in drawn]))
         facing_N = torch.from_numpy(
@@ -176,9 +178,9 @@ class LegSampler:
 
 
 def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
-    """Samples at which stretches with two legs may begin: of each run of them first and count."""
+    """Return the runs of samples, first and count, where a stretch with two legs may begin."""
     begin = np.arange(len(stream) - seconds * WINDOW_SAMPLES) / WINDOW_RATE
-    # As `_inside` counts them: legs follow one another.
+    # Counted as in `_inside`: legs are in order of time.
     over = np.searchsorted(stream.stop, begin + seconds, side="right")
     enough = over - np.searchsorted(stream.start, begin) >= 2
     edges = np.flatnonzero(np.diff(enough, prepend=False, append=False)).reshape(-1, 2)
@@ -191,20 +193,20 @@ def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     longest = max(len(stream) for stream in streams) / WINDOW_RATE
     return InputError(
         kind,
-        f"one every {apart:.1f} s in stretches of at most {longest:.0f} s",
+        f"one every {apart:.1f} s in stretches of up to {longest:.0f} s",
         f"two legs within {seconds} s",
-        f"set `{_SECONDS[kind]}` in the recipe to {math.ceil(2.0 * apart) + 1} or so",
+        f"set `{_SECONDS[kind]}` in the recipe to about {math.ceil(2.0 * apart) + 1}",
     )
 
 
 def _inside(stream: LegStream, offset: int, seconds: int) -> NDArray[np.int64]:
-    """Legs that lie within a stretch of the stream."""
+    """Return the legs that lie within a stretch of the stream."""
     begin = offset / WINDOW_RATE
     return np.flatnonzero((stream.start >= begin) & (stream.stop <= begin + seconds))
 
 
 def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:
-    """The tensors of a `LegBatch` that tell of the legs."""
+    """Return the tensors of a `LegBatch` that describe the legs."""
     rows = [_inside(stream, offset, seconds) for stream, offset in drawn]
     size, most = len(drawn), max(1, *(len(row) for row in rows))
     share = np.zeros((size, most, seconds))
@@ -231,11 +233,11 @@ def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor
 def leg_samplers(
     config: TrainingConfig, streams: Sequence[LegStream], beside: WindowSampler
 ) -> list[tuple[LegSampler, int]]:
-    """A sampler for each kind of weak truth that there is, and how many stretches a step draws.
+    """Return a sampler and the number of stretches per step for each kind of weak truth present.
 
     Raises:
         InputError: a kind has no stretch that is long enough for two legs.
-        ConfigError: a stretch is no whole number of the rows of windows that a step draws.
+        ConfigError: the windows in a stretch are not a multiple of `config.successive`.
     """
     kinds = by_kind(streams, config)
     for kind, _, seconds, _ in kinds:
@@ -251,7 +253,7 @@ def leg_samplers(
 def by_kind(
     streams: Sequence[LegStream], config: TrainingConfig
 ) -> list[tuple[str, list[LegStream], int, int]]:
-    """Each kind that there is: its name, its streams, windows in a stretch, stretches in a step."""
+    """Return name, streams, windows per stretch and stretches per step of each kind present."""
     kinds = (
         ("waypoints", config.waypoint_seconds, config.waypoint_stretches),
         ("positions", config.track_seconds, config.track_stretches),
@@ -264,12 +266,12 @@ def by_kind(
 
 
 def ends_covariance(start: FloatArray, stop: FloatArray, sigma: FloatArray) -> FloatArray:
-    """A diag(s^2) A' (M, M) [m^2]: legs that share an end err with opposite signs there.
+    """Return A diag(s^2) A' (M, M) [m^2]: an end shared by two legs has opposite signs in them.
 
     Args:
-        start: (M,) of the legs, in order [s].
-        stop: (M,) of them [s].
-        sigma: (M, 2) of their ends [m].
+        start: (M,) start times of the legs, in order [s].
+        stop: (M,) stop times of the legs [s].
+        sigma: (M, 2) standard deviations of their ends [m].
     """
     C = np.diag((sigma**2).sum(axis=1))
     joined = np.flatnonzero(np.abs(stop[:-1] - start[1:]) < 1e-6)
@@ -280,13 +282,13 @@ def ends_covariance(start: FloatArray, stop: FloatArray, sigma: FloatArray) -> F
 
 
 def velocity_change(accel_N: Tensor) -> Tensor:
-    """How the mean velocity changes from one second to the next but one [m/s].
+    """Return the change of the mean velocity from each second to the one after the next [m/s].
 
     Args:
-        accel_N: (S, K, 200, 2) horizontal acceleration in N through K seconds [m/s^2].
+        accel_N: (S, K, 200, 2) horizontal acceleration in N over K seconds [m/s^2].
 
     Returns:
-        (S, K - 2, 2), less its mean over the stretch.
+        (S, K - 2, 2), minus the mean over the stretch.
     """
     weights = torch.from_numpy(VELOCITY_WEIGHTS).float()
     before = torch.einsum("skic,i->skc", accel_N[:, :-1], weights)
@@ -297,7 +299,7 @@ def velocity_change(accel_N: Tensor) -> Tensor:
 
 
 def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
-    """Residuals (S, M, 3) [m] of displacements (S, K, 3) in N, the map's yaw fitted."""
+    """Return residuals (S, M, 3) [m] of displacements (S, K, 3) in N after a fit of the yaw."""
     told = torch.einsum("smk,skc->smc", legs.share, displacement_N)
     a, b = told.detach(), legs.displacement
     weight = legs.known / legs.seconds
@@ -316,11 +318,11 @@ def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
 
 
 def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tuple[Tensor, Tensor]:
-    """Of answers (S, K, 3) [m] and log sigmas (S, K, 3), both as they were shown.
+    """Return the loss of predictions (S, K, 3) [m] and log sigmas (S, K, 3) in the windows' frames.
 
     Returns:
-        the robust whitened loss with the likelihood of the sigmas beside it [m^2], as of windows
-        with full truth, and the mean of |r|^2 / T [m^2/s], horizontal.
+        Robust whitened loss plus `direction_loss` and the weighted likelihood of the sigmas [m^2],
+        as for windows with full truth; and the mean of |r|^2 / T [m^2/s], horizontal.
     """
     displacement_N = (legs.R_NH @ displacement_H[..., None])[..., 0]
     residual = leg_residuals(displacement_N, legs)
@@ -337,11 +339,11 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
 
 
 def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
-    """What displacements (S, K, 3) in N cost that go another way than the accelerometer [m^2]."""
+    """Return the loss of displacements (S, K, 3) in N that contradict the accelerometer [m^2]."""
     d, a = displacement_N[:, 2:, :2] - displacement_N[:, :-2, :2], legs.velocity_change
     real = (d * a).sum((1, 2))
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
-    size = (real**2 + imaginary**2 + 1e-12).sqrt()  # has a gradient where nothing moves
+    size = (real**2 + imaginary**2 + 1e-12).sqrt()  # keeps the gradient finite where nothing moves
     chance = _CHANCE * d.detach().norm(dim=(1, 2)) * a.norm(dim=(1, 2))
     away = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
     loss: Tensor = VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
@@ -349,5 +351,5 @@ def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
 
 
 def _robust(white: Tensor) -> Tensor:
-    """Squares of whitened residuals, growing linearly beyond three deviations."""
+    """Return squared whitened residuals, linear beyond three standard deviations."""
     return torch.where(white < _HUBER, white**2, _HUBER * (2.0 * white - _HUBER))

@@ -1,8 +1,8 @@
-"""Lists of recordings in the package: names below a data folder, with the group of each.
+"""Packaged lists of recordings: names below a data folder, each with its group.
 
-`test` and `validation` are of the development recordings; `training` are the 36 minutes of the
-first weights; `holdout` are the people, devices and places that judge weights trained on the rest
-of `all`; `open` are those of `all` whose licence allows any use.
+`test` and `validation` list development recordings; `training` the 36 minutes of the first
+weights; `holdout` the people, devices and places used to evaluate weights trained on the rest of
+`all`; `open` those of `all` whose licence allows any use.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ NAMES = ("test", "validation", "training", "holdout", "all", "open")
 
 
 def listed(name: str, data: Path) -> list[Listed]:
-    """The recordings of a list of the package, or of one's own.
+    """Return the recordings of a packaged list or of a list file.
 
     Args:
-        name: one of `NAMES`, or a list file: `name, group` on each line.
-        data: folder that the names count from.
+        name: one of `NAMES`, or a list file with `name, group` on each line.
+        data: folder that the names are relative to.
 
     Raises:
-        InputError: there is no such list, or one of its recordings is not there.
+        InputError: there is no such list, or one of its recordings is missing.
     """
     if Path(name).is_file():
         return read_list(Path(name), data)
@@ -35,5 +35,5 @@ def listed(name: str, data: Path) -> list[Listed]:
 
 
 def split_paths(data: Path, split: str) -> list[Path]:
-    """Paths of the recordings of a list of the package; arguments and errors as of `listed`."""
+    """Return the paths of the recordings of a list; arguments and errors as for `listed`."""
     return [one.path for one in listed(split, data)]

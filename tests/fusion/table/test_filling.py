@@ -214,7 +214,7 @@ def test_the_command_leaves_tables_and_figures(
     text = (out / "table.md").read_text()
     assert text in done.output
     for words in (
-        "steps of the training 1, windows in each 6",
+        "1 training steps of 6 windows",
         "| R-ResNet |",
         "`pdr`",
         "4.165, 3.724",

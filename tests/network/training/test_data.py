@@ -95,9 +95,9 @@ def test_shares_are_of_the_windows_that_can_be_drawn() -> None:
 def test_shares_that_leave_nothing_are_refused() -> None:
     recorded = of([moving("x", 1.0)])
     for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
-        with pytest.raises(ConfigError, match="shares: found 0 for all"):
+        with pytest.raises(ConfigError, match="shares: found 0 for every"):
             gather([] if generated else recorded, generated, given)
-    with pytest.raises(ConfigError, match=r"shares: found 1\.2 of the recordings"):
+    with pytest.raises(ConfigError, match=r"shares: found a sum of 1\.2"):
         TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
