@@ -1,4 +1,4 @@
-"""`stario check backends`: filter against graph."""
+"""`stario check backends`: compare the filter with the graph."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def backends(
     estimating: Estimating,
     paths: PathsArgument = None,
     walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each in s.")] = 120.0,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
     data: Annotated[
-        Path | None, typer.Option(help="Folder of the development recordings, instead of walks.")
+        Path | None, typer.Option(help="Folder of the development recordings to use instead.")
     ] = None,
-    split: Annotated[str, typer.Option(help="Which of them.")] = "validation",
+    split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
     as_json: JsonOption = False,
 ) -> None:
     """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
 
-    Without PATH or --data: on simulated walks, measured under white noise of a known size.
+    Without PATH or --data, use simulated walks, measured with white noise of known magnitude.
     """
     from stario.fusion.evaluation.checks.backends import (
         score_recording,

@@ -9,7 +9,7 @@ from stario.fusion.commands.options import JsonOption
 
 
 def benchmark(as_json: JsonOption = False) -> None:
-    """Speed on this machine: filter against dense algebra, network, whole run."""
+    """Measure speed on this machine: filter against dense algebra, network, whole run."""
     from stario.fusion.evaluation.checks.speed import speed_report, speed_table
     from stario.network.model import load_model
 

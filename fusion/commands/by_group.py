@@ -1,4 +1,4 @@
-"""`stario check fusion`, `fixes` and `gaps`: what tracks are worth, by groups of recordings."""
+"""`stario check fusion`, `fixes` and `gaps`: quality of tracks by group of recordings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
 
 RecordingsArgument = Annotated[
-    list[Path], typer.Argument(help="Recordings, folders, archives or lists.")
+    list[Path], typer.Argument(help="Recordings, folders, archives or list files.")
 ]
 
 
@@ -38,10 +38,10 @@ def fusion(
     reading: Reading,
     estimating: Estimating,
     by: ByOption = "set",
-    graph: Annotated[bool, typer.Option("--graph", help="The graph as well; slower.")] = False,
+    graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Hold the filter's error against its network's, with NIS and honesty of the yaw, by group."""
+    """Compare the filter's error with its network's by group, with NIS and consistency of yaw."""
     from stario.fusion.evaluation.checks.worth import worth_of, worth_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
@@ -60,13 +60,13 @@ def fixes(
     paths: RecordingsArgument,
     reading: Reading,
     estimating: Estimating,
-    every: Annotated[float, typer.Option(min=0.1, help="Seconds between two fixes.")] = 5.0,
-    sigma: Annotated[float, typer.Option(min=0.001, help="Their error per axis \\[m].")] = 0.3,
+    every: Annotated[float, typer.Option(min=0.1, help="Interval between fixes in s.")] = 5.0,
+    sigma: Annotated[float, typer.Option(min=0.001, help="Fix sigma per axis \\[m].")] = 0.3,
     backend: BackendOption = "ekf",
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
-    """Give true positions now and then, and see whether position and yaw are as sure as said."""
+    """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.evaluation.checks.fixed import fixed_table, fixed_track
 
     _judge_each(
@@ -87,7 +87,7 @@ def gaps(
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
-    """Take 0.1 s out at six instants, then 5 % of the samples, and see how far the end moves."""
+    """Remove 0.1 s at six instants, then 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.missing import moved_ends, moved_table
 
     _judge_each("check gaps", (reading, paths, estimating, by, as_json), moved_ends, moved_table)
@@ -99,7 +99,7 @@ def _judge_each(
     judge: Judge,
     table: Callable[[Sequence[Any]], str],
 ) -> None:
-    """Judge each recording, print the table or JSON, and leave with what could not be used."""
+    """Evaluate each recording, print a table or JSON, and exit with 1 if any was skipped."""
     from stario.fusion.evaluation.judging.judge import check_by, labels
 
     reading, paths, estimating, by, as_json = given

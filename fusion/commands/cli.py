@@ -1,7 +1,7 @@
-"""The `stario` command: arguments in, library calls, results out.
+"""Command-line interface: the `stario` command.
 
 Heavy packages are imported inside the commands, so that `stario --help` is instant. Exit status: 0
-done, 1 a known error in one line on stderr, 2 wrong usage; a bug gives a traceback.
+success, 1 known error (one line on stderr), 2 wrong usage; a bug gives a traceback.
 """
 
 from __future__ import annotations

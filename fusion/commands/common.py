@@ -1,4 +1,4 @@
-"""What the commands share: the way through recordings, progress, tables and JSON."""
+"""Shared parts of the commands: iteration over recordings, progress, tables and JSON."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def collected(
     skipped: list[Skipped],
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Result]:
-    """What came of recordings, in order; those that could not be used join `skipped`.
+    """Return the results in order; append recordings that could not be used to `skipped`.
 
     Args:
-        outcomes: as `stario.sequences.datasets.batch.each` yields them.
-        skipped: takes them up.
-        progress: called with the number of recordings that are done.
+        outcomes: results and failures from `stario.sequences.datasets.batch.each`.
+        skipped: list to extend.
+        progress: called with the number of recordings finished so far.
     """
     from stario.sequences.datasets.batch import Skipped
 
@@ -52,13 +52,13 @@ def result_of_each(
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """What `work` makes of each recording, behind a progress bar, and what could not be used.
+    """Apply `work` to each recording with a progress bar; return results and failures.
 
     Args:
-        title: of the bar.
-        reading: how recordings are read.
-        paths: of recordings, folders or lists.
-        work: given a recording's path and the recording.
+        title: label of the progress bar.
+        reading: options for reading recordings.
+        paths: recordings, folders or list files.
+        work: function of a recording's path and the recording.
     """
     from stario.sequences.datasets.batch import each
 
@@ -81,15 +81,15 @@ def one_by_one(
     as_json: bool,
     single: str = "",
 ) -> None:
-    """Let `work` make a record of each recording, and a folder where it leaves its files.
+    """Apply `work` to each recording, giving each its own folder for files.
 
     Args:
-        reading: how recordings are read.
-        paths: of recordings, folders or lists.
-        out: the folder of a single recording, or of the folders of many; None for `runs`.
-        work: given a recording and its folder; more than one recording have distinct names.
-        as_json: print the records.
-        single: an option that was given and goes with one recording alone.
+        reading: options for reading recordings.
+        paths: recordings, folders or list files.
+        out: folder of a single recording, or parent folder of several; None for `runs`/NAME.
+        work: function of a recording and its folder, distinct for each; returns its record.
+        as_json: whether to print the records.
+        single: name of an option in use that allows only one recording; empty if none.
     """
     from stario.fusion.evaluation.many import distinct_name
     from stario.sequences.datasets.batch import each
@@ -111,7 +111,7 @@ def one_by_one(
 
 
 def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
-    """Name on stderr what could not be used, and leave with 1 if there was any."""
+    """List what was skipped on stderr and exit with status 1 if there was any."""
     for one in skipped:
         where = "" if one.item in one.reason else f"{one.item}: "
         typer.echo(f"stario: skipped: {where}{one.reason}", err=True)
@@ -121,7 +121,7 @@ def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
 
 @contextmanager
 def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[Progress]:
-    """A bar on stderr, driven by the share of the work done; none where nobody watches."""
+    """Show a progress bar on stderr, driven by the completed share; hidden without a terminal."""
     from tqdm import tqdm
 
     hidden = None if shown else True
@@ -134,11 +134,11 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
 
 
 _WHOLE = 0.98
-"""A track of which the truth covers less is said to be compared in part."""
+"""Share of a track below which the coverage by ground truth is reported as partial."""
 
 
 _EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
-"""Figures whose meaning stands below a table."""
+"""Metrics explained below a table."""
 
 
 def track_table(
@@ -147,13 +147,13 @@ def track_table(
     truth: Trajectory | None,
     words: dict[str, str],
 ) -> str:
-    """A row of figures for each track, and what they mean where there is truth.
+    """Format a table with a row of metrics per track, and their meaning if there is truth.
 
     Args:
-        metrics: by track.
-        time: (N,) of a track [s].
-        truth: None where there is none.
-        words: what the figures mean.
+        metrics: metrics by track.
+        time: (N,) times of a track [s].
+        truth: ground truth, or None.
+        words: meaning of each metric.
     """
     columns = {
         "ate_m": "ATE [m]",
@@ -173,12 +173,12 @@ def track_table(
     lines += [f"{key}: {words[key]}." for key in _EXPLAINED]
     covered = float(truth.covers(time).mean())
     if covered < _WHOLE:
-        lines.append(f"The truth covers {covered:.0%} of the track: figures are of that part.")
+        lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
     return "\n".join(lines)
 
 
 def print_json(content: object) -> None:
-    """Print figures on stdout for another program."""
+    """Print JSON on stdout."""
     from stario.sequences.files import json_text
 
     typer.echo(json_text(content), nl=False)

@@ -1,4 +1,4 @@
-"""`stario compare`: all tracks of recordings side by side."""
+"""`stario compare`: all tracks of each recording side by side."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def compare(
     report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare tracks: inertial alone, network alone, EKF, graph. Without PATH: a simulated walk."""
+    """Compare tracks: inertial only, network only, EKF, graph. Without PATH: a simulated walk."""
     from stario.fusion.evaluation.compare import compare as compare_tracks
     from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.many import compare_recordings
@@ -60,7 +60,7 @@ def compare(
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
         if not paths:
-            typer.echo("demonstration: a simulated walk that training never saw", err=True)
+            typer.echo("demonstration: a simulated walk not used in training", err=True)
             model = estimating.network()
             made = compare_tracks(model, demonstration(), settings, progress, known)
             comparisons.append(made)

@@ -1,4 +1,4 @@
-"""`stario check consistency`: does the filter know how wrong it is?"""
+"""`stario check consistency`: are the filter's errors consistent with its covariance?"""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from stario.fusion.commands.options import JsonOption
 def consistency(
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="TOML or JSON file; else the defaults."),
+        typer.Option("--config", help="TOML or JSON file with settings."),
     ] = None,
-    yaw: Annotated[float, typer.Option(min=0.0, help="Sigma of the first yaw in deg.")] = 10.0,
+    yaw: Annotated[float, typer.Option(min=0.0, help="Sigma of the initial yaw in deg.")] = 10.0,
     runs: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=2.0, help="Length of each in s.")] = 300.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first run.")] = 0,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Duration of each walk in s.")] = 300.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first walk.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Monte Carlo on simulated walks: NEES, NIS and yaw against what an honest filter shows."""
+    """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
     from stario.fusion.config import NavigatorConfig, read_config
     from stario.fusion.evaluation.checks.consistency import consistency as monte_carlo
 

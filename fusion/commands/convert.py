@@ -1,4 +1,4 @@
-"""`stario convert`: readable recordings into a CSV, the EuRoC layout or an archive of them."""
+"""`stario convert`: recordings to a CSV, the EuRoC layout or an archive."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ def convert(
         list[Path],
         typer.Argument(
             metavar="IN... OUT",
-            help="Recordings, folders or lists of some, and the file or new folder to write. "
-            "Into an archive (.h5) go any number, into others one.",
+            help="Recordings, folders or list files, then the file or new folder to write. "
+            "An archive (.h5) takes any number of recordings, the other layouts one.",
         ),
     ],
     reading: Reading,
     to: Annotated[
         str | None,
-        typer.Option(help="csv, euroc or archive; by default by OUT's end, .csv, none or .h5."),
+        typer.Option(help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a file that is there already.")
+        bool, typer.Option("--overwrite", help="Replace an existing file.")
     ] = False,
 ) -> None:
-    """Convert recordings to a CSV, to the EuRoC layout or to an archive, without loss."""
+    """Convert recordings without loss to a CSV, the EuRoC layout or an archive."""
     from stario.sequences.datasets.convert import convert as convert_sequence
     from stario.sequences.datasets.convert import convert_all, layout_of
 
     if len(paths) < 2:
-        raise InputError("convert", str(paths[0]), "IN... OUT", "name what to write as well")
+        raise InputError("convert", str(paths[0]), "IN... OUT", "also name the output")
     *sources, target = paths
     layout = layout_of(target, to)
     files, skipped = reading.recordings(sources)
@@ -59,29 +59,29 @@ def convert(
 
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
-    """Refuse to write over what is there, and over what is read in any case."""
+    """Refuse to overwrite an input, or without `overwrite` any existing file."""
     from stario.sequences.readers.archive import split_name
 
     read = {split_name(source)[0] for source in sources}
     if target.exists() and any(file.exists() and target.samefile(file) for file in read):
-        raise InputError("OUT", f"{target}, which is read as well", "another file")
+        raise InputError("OUT", f"{target}, which is also an input", "another file")
     if target.is_file() and not overwrite:
         raise InputError(
-            "OUT", f"{target}, which is there already", "a new file", "or pass --overwrite"
+            "OUT", f"{target}, which already exists", "a new file", "or pass --overwrite"
         )
 
 
 def _only(files: list[Path], skipped: list[Skipped]) -> Path:
-    """The one recording that was found."""
+    """Return the only recording found."""
     leave_with_skipped(skipped)
     if len(files) != 1:
-        expected = "one recording, or an archive (.h5) to write"
+        expected = "one recording, or an archive (.h5) as OUT"
         raise InputError("convert", f"{len(files)} recordings", expected)
     return files[0]
 
 
 def _read(reading: Reading, files: list[Path], skipped: list[Skipped]) -> Iterator[ImuSequence]:
-    """One recording after the other; what cannot be read or judged is told at the end."""
+    """Yield one recording after the other; add those that cannot be converted to `skipped`."""
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.convert import check_content
 

@@ -1,4 +1,4 @@
-"""`stario evaluate`: accuracy over many recordings with truth."""
+"""`stario evaluate`: accuracy over many recordings with ground truth."""
 
 from __future__ import annotations
 
@@ -37,48 +37,49 @@ def evaluate(
     split: Annotated[
         str,
         typer.Option(
-            help="Which: test, validation, training, holdout, all, or a list file (name, group)."
+            help="With --data: test, validation, training, holdout, all, open, or a list file "
+            "with lines of name, group."
         ),
     ] = "test",
     by: Annotated[
         str | None,
         typer.Option(
             "--by",
-            help="Judge the network alone by groups: set, group, person, device, place, carry. "
-            "Truth may be poses, positions or waypoints.",
+            help="Evaluate the network alone by set, group, person, device, place or carry. "
+            "Ground truth may be poses, positions or waypoints.",
         ),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            help="With --by: weights to compare with, or pdr (steps without a network), by paired "
-            "ratios with 95 % intervals. "
-            "{group} in the name of weights is each recording's group: leave one group out."
+            help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
+            "network), by paired error ratios with 95 % intervals. {group} in a weights name "
+            "stands for each recording's group: leave-one-group-out."
         ),
     ] = None,
     ekf: Annotated[
-        bool, typer.Option("--ekf", help="With --by: the mean NIS of the EKF as well; slow.")
+        bool, typer.Option("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
     ] = False,
     models: Annotated[
         str | None,
         typer.Option(
             "--models",
-            help="Networks side by side: names of `stario check models`, default, or weights "
-            "files, with commas between; several weights of one network are averaged.",
+            help="Networks to compare, separated by commas: names from `stario check models`, "
+            "default, or weights files; several weights of one network are averaged.",
         ),
     ] = None,
     runs: Annotated[
-        Path, typer.Option(help="Folder of training runs, where named networks are found.")
+        Path, typer.Option(help="Folder of training runs in which named networks are found.")
     ] = Path("runs"),
     convention: Annotated[
         str | None,
-        typer.Option(help="How --models averages position errors: rms (default), ronin, mean."),
+        typer.Option(help="How --models averages position errors: rms (default), ronin or mean."),
     ] = None,
     jobs: JobsOption = 1,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Accuracy and consistency over many recordings with truth, medians and means."""
+    """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import scores_of, summary, summary_table
@@ -92,7 +93,7 @@ def evaluate(
         leave_with_skipped(skipped)
         return
     if against is not None:
-        raise InputError("--against", f"{against} without --by", "a grouping", "--by set")
+        raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [one.path for one in listed]
     if models is not None:
@@ -103,7 +104,7 @@ def evaluate(
         return
     if convention is not None:
         raise InputError(
-            "--convention", f"{convention} without --models", "rms", "name networks by --models"
+            "--convention", f"{convention} without --models", "networks", "name them with --models"
         )
     settings, network = estimating.settings(), estimating.network_for(jobs)
     recordings = []
@@ -129,7 +130,7 @@ def evaluate(
 def _listed(
     reading: Reading, paths: list[Path], data: Path | None, split: str
 ) -> tuple[list[Listed], list[Skipped]]:
-    """Recordings that are named, or else those of a split, and what leads to none."""
+    """Return the named recordings, or else those of the split, and the skipped paths."""
     from stario.network.training.splits import listed
     from stario.sequences.datasets.splits import Listed
 
@@ -137,10 +138,10 @@ def _listed(
         files, skipped = reading.recordings(paths)
         return [Listed(path, "") for path in files], skipped
     if data is None:
-        raise InputError("PATH", "none", "recordings", "name some, or the data of a split: --data")
+        raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
     if reading.where:
         raise InputError(
-            "--where", "with a split", "with PATH", "name the archive instead of --data"
+            "--where", "use with --data", "use with PATH", "name the archive instead of --data"
         )
     return listed(split, data), []
 
@@ -156,7 +157,7 @@ def _networks(
     out: Path | None,
     as_json: bool,
 ) -> list[Skipped]:
-    """The table of networks; returns the recordings that could not be used."""
+    """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
     from stario.fusion.evaluation.results import make_folder
     from stario.fusion.evaluation.tables import (

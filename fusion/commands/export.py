@@ -1,4 +1,4 @@
-"""`stario export`: a network for other runtimes."""
+"""`stario export`: export a network for other runtimes."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ def export(
         str,
         typer.Option(
             "--model",
-            help="Network: a name of `stario check models`, default, or weights with their card.",
+            help="Network: a name from `stario check models`, default, or weights with their card.",
         ),
     ] = "default",
     runs: Annotated[
-        Path, typer.Option(help="Folder of training runs, where named networks are found.")
+        Path, typer.Option(help="Folder of training runs in which named networks are found.")
     ] = Path("runs"),
     out: Annotated[
-        Path | None, typer.Option("--out", help="File to write; else the network's name here.")
+        Path | None, typer.Option("--out", help="File to write. Default: ./NETWORK.onnx")
     ] = None,
 ) -> None:
-    """Export a network with its calibration; `--model FILE.onnx` then runs it anywhere."""
+    """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""
     from stario.network.model import load_model, weights_named
     from stario.network.runtime.export import export_onnx
 
     loaded = load_model(weights_named(model, runs))
     path = out or Path(f"{loaded.name}.onnx")
     if path.suffix != ".onnx":
-        raise InputError("--out", str(path), "a name that ends in .onnx")
+        raise InputError("--out", str(path), "a name ending in .onnx")
     export_onnx(loaded, path)
     typer.echo(str(path))

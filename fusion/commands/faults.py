@@ -1,4 +1,4 @@
-"""`stario check faults`: what faults in a recording cost."""
+"""`stario check faults`: errors that faults in a recording cause."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ def faults(
     reading: Reading,
     estimating: Estimating,
     path: Annotated[
-        Path | None, typer.Argument(help="A recording with truth; else a walk, its sensor known.")
+        Path | None,
+        typer.Argument(help="Recording with truth. Default: a walk with a known sensor."),
     ] = None,
     network: Annotated[
         bool,
         typer.Option(
             "--network",
-            help="Let the network measure; else the true displacements under white noise do.",
+            help="Use the network's displacements instead of true ones with white noise.",
         ),
     ] = False,
     seed: Annotated[
-        int, typer.Option(min=0, help="Of the faults' draws, and of the walk where none is given.")
+        int, typer.Option(min=0, help="Seed of the faults and of the simulated walk, if any.")
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Put faults into a recording, one by one, and print what each costs and what is reported."""
+    """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
 
     settings = estimating.settings()

@@ -1,4 +1,4 @@
-"""`stario inspect`: what a recording is like and what is wrong with it."""
+"""`stario inspect`: properties and problems of a recording."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 @grouped
 def inspect(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or lists of some.")
+        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
     ],
     reading: Reading,
     model: Annotated[
-        str, typer.Option("--model", help="Weights whose training the motion is compared with.")
+        str, typer.Option("--model", help="Compare the motion with these weights' training.")
     ] = "default",
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Look recordings over: timing, noise, units, signs, magnetometer, truth, kind of motion."""
+    """Inspect recordings: timing, noise, units, signs, magnetometer, truth, kind of motion."""
     from stario.network.model import load_model
 
     work = partial(_inspect, network=load_model(model), told=not as_json)
@@ -67,7 +67,7 @@ def _inspect(
 
 
 def _motion(sequence: ImuSequence, network: DisplacementModel) -> Familiarity | None:
-    """How the recording moves; None where it cannot be told, of which the problems say why."""
+    """Return the kind of motion; None if undetermined, for which the problems give the reason."""
     from stario.fusion.evaluation.familiarity import familiarity
     from stario.sequences.errors import InputError
 

@@ -1,4 +1,4 @@
-"""`stario evaluate --by`: networks alone, judged by groups of recordings."""
+"""`stario evaluate --by`: networks alone, evaluated by group of recordings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def judge_by_groups(
     out: Path | None,
     as_json: bool,
 ) -> list[Skipped]:
-    """The table of groups; returns the recordings that could not be used."""
+    """Write and print the table of groups; return the recordings that were skipped."""
     from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
     from stario.fusion.evaluation.judging.prepared import prepared_recordings
     from stario.fusion.evaluation.judging.table import (
@@ -46,7 +46,7 @@ def judge_by_groups(
     models = {name: partial(_for_group, name) for name in names}
     for name in names:
         if _GROUP not in name:
-            _for_group(name, "")  # what cannot be loaded is told before anything is prepared
+            _for_group(name, "")  # fail on unloadable weights before preparing anything
     if out is not None:
         make_folder(out)
     paths = [one.path for one in recordings]
@@ -86,5 +86,5 @@ def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
 
 
 def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
-    """Weights by name; `{group}` in it is the group, blanks as underscores."""
+    """Load weights by name; `{group}` in it stands for the group, with underscores for blanks."""
     return _loaded(name.replace(_GROUP, group.replace(" ", "_")))

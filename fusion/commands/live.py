@@ -1,4 +1,4 @@
-"""`stario live`: tracks that grow while devices send."""
+"""`stario live`: live tracks of devices that send samples."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from stario.fusion.commands.options import Estimating, grouped
 @grouped
 def live(
     estimating: Estimating,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page and the pushes.")] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; 0.0.0.0 lets phones in, with a token.")
+        str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
     ] = "127.0.0.1",
     lines_port: Annotated[
         int | None,
         typer.Option(
-            min=0, max=65535, help="For lines of JSON over TCP and UDP; port + 1 if not given."
+            min=0, max=65535, help="Port for lines of JSON over TCP and UDP. Default: --port + 1."
         ),
     ] = None,
     phyphox: Annotated[
-        list[str] | None, typer.Option(help="Address of a phone with phyphox; may be repeated.")
+        list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for the recordings.")] = Path(
         "runs/live"
     ),
 ) -> None:
-    """Watch tracks grow: takes Sensor Logger, phyphox and lines of JSON; serves one page."""
+    """Show live tracks on a web page, from Sensor Logger, phyphox or lines of JSON."""
     from stario.sequences.readers.checked import optional_package
 
     for package in ("starlette", "uvicorn", "plotly"):

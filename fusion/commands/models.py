@@ -1,4 +1,4 @@
-"""`stario check models`: what each network costs."""
+"""`stario check models`: cost of each network."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from stario.fusion.commands.options import JsonOption
 
 def models(
     names: Annotated[
-        list[str] | None, typer.Argument(help="Networks; all of the paper's table if none.")
+        list[str] | None, typer.Argument(help="Networks. Default: all of the paper's table.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Parameters, FLOPs, time and memory of each network, beside the paper's figures."""
+    """List parameters, FLOPs, time and memory of each network next to the paper's values."""
     from stario.network.architectures import ARCHITECTURES
     from stario.network.runtime.survey import survey, survey_table
     from stario.sequences.datasets.stream_cache import cache_folder

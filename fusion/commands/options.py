@@ -1,4 +1,4 @@
-"""Groups of options that commands share, written once."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 PathsArgument = Annotated[
-    list[Path] | None, typer.Argument(help="Recordings, folders or lists of some.")
+    list[Path] | None, typer.Argument(help="Recordings, folders or list files.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
 FixesOption = Annotated[
@@ -34,82 +34,81 @@ FixesOption = Annotated[
         "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas.",
     ),
 ]
-BackendOption = Annotated[str, typer.Option(help="What fuses: ekf, or graph.")]
+BackendOption = Annotated[str, typer.Option(help="Estimator: ekf or graph.")]
 ByOption = Annotated[
-    str, typer.Option(help="Group by set, or by an attribute such as person, device, carry.")
+    str, typer.Option(help="Group by set, or by an attribute such as person, device or carry.")
 ]
 JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Processes that share the recordings.")
+    int, typer.Option("--jobs", min=1, help="Number of processes that share the recordings.")
 ]
 ReportOption = Annotated[
-    bool, typer.Option("--report", help="Also write report.html: map, slider, plots, health.")
+    bool, typer.Option("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON on stdout.")]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Options that say how a recording is read."""
+    """Options for reading a recording."""
 
     format: Annotated[
-        str, typer.Option("--format", help="Format of the recording: auto, or its name.")
+        str, typer.Option("--format", help="Format of the recording: auto or a format name.")
     ] = "auto"
     gyro_unit: Annotated[
         str, typer.Option("--gyro-unit", help="Unit of the gyroscope: rad/s or deg/s.")
     ] = "rad/s"
     accel_unit: Annotated[
         str,
-        typer.Option(
-            "--accel-unit", help="Unit of the accelerometer: m/s^2 or g, or either with a minus."
-        ),
+        typer.Option("--accel-unit", help="Unit of the accelerometer: m/s^2, g, -m/s^2 or -g."),
     ] = "m/s^2"
     accel_sign: Annotated[
         str,
         typer.Option(
-            "--accel-sign", help="Where the accelerometer points at rest: up, or down: apple."
+            "--accel-sign", help="Direction of the accelerometer at rest: up, or apple (down)."
         ),
     ] = "up"
     axes: Annotated[
         str,
         typer.Option(
             "--axes",
-            help="The truth's x, y, z in the file's axes, such as y,-x,z (--axes=-y,x,z).",
+            help="Axes of the ground truth in the file's axes, such as y,-x,z (or --axes=-y,x,z).",
         ),
     ] = "x,y,z"
     imu_topic: Annotated[
-        str | None, typer.Option("--imu-topic", help="Of a bag, where it holds several IMUs.")
+        str | None, typer.Option("--imu-topic", help="IMU topic of a bag with several IMUs.")
     ] = None
     truth_topic: Annotated[
-        str | None, typer.Option("--truth-topic", help="Of a bag: poses or odometry that are true.")
+        str | None, typer.Option("--truth-topic", help="Topic of true poses or odometry in a bag.")
     ] = None
     gravity: Annotated[
         str,
         typer.Option(
             "--gravity",
-            help="Included in the accelerometer, or removed: put back by the true attitude.",
+            help="Gravity in the accelerometer: included, or removed and restored from the true "
+            "attitude, or else the device's own.",
         ),
     ] = "included"
     where: Annotated[
         list[str] | None,
         typer.Option(
             "--where",
-            help="Of archives only recordings with this attribute, such as person=dan or "
-            "'name=r*'; of several values of one attribute any, of several attributes all.",
+            help="Only recordings of archives with this attribute, such as person=dan or "
+            "'name=r*'. Repeatable: any value of one attribute, but all attributes must match.",
         ),
     ] = None
 
     def as_read(self) -> dict[str, object]:
-        """What a recording's numbers depend on: all options but those that choose recordings."""
+        """Return the options that affect a recording's values: all except `where`."""
         return {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "where"
         }
 
     def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
-        """Recordings at the paths, in folders or in lists, and what leads to none."""
+        """Return the recordings at the paths, in folders or list files, and the skipped paths."""
         from stario.sequences.datasets.batch import Skipped
         from stario.sequences.readers import find_recordings
 
-        if self.format != "auto":  # a format that is named is that of the path itself
+        if self.format != "auto":  # a named format applies to the path itself
             return list(paths), []
         chosen = _attributes(self.where or ())
         files: list[Path] = []
@@ -122,7 +121,7 @@ class Reading:
         return files, [Skipped("", str(error)) for error in errors]
 
     def read(self, path: Path) -> ImuSequence:
-        """The recording at a path, in rad/s, m/s^2 of specific force and its truth's axes."""
+        """Read a recording in rad/s, m/s^2 of specific force and the axes of its ground truth."""
         from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
@@ -136,10 +135,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Estimating:
-    """Options that say what estimates a track."""
+    """Options of the estimator."""
 
     config: Annotated[
-        Path | None, typer.Option("--config", help="TOML or JSON file with settings of the filter.")
+        Path | None, typer.Option("--config", help="TOML or JSON file with settings.")
     ] = None
     model: Annotated[
         str,
@@ -151,7 +150,7 @@ class Estimating:
     magnetometer: Annotated[
         bool,
         typer.Option(
-            "--magnetometer/--no-magnetometer", help="Use the magnetic field where there is one."
+            "--magnetometer/--no-magnetometer", help="Use the magnetometer, if there is one."
         ),
     ] = True
 
@@ -161,12 +160,12 @@ class Estimating:
             "--declination",
             min=-180.0,
             max=180.0,
-            help="Of magnetic from true north, degrees east; the track's y then points north.",
+            help="Magnetic declination in degrees east; the track's y axis then points north.",
         ),
     ] = None
 
     def settings(self) -> NavigatorConfig:
-        """The filter's settings."""
+        """Return the navigator's settings."""
         from stario.fusion.config import NavigatorConfig, read_config
 
         config = NavigatorConfig() if self.config is None else read_config(self.config)
@@ -178,21 +177,21 @@ class Estimating:
         return replace(config, filter=chosen)
 
     def network(self) -> DisplacementModel:
-        """The network with its weights."""
+        """Load the network with its weights."""
         from stario.network.model import load_model
 
         return load_model(self.model)
 
     def network_for(self, jobs: int) -> DisplacementModel | str:
-        """The network, or, once it is known to load, its name for processes to load it by."""
+        """Return the loaded network, or for several jobs its name, after checking that it loads."""
         network = self.network()
         return network if jobs == 1 else self.model
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command for typer whose parameters `Reading` and `Estimating` become their fields' options.
+    """Expand a command's `Reading` and `Estimating` parameters into one typer option per field.
 
-    So a group's options are written once, and a command that takes `reading: Reading` has them.
+    The options are thus defined once, and any command that takes `reading: Reading` has them.
     """
     hints = typing.get_type_hints(command, include_extras=True)
     groups = {name: kind for name, kind in hints.items() if kind in (Reading, Estimating)}
@@ -229,10 +228,10 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def recipe_values(path: Path) -> dict[str, Any]:
-    """Settings of a training recipe, of a JSON file.
+    """Read the settings of a training recipe from a JSON file.
 
     Raises:
-        ConfigError: it cannot be read, or is no table of settings.
+        ConfigError: the file cannot be read, or is not a table of settings.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -244,7 +243,7 @@ def recipe_values(path: Path) -> dict[str, Any]:
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
-    """Patterns by attribute, of `key=pattern` words."""
+    """Return the patterns by attribute from `key=pattern` words."""
     chosen: dict[str, list[str]] = {}
     for word in words:
         key, equals, pattern = word.partition("=")

@@ -1,4 +1,4 @@
-"""`stario run`: recordings into fused tracks."""
+"""`stario run`: fuse recordings into tracks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @grouped
 def run(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or lists of some.")
+        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
     ],
     reading: Reading,
     estimating: Estimating,
@@ -40,7 +40,7 @@ def run(
     out: OutOption = None,
     report: ReportOption = False,
     view: Annotated[
-        bool, typer.Option("--view", help="Open in the 3-D viewer rerun; the file stays in --out.")
+        bool, typer.Option("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -62,7 +62,7 @@ def run(
 
 @dataclass(frozen=True)
 class Shown:
-    """What a run shows: a report, the viewer, figures on stdout."""
+    """Optional outputs of a run: report, viewer, results on stdout."""
 
     report: bool
     view: bool
@@ -76,7 +76,7 @@ def _run(
     fixes: Sequence[Fix],
     shown: Shown,
 ) -> dict[str, object]:
-    """Write one recording's track, tell of it on stdout, return its record for programs."""
+    """Write one recording's track, summarise it on stdout and return its record."""
     import numpy as np
 
     from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
@@ -119,7 +119,7 @@ def _run(
     typer.echo(sequence.summary())
     length = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    typer.echo(f"{length} travelled by the estimate, which ends {ends:.1f} m from its start")
+    typer.echo(f"{length} travelled (estimated), ending {ends:.1f} m from the start")
     if truth is not None:
         typer.echo(track_table({backend: metrics}, track.time, truth, words))
     elif sequence.positions is not None:

@@ -17,13 +17,13 @@ def simulate(
     seconds: Annotated[float, typer.Option(help="Duration in s.")] = 60.0,
     rate: Annotated[float, typer.Option(min=50.0, max=1000.0, help="Sampling rate in Hz.")] = 200.0,
     carry: Annotated[
-        str, typer.Option(help="How the device is carried; random draws person and carry.")
+        str, typer.Option(help="How the device is carried; random also draws the person.")
     ] = "random",
-    imu: Annotated[str, typer.Option(help="Sensor: phone, good or perfect.")] = "phone",
-    seed: Annotated[int, typer.Option(min=0, help="Of walk and sensor.")] = 0,
+    imu: Annotated[str, typer.Option(help="Sensor model: phone, good or perfect.")] = "phone",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a simulated walk with its truth as a CSV recording."""
+    """Write a simulated walk with its ground truth as a CSV recording."""
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
     from stario.sequences.simulation.walks import WalkStyle, generate_walk

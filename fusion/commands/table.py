@@ -20,54 +20,53 @@ if TYPE_CHECKING:
 
 def table(
     out: Annotated[
-        Path, typer.Option("--out", help="Folder that keeps every finished cell; goes on there.")
+        Path, typer.Option("--out", help="Folder of the finished cells; a rerun resumes there.")
     ],
     data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
     sets: Annotated[
         str | None,
-        typer.Option(help="Of --data: oxiod,ridi,all,tyrex,kipd,ilc; all of them without it."),
+        typer.Option(help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."),
     ] = None,
     published: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", help="A data set as published, NAME=FOLDER, such as ronin=/data/RoNIN; often."
+            "--set", help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable."
         ),
     ] = None,
     networks: Annotated[
-        str | None, typer.Option(help="Names of `stario check models`, with commas; else all.")
+        str | None,
+        typer.Option(help="Networks of `stario check models`, comma-separated. Default: all."),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps of every training, over the recipe's.")
+        int | None, typer.Option(min=1, help="Training steps per network; overrides the recipe.")
     ] = None,
     seeds: Annotated[
         int,
-        typer.Option(min=1, help="Of StarIO with and without MSGCU, R-ResNet and DeepILS."),
+        typer.Option(min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."),
     ] = 3,
-    split_seed: Annotated[int, typer.Option(min=0, help="Of the split of recordings.")] = 0,
+    split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
     per_group: Annotated[
-        int, typer.Option(min=1, help="Of the set all: most recordings of a group that test.")
+        int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
     ] = 2,
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="JSON file with the recipe; else the package's."),
+        typer.Option("--config", help="JSON file with the recipe. Default: the package's."),
     ] = None,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder that keeps windows for the next cell; else STARIO_CACHE or ~/.cache."
-        ),
+        typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache."),
     ] = None,
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", help="Cells at once; -1 for as many as there is room for."),
+        typer.Option("--jobs", help="Cells to run in parallel; -1 for as many as possible."),
     ] = None,
     backend: Annotated[
-        str, typer.Option(help="Where cells are filled: loky (this machine), dask or ray.")
+        str, typer.Option(help="Where cells run: loky (this machine), dask or ray.")
     ] = "loky",
 ) -> None:
-    """Train and test every network on every data set; a killed run goes on, what is new fills in.
+    """Train and test every network on every data set; a rerun adds only missing cells.
 
-    The paper's protocol: 8:1:1 by recordings, true attitude, one recipe, as many steps for all.
+    The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.fusion.table.files import known_costs, write_results
@@ -107,7 +106,7 @@ def _data_sets(
     from stario.fusion.table.sets import development_sets, folder_set
 
     if data is None and not published:
-        raise InputError("data", "none", "recordings", "name --data, or --set NAME=FOLDER")
+        raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     known: list[DataSet] = []
     if data is not None:
         names = None if sets is None else [name.strip() for name in sets.split(",")]
@@ -117,7 +116,7 @@ def _data_sets(
         if not (name and equals and folder):
             raise InputError("--set", repr(word), "NAME=FOLDER", "such as ronin=/data/RoNIN")
         if name in {one.name for one in known}:
-            raise InputError("--set", repr(name), "a name of its own", f"leave {name} out: --sets")
+            raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         known.append(folder_set(name, Path(folder), seed))
     return known
 
@@ -128,7 +127,7 @@ def _recipe(path: Path | None) -> dict[str, Any]:
 
 
 def _trained(cells: list[Cell]) -> list[str]:
-    """Networks of the cells, in the order of the paper's table."""
+    """Return the networks of the cells, in the order of the paper's table."""
     from stario.network.architectures import ARCHITECTURES
 
     asked = {cell.network for cell in cells}

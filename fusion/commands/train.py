@@ -1,4 +1,4 @@
-"""`stario train`: a network from recordings and simulated walks."""
+"""`stario train`: train a network on recordings and simulated walks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _GENERATED = 150
-"""Simulated walks beside the recordings."""
+"""Default number of simulated walks."""
 
 
 @grouped
@@ -39,49 +39,51 @@ def train(
         str | None,
         typer.Option(
             "--model",
-            help="Network to train, as `stario check models` names it; else that of --start-from.",
+            help="Network to train, from `stario check models`. Default: that of --start-from.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help="Folder of the run, resumed if it holds a checkpoint; else runs/NETWORK.",
+            help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK.",
         ),
     ] = None,
     validation: Annotated[
         list[Path] | None,
-        typer.Option(help="Recordings that choose and calibrate; else the last fifth of each."),
+        typer.Option(
+            help="Recordings to select and calibrate on. Default: the last fifth of each."
+        ),
     ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the development recordings: learn from all that the package lists but "
-            "the test recordings, choose and calibrate by those of its list `holdout`."
+            help="Folder of the development recordings: train on all that the package lists except "
+            "the test recordings; select and calibrate on those of its list `holdout`."
         ),
     ] = None,
     learn_from: Annotated[
         str,
         typer.Option(
-            help="With --data: all; open, those whose licence allows any use; or few, the eight "
-            "recordings of the paper's comparison."
+            help="With --data: all, open (those whose licence allows any use) or few (the eight "
+            "recordings of the paper's comparison)."
         ),
     ] = "all",
     leave_out: Annotated[
         str | None,
-        typer.Option(help="With --data: leave this group out instead, such as 'tyrex Thibaud'."),
+        typer.Option(help="With --data: hold out this group instead, such as 'tyrex Thibaud'."),
     ] = None,
     generated: Annotated[
-        int | None, typer.Option(min=0, help=f"Generated walks of 60 s; {_GENERATED} if not said.")
+        int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
     ] = None,
     recorded_only: Annotated[
-        bool, typer.Option("--recorded-only", help="Learn from no simulated walk at all.")
+        bool, typer.Option("--recorded-only", help="Train without simulated walks.")
     ] = False,
     config: Annotated[
-        Path | None, typer.Option("--config", help="JSON file with settings of the recipe.")
+        Path | None, typer.Option("--config", help="JSON file with recipe settings.")
     ] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs, over the file's.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed, over the file's.")] = None,
+    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
     start_from: Annotated[
         str | None,
         typer.Option(help="Weights to start from: default, another name, or a safetensors file."),
@@ -89,22 +91,20 @@ def train(
     last_stage: Annotated[
         str | None,
         typer.Option(
-            help="Learn from the validation recordings too; sigma is calibrated as that of these "
-            "weights, which left them out.",
+            help="Also train on the validation recordings; sigma takes the calibration of these "
+            "weights, which were trained without them.",
         ),
     ] = None,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder that keeps windows for the next run; else STARIO_CACHE or ~/.cache."
-        ),
+        typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache."),
     ] = None,
     jobs: JobsOption = 1,
 ) -> None:
-    """Train a network on recordings with truth and on simulated walks; resumes by itself.
+    """Train a network on recordings with ground truth and on simulated walks; a rerun resumes.
 
-    Truth may be poses, positions or waypoints: fine-tune the default weights on walks of your own
-    by --start-from default. The same recipe for every network. In several processes:
+    Ground truth may be poses, positions or waypoints. Use --start-from default to fine-tune the
+    default weights on your own walks. All networks share one recipe. In several processes:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
     from stario.fusion.evaluation.results import make_folder
@@ -114,15 +114,15 @@ def train(
     from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
 
-    first = load_model(start_from) if start_from else None  # before anything takes time
+    first = load_model(start_from) if start_from else None  # fails before anything slow starts
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     if not paths and data is None and generated is None:
-        raise InputError("PATH", "none", "recordings, --data, or --generated for walks alone")
+        raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
     walks = 0 if recorded_only else _GENERATED if generated is None else generated
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
     if data is not None and reading.where:
-        raise InputError("--where", "with --data", "with PATH alone", "name the archive instead")
+        raise InputError("--where", "with --data", "with PATH only", "name the archive instead")
     recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
     )
@@ -139,11 +139,11 @@ def train(
         raise InputError(
             "recordings",
             "none whose last fifth has an unbroken stretch of 2 s",
-            "some to choose and calibrate by",
-            "name them: --validation",
+            "validation data to select and calibrate on",
+            "name recordings with --validation",
         )
     calibrated_by = last_stage or (None if kept.streams else start_from)
-    # Sigma needs windows with full truth; where nobody has any, those of generated walks.
+    # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = kept.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
     if leads():
         for words in material.words:
@@ -160,7 +160,7 @@ def train(
                 f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
                 f"validation {report.validation_error:.4f} m^2; "
                 f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
-                "time in drawing them",
+                "time spent drawing them",
                 err=True,
             ),
             trained_on=material.words,
@@ -188,13 +188,13 @@ def _recipe(
             "--start-from",
             f"weights of {first.card.architecture}",
             recipe.architecture,
-            "leave out --model, or name weights of that network",
+            "omit --model, or name weights of that network",
         )
     return recipe
 
 
 def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
-    """Recordings to learn from and to be kept, of the lists in the package."""
+    """Return the training and held-out recordings from the lists in the package."""
     from stario.network.training.splits import listed
     from stario.sequences.datasets.splits import leave_out
 
@@ -226,7 +226,7 @@ def _recorded(
     lists: tuple[list[Path], list[Path]],
     streams_of: Callable[[list[Path]], tuple[list[Recorded], list[Skipped]]],
 ) -> tuple[list[Recorded], list[Recorded], list[Skipped]]:
-    """Recordings to learn from, those held out, and what could not be used, named at once."""
+    """Return training, held-out and skipped recordings; exit at once if too few are usable."""
     from stario.network.training.data import split_off
 
     files, missing = reading.recordings(paths)
@@ -244,13 +244,13 @@ def _recorded(
 
 
 def _check_apart(files: list[Path], held_files: list[Path]) -> None:
-    """Refuse a recording that is learned from and kept: it would say that all is learned."""
+    """Refuse a recording used for both training and validation: it would hide overfitting."""
     kept = {path.resolve() for path in held_files}
     both = [path for path in files if path.resolve() in kept]
     if both:
         raise InputError(
-            "--validation", f"{both[0]}, which is learned from", "other recordings",
-            "leave it out; without --validation the last fifth of each recording is kept",
+            "--validation", f"{both[0]}, which is also trained on", "other recordings",
+            "remove it; without --validation the last fifth of each recording is held out",
         )  # fmt: skip
 
 

@@ -1,1 +1,1 @@
-"""A walk that is watched while it happens: samples come in, tracks are drawn as they grow."""
+"""Live server: devices send samples, a web page shows their tracks as they grow."""

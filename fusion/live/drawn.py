@@ -1,4 +1,4 @@
-"""What is drawn of a device's track: its points, taken along when fixes move the map frame."""
+"""Displayed points of a device's track, transformed when fixes move the map frame."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ Point = list[float]
 the standard deviation of yaw [deg]."""
 
 MOST_POINTS = 20_000
-"""Kept of a track; beyond, every second one is forgotten, since memory must not grow."""
+"""Maximum number of points of a track; beyond it every second one is dropped to bound memory."""
 
 _GAP_SECONDS = 0.5
-"""States come ten times a second; further apart, samples were missing."""
+"""Interval between states [s] above which samples were missing; normally it is 0.1 s."""
 
 
 @dataclass
 class Drawn:
-    """A track as it is drawn.
+    """Displayed track of one device.
 
     Attributes:
-        points: thinned where there are many.
-        revision: goes up whenever earlier points changed.
-        origin: (3,) what is drawn as zero [m].
-        map_frame: of the newest states.
-        since: index of the first point that fixes still move: behind a gap in which the direction
-            was lost, what was before stays where it is.
+        points: thinned beyond `MOST_POINTS`.
+        revision: counter, incremented when earlier points change.
+        origin: (3,) position displayed as zero [m].
+        map_frame: `NavState.map_frame` of the newest states.
+        since: index of the first point that fixes still move; points before a gap in which the
+            heading was lost stay where they are.
     """
 
     points: list[Point] = field(default_factory=list)
@@ -44,7 +44,7 @@ class Drawn:
     since: int = 0
 
     def add(self, state: NavState) -> None:
-        """The newest state."""
+        """Append the newest state."""
         behind_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
         if behind_gap and state.covariance[2, 2] > KNOWN_YAW**2:
             self.since = len(self.points)
@@ -54,7 +54,7 @@ class Drawn:
             self.revision += 1
 
     def move(self, before: NavState, after: NavState) -> None:
-        """The map frame moved and turned: `before` became `after`, and so do earlier points."""
+        """Transform earlier points by the map-frame change that turned `before` into `after`."""
         turn = float(yaw_of(Rotation.from_matrix(after.R_WB @ before.R_WB.T))[0])
         R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
         shift = after.p_W[:2] - R @ before.p_W[:2]
@@ -71,7 +71,7 @@ class Drawn:
 
 
 def point_of(state: NavState) -> Point:
-    """What is drawn of a state, rounded to what a screen shows."""
+    """Return the point of a state, rounded to screen precision."""
     P = state.covariance
     values = (
         *state.p_W,

@@ -1,4 +1,4 @@
-"""All devices of a server: each worked off by itself, and news for those who watch."""
+"""All devices of a server: a session for each, and notifications for viewers."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
 MOST_DEVICES = 16
-"""At once; more are refused, since memory must not grow."""
+"""Maximum number of devices at once; further ones are refused to bound memory."""
 
 MOST_SENT = 3000
-"""Points of a device in one message to a viewer that knows none of them yet."""
+"""Maximum number of points of a device in one message, as to a new viewer."""
 
 
 class Hub:
-    """The sessions by device, and whoever watches them.
+    """Sessions by device, with notifications for viewers.
 
-    Each device has a lock: its batches are worked off one after the other, in a thread, so that
-    neither a slow network nor another device's batch holds up the server.
+    Each device has a lock: its batches are processed one after the other, in a thread, so that
+    neither a slow displacement network nor another device's batch blocks the server.
 
     Args:
-        folder: for recordings.
-        new_navigator: makes a navigator for each track.
+        folder: folder for recordings.
+        new_navigator: returns a new navigator for each track.
 
     Attributes:
-        sessions: by device.
-        refused: messages that could not be read, by where they came in.
-        ending: whether the server is about to stop, and viewers are to be let go.
+        sessions: sessions by device.
+        refused: number of refused messages by transport.
+        ending: whether the server is stopping and viewers must be disconnected.
     """
 
     def __init__(self, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
@@ -46,14 +46,14 @@ class Hub:
         self.refused: Counter[str] = Counter()
 
     async def take(self, batch: Batch, accel_factor: float = 1.0) -> int:
-        """Take a batch in; returns how many samples it made.
+        """Process a batch; return the number of samples it completed.
 
         Raises:
             InputError: there are too many devices, or the recording cannot be written.
         """
         received = time.time()
         if not batch.readings and batch.device not in self.sessions:
-            return 0  # a push to see whether somebody listens
+            return 0  # an empty push that tests the connection
         session = self._session(batch.device)
         async with self._locks[batch.device]:
             count = await asyncio.to_thread(session.take, batch, received, accel_factor)
@@ -61,42 +61,42 @@ class Hub:
         return count
 
     async def command(self, device: str, name: str, **values: float) -> None:
-        """Have a device's session do something: start, stop, zero or fix.
+        """Run a command on a device's session: start, stop, zero or fix.
 
         Raises:
-            InputError: there is no such device, or it cannot be done now.
+            InputError: the device is unknown, or the command is not possible now.
         """
         if device not in self.sessions:
             known = ", ".join(self.sessions) or "none yet"
-            raise InputError("device", repr(device), f"one that has sent something: {known}")
+            raise InputError("device", repr(device), f"a device that has sent data: {known}")
         action = getattr(self.sessions[device], name)
         async with self._locks[device]:
             await asyncio.to_thread(action, **values)
         self.announce()
 
     def refuse(self, where: str) -> None:
-        """Count what could not be read, by where it came in."""
+        """Count a refused message by transport."""
         self.refused[where] += 1
 
     def announce(self) -> None:
-        """Wake all who wait for news."""
+        """Wake all tasks that wait for news."""
         self._news.set()
         self._news = asyncio.Event()
 
     async def news(self, seconds: float) -> None:
-        """Wait for something new, but not longer than some seconds."""
+        """Wait for news, but no longer than `seconds`."""
         try:
             await asyncio.wait_for(self._news.wait(), seconds)
         except TimeoutError:
             return
 
     def end(self) -> None:
-        """Let the viewers go."""
+        """Disconnect the viewers."""
         self.ending = True
         self.announce()
 
     def close(self) -> None:
-        """End all recordings."""
+        """Close all recordings."""
         for session in self.sessions.values():
             session.close()
 
@@ -104,7 +104,7 @@ class Hub:
         if device not in self.sessions:
             if len(self.sessions) >= MOST_DEVICES:
                 raise InputError(
-                    "device", f"a further one, {device!r}", f"at most {MOST_DEVICES} at once"
+                    "device", f"a new one, {device!r}", f"at most {MOST_DEVICES} devices at once"
                 )
             self.sessions[device] = Session(device, self._folder, self._new_navigator)
             self._locks[device] = asyncio.Lock()
@@ -112,10 +112,10 @@ class Hub:
 
 
 class Viewer:
-    """What one viewer knows already, so that only what is new is sent.
+    """Record of what one viewer has received, so that only new points are sent.
 
     Args:
-        hub: to watch.
+        hub: hub to watch.
     """
 
     def __init__(self, hub: Hub) -> None:
@@ -123,9 +123,9 @@ class Viewer:
         self._known: dict[str, tuple[int, int]] = {}
 
     def message(self) -> dict[str, Any]:
-        """Every device's status, and the points that are new since the last message.
+        """Return every device's status and its points since the last message.
 
-        `points` replace all that the viewer has where `fresh` is true, else they follow them.
+        If `fresh` is true, `points` replace all the viewer has; otherwise they are appended.
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):

@@ -1,8 +1,8 @@
-"""Lines of JSON over TCP and UDP, for any device that is no phone with an app.
+"""Lines of JSON over TCP and UDP, for any device other than a phone with an app.
 
-Each line is one sample, see `payload`; a UDP packet holds one or several. Over TCP what cannot be
-used is answered by a line `{"error": ...}`; over UDP it is counted. Where the server has a token, a
-TCP connection begins with the line `{"token": "..."}`, and a UDP packet's first line is that one.
+Each line is one sample (see `payload`); a UDP packet holds one or several. An invalid line is
+answered with `{"error": ...}` over TCP and counted over UDP. If the server has a token, a TCP
+connection and each UDP packet must begin with the line `{"token": "..."}`.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from stario.fusion.live.server import same
 from stario.sequences.errors import InputError
 
 LONGEST_LINE = 64 * 1024
-"""Bytes."""
+"""Maximum length of a line [bytes]."""
 
 MOST_CONNECTIONS = 32
 MOST_WAITING = 2000
-"""UDP packets that wait to be worked off; beyond, they are dropped and counted."""
+"""Maximum number of queued UDP packets; further ones are dropped and counted."""
 
 _log = logging.getLogger(__name__)
 
 
 class LineServer:
-    """Listens for lines over TCP and UDP on one port.
+    """Server for lines over TCP and UDP on one port.
 
     Args:
-        hub: that takes the samples.
-        token: empty where none is wanted.
+        hub: hub that takes the samples.
+        token: required token; empty for none.
     """
 
     def __init__(self, hub: Hub, token: str = "") -> None:
@@ -46,7 +46,7 @@ class LineServer:
         """Listen until cancelled.
 
         Raises:
-            OSError: the port is taken.
+            OSError: the port is in use.
         """
         loop = asyncio.get_running_loop()
         server = await asyncio.start_server(self._connected, host, port)
@@ -63,10 +63,10 @@ class LineServer:
             server.close()
 
     async def listening(self, serving: asyncio.Task[None]) -> None:
-        """Wait until the task of `serve` listens.
+        """Wait until the task running `serve` is listening.
 
         Raises:
-            OSError: it cannot.
+            OSError: it cannot listen.
         """
         bound = asyncio.create_task(self._bound.wait())
         await asyncio.wait((bound, serving), return_when=asyncio.FIRST_COMPLETED)
@@ -97,11 +97,11 @@ class LineServer:
             if lines and not trusted:
                 trusted = self._is_token(lines.pop(0))
                 if not trusted:
-                    await self._answer(writer, ["token: none or another one"])
+                    await self._answer(writer, ["token: missing or wrong"])
                     return
             errors = await self._take(lines, sender)
             if len(rest) > LONGEST_LINE:
-                errors.append(f"line: found a longer one, expected at most {LONGEST_LINE} bytes")
+                errors.append(f"line: found a longer line, expected at most {LONGEST_LINE} bytes")
                 rest = b""
             await self._answer(writer, errors)
         if trusted and rest.strip():
@@ -118,8 +118,8 @@ class LineServer:
             data, sender = await self._packets.get()
             try:
                 await self._work_off(data.split(b"\n"), sender)
-            except Exception:  # anybody may send anything: no packet ends the others' listening
-                _log.exception("%s: a packet is left out", sender)
+            except Exception:  # no packet, whatever it holds, may stop the server
+                _log.exception("%s: a packet is skipped", sender)
                 self._hub.refuse("udp")
 
     async def _work_off(self, lines: list[bytes], sender: str) -> None:
@@ -130,7 +130,7 @@ class LineServer:
             self._hub.refuse("udp")
 
     async def _take(self, lines: Sequence[bytes], sender: str) -> list[str]:
-        """Take lines in, those of a device at once; returns what is wrong with the others."""
+        """Process lines, batched by device; return the errors of those that fail."""
         errors: list[str] = []
         batches: list[Batch] = []
         for line in filter(bytes.strip, lines):

@@ -1,5 +1,5 @@
 "use strict";
-// Draws what /events tells: a track per device on the map, sigma, speed and yaw over time.
+// Draws the data of /events: a track per device on the map; sigma, speed and yaw over time.
 (() => {
   const element = (id) => document.getElementById(id);
   const [map, time, connection] = [element("map"), element("time"), element("connection")];
@@ -12,7 +12,7 @@
   const devices = new Map();
   window.stario = { devices, delays: [] };
 
-  // One server, one frame: points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw].
+  // All devices share one map frame. Points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw].
   const sigmaOf = (p) => Math.sqrt((p[6] + p[8]) / 2 + Math.hypot((p[6] - p[8]) / 2, p[7]));
   const thinned = (points) => {
     const step = Math.ceil(points.length / MOST_DRAWN);
@@ -35,13 +35,13 @@
   const base = { font, paper_bgcolor: "white", plot_bgcolor: "white", showlegend: false };
   const mapLayout = { ...base, margin: { l: 54, r: 10, t: 6, b: 42 }, dragmode: "pan", hovermode: "closest", uirevision: 1,
     xaxis: { ...axis("x [m]"), range: [-6, 6] }, yaxis: { ...axis("y [m]"), range: [-6, 6], scaleanchor: "x" } };
-  const rows = [["Sigma of position [m]", sigmaOf], ["Speed [m/s]", (p) => p[4]], ["Yaw [deg]", (p) => p[5]]];
+  const rows = [["Position sigma [m]", sigmaOf], ["Speed [m/s]", (p) => p[4]], ["Yaw [deg]", (p) => p[5]]];
   const timeLayout = { ...base, height: 460, margin: { l: 54, r: 10, t: 22, b: 42 }, hovermode: "x", dragmode: false, uirevision: 1,
     grid: { rows: 3, columns: 1, pattern: "independent", ygap: 0.38 },
     annotations: rows.map(([text], k) => ({ text, x: 0, xanchor: "left", xref: "paper", yref: `y${k ? k + 1 : ""} domain`,
       y: 1.02, yanchor: "bottom", showarrow: false, font })) };
   rows.forEach((_, k) => {
-    timeLayout[`xaxis${k ? k + 1 : ""}`] = { ...axis(k === 2 ? "time of each track [s]" : ""), ...(k ? { matches: "x" } : {}) };
+    timeLayout[`xaxis${k ? k + 1 : ""}`] = { ...axis(k === 2 ? "time since the start of each track [s]" : ""), ...(k ? { matches: "x" } : {}) };
     timeLayout[`yaxis${k ? k + 1 : ""}`] = { ...axis(""), ...(k === 2 ? { range: [-185, 185], dtick: 90 } : { rangemode: "tozero" }) };
   });
   const config = { responsive: true, displaylogo: false, displayModeBar: false, scrollZoom: true };
@@ -99,7 +99,7 @@
     await Promise.all([Plotly.react(map, mapTraces, mapLayout, config), Plotly.react(time, timeTraces, timeLayout, config)]);
   };
 
-  // A slow device draws less often: half of its time at most goes into drawing.
+  // A slow browser draws less often: it spends at most half of its time drawing.
   let [drawing, wanted] = [false, false];
   const redraw = async () => {
     wanted = true;
@@ -176,9 +176,9 @@
     const strokes = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
     card.querySelector("svg").innerHTML = `<line x1="0" y1="5" x2="30" y2="5" stroke="${device.colour}" stroke-width="3" stroke-dasharray="${strokes[device.dash]}"/>`;
     card.querySelector(".name").textContent = id;
-    device.toggle = button("Stop", "Ends this track, or begins a new one", () => post(id, device.running ? "stop" : "start"));
-    device.zero = button("Zero here", "Draws the place where it is now as x = y = 0", () => post(id, "zero"));
-    device.fix = button("Place on map", "Tells the filter where it is now, by a tap on the map", () => tap(id));
+    device.toggle = button("Stop", "End this track, or start a new one", () => post(id, device.running ? "stop" : "start"));
+    device.zero = button("Zero here", "Show the current position as x = y = 0", () => post(id, "zero"));
+    device.fix = button("Place on map", "Give the filter the current position by a tap on the map", () => tap(id));
     card.querySelector(".tools").append(device.toggle, device.zero, device.fix);
     element("devices").append(card);
     devices.set(id, device);
@@ -190,15 +190,15 @@
     const age = now - device.received;
     const state = device.card.querySelector(".state");
     const silent = device.running && age > 3;
-    state.textContent = !device.running ? "stopped" : silent ? `silent for ${age.toFixed(0)} s` : `live, ${device.rate.toFixed(0)} Hz`;
+    state.textContent = !device.running ? "stopped" : silent ? `no data for ${age.toFixed(0)} s` : `live, ${device.rate.toFixed(0)} Hz`;
     state.classList.toggle("bad", silent);
     const figures = p ? [
       [`${Math.hypot(p[1] - device.origin[0], p[2] - device.origin[1]).toFixed(1)} m`, "from the origin"],
-      [`${sigmaOf(p).toFixed(2)} m`, "sigma of position"],
+      [`${sigmaOf(p).toFixed(2)} m`, "position sigma"],
       [`${p[4].toFixed(2)} m/s`, "speed"],
       [`${p[5].toFixed(0)} ± ${p[9].toFixed(0)}°`, "yaw, 1 sigma"],
       [`${(Math.round(10 * (p[3] - device.origin[2])) / 10 || 0).toFixed(1)} m`, "height"],
-      [`${Math.floor(p[0] / 60)}:${String(Math.floor(p[0] % 60)).padStart(2, "0")}`, "min:s"]] : [];
+      [`${Math.floor(p[0] / 60)}:${String(Math.floor(p[0] % 60)).padStart(2, "0")}`, "time (min:s)"]] : [];
     device.card.querySelector(".figures").replaceChildren(...figures.map(([value, what]) => {
       const box = document.createElement("div");
       box.append(Object.assign(document.createElement("b"), { textContent: value }),
@@ -233,7 +233,7 @@
     }
     element("empty").hidden = devices.size > 0;
     const refused = Object.values(message.refused).reduce((sum, n) => sum + n, 0);
-    connection.textContent = `${devices.size} device${devices.size === 1 ? "" : "s"}${refused ? `, ${refused} messages refused` : ""}`;
+    connection.textContent = `${devices.size} device${devices.size === 1 ? "" : "s"}${refused ? `, ${refused} messages rejected` : ""}`;
     connection.className = "";
     redraw();
   };
@@ -244,6 +244,6 @@
     watchMap();
     const events = new EventSource("events" + location.search);
     events.onmessage = (event) => { take(JSON.parse(event.data)); document.body.dataset.ready = "yes"; };
-    events.onerror = () => { connection.textContent = "no connection to the server, trying again"; connection.className = "bad"; };
+    events.onerror = () => { connection.textContent = "no connection to the server, retrying"; connection.className = "bad"; };
   });
 })();

@@ -1,8 +1,8 @@
-"""Sensors with clocks of their own, merged into samples at the gyroscope's times.
+"""Merge sensors with separate clocks into samples at the gyroscope's times.
 
-A phone's sensors tick apart from each other and arrive in batches. Each gyroscope sample waits for
-the accelerometer's next one and takes the specific force interpolated in between; gravity and
-linear acceleration, where they come apart, are joined first in the same way.
+A phone's sensors are sampled at different times and arrive in batches. Each gyroscope sample waits
+for the next accelerometer sample and takes the specific force interpolated at its own time; gravity
+and linear acceleration, if sent separately, are first joined in the same way.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ Field = tuple[int, Vector]
 """Time [ns], magnetic flux density [uT]."""
 
 CHOOSING = 5 * 10**8
-"""Time [ns] in which every sensor of a device shows up, before it is chosen among them."""
+"""Time [ns] allowed for every sensor of a device to appear before choosing among them."""
 
 LONGEST_WAIT = 5 * 10**9
-"""So long [ns] a gyroscope sample waits for the accelerometer."""
+"""Maximum time [ns] a gyroscope sample waits for the accelerometer."""
 
 _MAX_GAP = round(MAX_IMU_GAP * 1e9)
 _GYROS = (GYRO, GYRO_RAW)
@@ -44,11 +44,11 @@ _ACCELS = ((TOTAL,), (LINEAR, GRAVITY), (ACCEL_RAW,))
 
 
 class Join:
-    """Values of a second stream at the times of a first.
+    """Interpolation of a second stream at the times of a first.
 
     Attributes:
-        late: values of either that came behind newer ones of theirs, and were dropped.
-        alone: values of the first that none of the second is near, and were dropped.
+        late: number of values dropped because their stream already had newer ones.
+        alone: number of values of the first dropped for lack of nearby values of the second.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Join:
         self.late = self.alone = 0
 
     def add(self, stream: int, time_ns: int, value: Vector) -> None:
-        """A value of the first (0) or second (1) stream; each must move on in time."""
+        """Add a value to the first (0) or second (1) stream; its times must increase."""
         if time_ns <= self._newest[stream]:
             self.late += 1
             return
@@ -66,14 +66,14 @@ class Join:
         (self._first, self._second)[stream].append((time_ns, value))
 
     def ready(self) -> list[Sample]:
-        """What can be told by now, in the order of time."""
+        """Return the samples that are complete so far, in time order."""
         done: list[Sample] = []
         while self._first and self._second:
             time, value = self._first[0]
             while len(self._second) > 1 and self._second[1][0] <= time:
                 self._second.popleft()
             if self._second[0][0] < time and len(self._second) == 1:
-                break  # its next one is still to come
+                break  # its next value is still to come
             self._first.popleft()
             other = self._at(time)
             if other is None:
@@ -86,7 +86,7 @@ class Join:
         return done
 
     def _at(self, time: int) -> Vector | None:
-        """The second stream's value at a time, None outside it or in a gap."""
+        """Return the second stream's value at a time; None outside it or in a gap."""
         before, value = self._second[0]
         if before == time:
             return value
@@ -101,12 +101,12 @@ class Join:
 
 
 class Merger:
-    """Turns a device's readings into samples, once it is known which sensors it has.
+    """Converter of a device's readings into samples, once its sensors are known.
 
     Attributes:
-        upward: cosine between the force and up as the device's own attitude has it; 0 where it
-            does not tell.
-        magnetic: whether it has a magnetometer.
+        upward: cosine between the specific force and the upward vertical of the device's own
+            attitude; 0 if it sends none.
+        magnetic: whether the device has a magnetometer.
     """
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ class Merger:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Readings dropped so far, by reason; those with a count."""
+        """Number of readings dropped so far by reason, without zeros."""
         counts = {
             "late": self._join.late + self._gravity.late + self._field_late,
             "without acceleration": self._join.alone,
@@ -129,7 +129,7 @@ class Merger:
 
     @property
     def missing(self) -> str:
-        """What a device does not send though a track needs it; empty where nothing is missing."""
+        """Sensor that a track needs but the device does not send; empty if none is missing."""
         if self._gyro or not self._waiting:
             return ""
         seen = {reading.sensor for reading in self._waiting}
@@ -140,13 +140,13 @@ class Merger:
         return ""
 
     def add(self, readings: Iterable[Reading]) -> list[Sample]:
-        """Readings as they come; returns the samples that they complete."""
+        """Add readings as they arrive; return the samples they complete."""
         if not self._gyro:
             self._waiting += readings
             if not self._choose():
                 return []
             readings, self._waiting = self._waiting, []
-        # Sensors come one after the other in a batch: each is sorted, so that none is late.
+        # A batch lists one sensor after the other; it is sorted by time so that none is late.
         for reading in sorted(readings, key=lambda reading: reading.time_ns):
             self._take(reading)
         if len(self._accel) == 2:
@@ -156,7 +156,7 @@ class Merger:
         return self._join.ready()
 
     def fields(self) -> list[Field]:
-        """The magnetic fields since the last call, in the order of time."""
+        """Return the magnetic fields since the last call, in time order."""
         fields, self._fields = self._fields, []
         return fields
 
@@ -176,7 +176,7 @@ class Merger:
             self._join.add(1, time, value)
 
     def _choose(self) -> bool:
-        """The best of the sensors seen, once enough of the stream is there to have seen all."""
+        """Choose the best sensors, once the stream is long enough to have shown all."""
         times = [reading.time_ns for reading in self._waiting]
         if not times or max(times) - min(times) < CHOOSING:
             return False
@@ -184,7 +184,7 @@ class Merger:
         gyro = next((name for name in _GYROS if name in seen), "")
         accel = next((names for names in _ACCELS if set(names) <= seen), ())
         if not gyro or not accel:
-            newest = max(times)  # what waits must not grow
+            newest = max(times)  # bounds memory
             self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
             return False
         self._gyro, self._accel, self.magnetic = gyro, accel, MAG in seen

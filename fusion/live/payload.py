@@ -1,20 +1,20 @@
-"""What devices send, taken apart: Sensor Logger's pushes, and lines of JSON from anything else.
+"""Parsers for what devices send: Sensor Logger's pushes, and lines of JSON from anything else.
 
 A push of the app Sensor Logger is a JSON object with a batch of samples of all its sensors:
 
     {"messageId": 7, "sessionId": "...", "deviceId": "...", "payload": [
         {"name": "gyroscope", "time": 1698501144401773000, "values": {"x": 0.1, "y": 0, "z": 0}}]}
 
-`time` is in nanoseconds, rates in rad/s, accelerations in m/s^2. "accelerometer" is without gravity
-and "gravity" a sensor of its own; "totalacceleration" (Android) holds both; "magnetometer" is in
-uT. Sensors that no track is made of are skipped.
+`time` is in nanoseconds, rates in rad/s, accelerations in m/s^2. "accelerometer" excludes gravity,
+which is a separate sensor, "gravity"; "totalacceleration" (Android) includes both; "magnetometer"
+is in uT. Other sensors are skipped.
 
-A line of any other device is one sample; gyro [rad/s], accel [m/s^2] and, where there is one, mag
-[uT] come together or alone:
+A line of any other device is one sample; gyro [rad/s], accel [m/s^2] and, optionally, mag [uT] may
+share a line or have lines of their own:
 
     {"device": "rig", "t": 12.345, "gyro": [0.1, 0, 0], "accel": [0, 0, 9.81]}
 
-`t_ns` (a whole number) may stand for `t`. A batch is taken as a whole or refused as a whole.
+`t_ns` (an integer) may replace `t`. A batch is accepted or refused as a whole.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from stario.sequences.errors import InputError
 Vector = tuple[float, float, float]
 
 MOST_ENTRIES = 50_000
-"""Samples in one push; the fastest phone needs a minute for them."""
+"""Maximum number of samples in one push; the fastest phone takes a minute to record them."""
 
 LONGEST_SPAN = 600 * 10**9
-"""Time [ns] between a push's first and last sample: longer, and a stamp is wrong."""
+"""Maximum time [ns] between a push's first and last sample; beyond it a time stamp is wrong."""
 
 _LARGEST = 1e4
-"""No sensor reads more in rad/s, m/s^2 or uT."""
+"""Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
 _LATEST = 2**63
 _LONGEST_NAME = 80
@@ -57,8 +57,8 @@ class Reading:
 
     Attributes:
         sensor: one of `SENSORS`, or `ORIENTATION`.
-        time_ns: on the device's clock [ns].
-        value: [rad/s], [m/s^2] or [uT]; of an attitude the unit vector up, in B.
+        time_ns: time on the device's clock [ns].
+        value: reading in rad/s, m/s^2 or uT; for an attitude, the unit vector up, in B.
     """
 
     sensor: str
@@ -68,12 +68,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Batch:
-    """What came at once from one device.
+    """Readings that arrived together from one device.
 
     Attributes:
-        device: which one.
-        recording: its own name for the recording, empty where it has none.
-        readings: in the order they came.
+        device: name of the device.
+        recording: its own name for the recording; empty if it has none.
+        readings: readings in order of arrival.
     """
 
     device: str
@@ -82,10 +82,10 @@ class Batch:
 
 
 def parse_push(body: bytes) -> Batch:
-    """A push of Sensor Logger.
+    """Parse a push of Sensor Logger.
 
     Raises:
-        InputError: the body is no such JSON; it names the field.
+        InputError: the body is not such JSON; the error names the field.
     """
     message = _object("body", json_from(body))
     payload = message.get("payload")
@@ -105,14 +105,14 @@ def parse_push(body: bytes) -> Batch:
 
 
 def parse_line(line: bytes, sender: str) -> Batch:
-    """A line of a device's own.
+    """Parse a line of JSON.
 
     Args:
-        line: JSON.
-        sender: the device's name where the line has none.
+        line: JSON object.
+        sender: name of the device if the line gives none.
 
     Raises:
-        InputError: the line is no such JSON; it names the field.
+        InputError: the line is not such JSON; the error names the field.
     """
     message = _object("line", json_from(line))
     if "payload" in message:
@@ -133,7 +133,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
 
 
 def joined(batches: Iterable[Batch]) -> list[Batch]:
-    """Batches with those that follow each other of one recording made one."""
+    """Merge consecutive batches of the same device and recording."""
     made: list[Batch] = []
     for batch in batches:
         if made and (made[-1].device, made[-1].recording) == (batch.device, batch.recording):
@@ -144,24 +144,24 @@ def joined(batches: Iterable[Batch]) -> list[Batch]:
 
 
 def json_from(text: bytes) -> Any:
-    """JSON, whatever the bytes are.
+    """Parse JSON from arbitrary bytes.
 
     Raises:
-        InputError: they are none.
+        InputError: the bytes are not valid JSON.
     """
     try:
         return json.loads(text)
     except RecursionError:
         raise InputError("JSON", "too many levels", "an object") from None
-    except ValueError as error:  # no UTF-8, no JSON, or a number of thousands of digits
+    except ValueError as error:  # not UTF-8, not JSON, or a number of thousands of digits
         raise InputError("JSON", str(error)[:120], "valid JSON in UTF-8") from None
 
 
 def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
-    """One sample of a push, None of a sensor that no track is made of."""
+    """Parse one sample of a push; None for a sensor that is not used."""
     name = entry.get("name")
     if not isinstance(name, str):
-        raise InputError(f"{where}.name", _kind(name), "the name of a sensor")
+        raise InputError(f"{where}.name", _kind(name), "a sensor name")
     sensor = name.lower()
     values = entry.get("values", entry)
     if sensor == ORIENTATION:
@@ -176,7 +176,7 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
 
 
 def _vertical(time: Any, values: Any) -> Reading | None:
-    """Up as the phone knows it; None where it does not tell, for no track needs it."""
+    """Return the vertical by the phone's attitude; None if not valid, since no track needs it."""
     try:
         x, y, z, w = (_number("q", values.get(f"q{axis}")) for axis in "xyzw")
         time_ns = _nanoseconds("time", time)
@@ -207,18 +207,18 @@ def _name(where: str, value: Any, needed: bool = True) -> str:
         value = str(value)
     if not isinstance(value, str) or (needed and not value.strip()):
         raise InputError(where, _kind(value), "a name")
-    # What is no character (a lone surrogate) could be put neither on the page nor in an answer.
+    # A lone surrogate is not a character: neither the page nor a response could contain it.
     return value.strip()[:_LONGEST_NAME].encode("utf-8", "replace").decode()
 
 
 def _nanoseconds(where: str, value: Any) -> int:
-    """A whole number, also as text of digits, as the app's JSON exports have it."""
+    """Parse an integer, also given as a string of digits as in the app's JSON exports."""
     if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20:
         value = int(value)
     if isinstance(value, float) and math.isfinite(value):
         value = round(value)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _LATEST:
-        raise InputError(where, _kind(value), "a time in nanoseconds, not negative")
+        raise InputError(where, _kind(value), "a non-negative time in nanoseconds")
     return value
 
 
@@ -249,12 +249,12 @@ def _number(where: str, value: Any) -> float:
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise InputError(where, "no finite number", "a number")
+        raise InputError(where, "no finite number", "a finite number")
     return number
 
 
 def _kind(value: Any) -> str:
-    """What something is, in few words whatever its size."""
+    """Describe a value in a few words, whatever its size."""
     if value is None:
         return "nothing"
     if isinstance(value, (dict, list)):

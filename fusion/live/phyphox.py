@@ -1,7 +1,7 @@
-"""A phone with phyphox: its remote interface is asked for what is new, some times a second.
+"""Client of a phone running phyphox: polls its remote interface several times a second.
 
 The app (menu: "Allow remote access") answers `/config` with the experiment's sensors and the names
-of their buffers, and `/get?acc_time=12.3&accX=12.3|acc_time` with what is newer than 12.3 s. The
+of their buffers, and `/get?acc_time=12.3&accX=12.3|acc_time` with the values after 12.3 s. The
 experiment must record the gyroscope and the acceleration with g: "Add experiment, simple" has both.
 """
 
@@ -19,7 +19,7 @@ from stario.fusion.live.payload import GRAVITY, GYRO, LINEAR, MAG, TOTAL, Batch,
 from stario.sequences.errors import InputError
 
 PERIOD = 0.2
-"""Between two questions [s]."""
+"""Interval between two requests [s]."""
 
 _SENSORS = {
     "gyroscope": GYRO,
@@ -37,13 +37,13 @@ _log = logging.getLogger(__name__)
 
 
 class Phyphox:
-    """A client of one phone.
+    """Client of one phone.
 
     Args:
-        address: such as 192.168.0.7:8080.
+        address: host and port, such as 192.168.0.7:8080.
 
     Raises:
-        InputError: it is no address of HTTP.
+        InputError: it is not an HTTP address.
     """
 
     def __init__(self, address: str) -> None:
@@ -57,20 +57,20 @@ class Phyphox:
         self._session = ""
 
     def fetch(self) -> Batch:
-        """What is new on the phone.
+        """Fetch the samples recorded since the last call.
 
         Raises:
-            InputError: its answer is not phyphox's, or the experiment lacks a sensor.
-            OSError: it does not answer.
+            InputError: the response is not phyphox's, or the experiment lacks a sensor.
+            OSError: the phone does not respond.
         """
         if not self._buffers:
             self._buffers = buffers_of(self._ask("/config"))
         answer = self._ask(f"/get?{'&'.join(self._questions())}")
         status, buffers = answer.get("status"), answer.get("buffer")
         if not isinstance(status, dict) or not isinstance(buffers, dict):
-            raise InputError("phyphox", "no status or no buffers", "an answer of phyphox's /get")
+            raise InputError("phyphox", "no status or no buffers", "a response of phyphox's /get")
         session = str(status.get("session", ""))
-        if session != self._session:  # another experiment: its buffers and times are others
+        if session != self._session:  # another experiment, with other buffers and times
             started, self._session = bool(self._session), session
             if started:
                 self._buffers, self._newest = {}, {}
@@ -93,8 +93,8 @@ class Phyphox:
         columns = [_column(buffers, name) for name in self._buffers[sensor]]
         readings = []
         if columns[0] and columns[0][-1] < self._newest.get(sensor, -1.0):
-            self._newest = {}  # the experiment was cleared: its time begins anew
-        for t, *value in zip(*columns, strict=False):  # one may be ahead by a sample
+            self._newest = {}  # the experiment was cleared: its time restarts
+        for t, *value in zip(*columns, strict=False):  # one column may be a sample longer
             if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _LARGEST_VALUE:
                 continue
             self._newest[sensor] = t
@@ -107,12 +107,12 @@ class Phyphox:
             body = answer.read(_LARGEST_ANSWER)
         message = json_from(body)
         if not isinstance(message, dict):
-            raise InputError("phyphox", "another answer", "a JSON object")
+            raise InputError("phyphox", "a different response", "a JSON object")
         return message
 
 
 def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]]:
-    """Names of the buffers of time, x, y and z by sensor, of phyphox's `/config`.
+    """Return the names of the time, x, y and z buffers by sensor from phyphox's `/config`.
 
     Raises:
         InputError: the experiment lacks the gyroscope or the acceleration with g.
@@ -139,14 +139,14 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]
 
 
 async def follow(hub: Hub, phone: Phyphox) -> None:
-    """Ask a phone for as long as the server runs; what goes wrong is told once, and tried again."""
+    """Poll a phone for as long as the server runs; log each problem once and retry."""
     told = ""
     while True:
         try:
             batch = await asyncio.to_thread(phone.fetch)
             await hub.take(batch)
             told = ""
-        except Exception as error:  # whatever a phone in a bad network answers, it is asked again
+        except Exception as error:  # whatever a phone on a bad network answers, retry
             words = str(error) or type(error).__name__
             if words != told:
                 _log.warning("%s: %s", phone.device, words)
@@ -156,7 +156,7 @@ async def follow(hub: Hub, phone: Phyphox) -> None:
 
 
 def _column(buffers: Mapping[str, Any], name: str) -> list[float]:
-    """The numbers of a buffer, up to the first that is none."""
+    """Return the numbers of a buffer, up to the first invalid value."""
     buffer = buffers.get(name)
     values = buffer.get("buffer") if isinstance(buffer, dict) else None
     numbers: list[float] = []

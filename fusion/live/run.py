@@ -1,4 +1,4 @@
-"""The live server as a whole: page and pushes, lines, phones that are asked; one event loop."""
+"""The complete live server: page, pushes, lines and polled phones in one event loop."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
 _LOOKS_EVERY = 0.1
-"""For a signal that ends the server [s]."""
+"""Interval between checks for a signal to stop [s]."""
 
 
 class LiveServer:
-    """Everything that `stario live` runs.
+    """Server of `stario live`.
 
     Args:
-        new_navigator: makes a navigator for each track.
+        new_navigator: returns a new navigator for each track.
         out: folder for recordings.
-        host: to listen on. Off loopback there is a token.
-        port: of the page, 0 for a free one.
-        lines_port: of the lines, 0 for a free one.
-        phones: addresses of phones with phyphox.
+        host: address to listen on; unless it is loopback, there is a token.
+        port: port of the page; 0 for a free one.
+        lines_port: port of the lines of JSON; 0 for a free one.
+        phones: addresses of phones running phyphox.
 
     Attributes:
-        token: empty on loopback.
+        token: access token; empty on loopback.
 
     Raises:
-        InputError: a phone's address is none, or the port is taken.
+        InputError: a phone's address is invalid, or the port is in use.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class LiveServer:
 
     @property
     def lines_port(self) -> int:
-        """Where lines are taken."""
+        """Port of the lines of JSON."""
         return self._lines.port
 
     def run(self, started: Callable[[], None] = lambda: None) -> None:
-        """Serve until stopped by a signal or `stop`; `started` is called once all listen."""
+        """Serve until stopped by a signal or `stop`; `started` is called once all are listening."""
         with suppress(KeyboardInterrupt):
             asyncio.run(self._run(started))
 
@@ -81,7 +81,7 @@ class LiveServer:
         self._server.should_exit = True
 
     def addresses(self) -> list[str]:
-        """Where to look and where to send, for a person."""
+        """Return lines of text with the addresses to open and to send to."""
         end = f"?token={self.token}" if self.token else ""
         here = self._host if self._host not in ("0.0.0.0", "::") else _own_address()
         shown = f"[{here}]" if ":" in here else here
@@ -95,7 +95,7 @@ class LiveServer:
         if self.token:
             lines.append(f'token:          {self.token} (lines begin with {{"token": "..."}})')
         else:
-            lines.append("only this computer can connect; --host 0.0.0.0 lets phones in")
+            lines.append("only this computer can connect; use --host 0.0.0.0 for phones")
         return lines
 
     async def _run(self, started: Callable[[], None]) -> None:
@@ -124,7 +124,7 @@ class LiveServer:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches an address."""
+    """Return whether an address can be reached only from this computer."""
     if host == "localhost":
         return True
     try:
@@ -141,7 +141,7 @@ def _bound(host: str, port: int) -> socket.socket:
         listener.bind((host, port))
     except socket.gaierror as error:
         listener.close()
-        raise InputError("--host", host, "an address of this computer, as 0.0.0.0") from error
+        raise InputError("--host", host, "an address of this computer, or 0.0.0.0") from error
     except OSError as error:
         listener.close()
         found = f"{host} {port}: {error.strerror or error}"
@@ -150,7 +150,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def _own_address() -> str:
-    """This computer's address in its network; nothing is sent to find it."""
+    """Return this computer's address in its network, found without sending anything."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

@@ -1,16 +1,17 @@
-"""The live server: pushes in, one page out.
+"""HTTP side of the live server: receives pushes, serves one page.
 
     GET  /                       the page
-    GET  /events                 its news, as server-sent events
+    GET  /events                 its updates, as server-sent events
     POST /data                   a push of Sensor Logger, or lines of JSON (application/x-ndjson)
     POST /devices/{id}/{command} start, stop, zero, or fix with {"x": m, "y": m, "sigma": m}
 
-`/data?accel_unit=g` (or -g, -m/s2) says what a device's accelerometer reports; the minus is Apple's
-sign. Whatever cannot be used gets a 4xx with the reason, and changes nothing.
+`/data?accel_unit=g` (or -g, -m/s2) gives the unit of a device's accelerometer; the minus is Apple's
+sign. An invalid request gets a 4xx with the reason and changes nothing.
 
-A server that others can reach wants its token with everything, in the address (`?token=...`), as
-`Authorization: Bearer ...`, or in the cookie that the page sets. One on loopback wants none, but
-answers only to loopback's own names, or any web page that a browser visits could reach it.
+A server that others can reach requires its token with every request: in the address
+(`?token=...`), as `Authorization: Bearer ...`, or in the cookie that the page sets. One on loopback
+needs none but answers only to loopback host names; otherwise any web page that a browser visits
+could reach it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, unit_named
 
 MOST_BYTES = 4 * 1024 * 1024
-"""Of a push."""
+"""Maximum size of a push [bytes]."""
 
 LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
 
@@ -55,11 +56,11 @@ _log = logging.getLogger(__name__)
 
 
 def live_app(hub: Hub, token: str = "") -> Starlette:
-    """The web application.
+    """Return the web application.
 
     Args:
-        hub: its devices.
-        token: that everything must bring; empty for a server on loopback alone.
+        hub: hub of the devices.
+        token: token that every request must carry; empty for a server on loopback only.
     """
     guard = (
         Middleware(TokenMiddleware, token=token)
@@ -84,18 +85,18 @@ def live_app(hub: Hub, token: str = "") -> Starlette:
 
 
 class TokenMiddleware:
-    """Lets nothing through that does not bring the token.
+    """Middleware that rejects requests without the token.
 
     Args:
-        app: behind it.
-        token: not empty.
+        app: application behind it.
+        token: required token, not empty.
     """
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or pass it on."""
+        """Reject a request, or pass it on."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -105,7 +106,7 @@ class TokenMiddleware:
         shown = (named, bearer, request.cookies.get(_COOKIE, ""))
         if not any(same(one, self._token) for one in shown):
             reason = (
-                "token: none or another one; add ?token=..., as the server printed at its start"
+                "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
             await JSONResponse({"error": reason}, 401)(scope, receive, send)
             return
@@ -120,15 +121,15 @@ class TokenMiddleware:
 
 
 def same(shown: str, token: str) -> bool:
-    """Whether a token is the right one, in a time that does not tell how nearly."""
+    """Compare a token with the right one in constant time."""
     return hmac.compare_digest(*(one.encode("utf-8", "surrogatepass") for one in (shown, token)))
 
 
 def accel_factor(unit: str) -> float:
-    """What turns an accelerometer's unit into specific force in m/s^2.
+    """Return the factor from an accelerometer's unit to specific force in m/s^2.
 
     Raises:
-        InputError: there is no such unit.
+        InputError: the unit is unknown.
     """
     name = unit_named(unit)
     if name not in ACCEL_UNITS:
@@ -144,7 +145,7 @@ async def _data(request: Request) -> Response:
         body = await _body(request)
         lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
         sender = f"http {request.client.host if request.client else ''}"
-        # In a thread, so that a large one holds up nobody else.
+        # In a thread, so that a large body does not block other requests.
         batches = await asyncio.to_thread(_parsed, body, sender if lines else "")
     except InputError:
         hub.refuse("http")
@@ -156,7 +157,7 @@ async def _data(request: Request) -> Response:
 
 
 def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
-    """The batches of a body, all of them or none."""
+    """Parse the batches of a body, all of them or none."""
     if not sender_of_lines:
         return [parse_push(body)]
     lines = [(k, line) for k, line in enumerate(body.splitlines(), 1) if line.strip()]
@@ -172,23 +173,23 @@ def _parsed_line(number: int, line: bytes, sender: str) -> Batch:
 
 
 def _check_origin(request: Request) -> None:
-    """Browsers say whose page sends something: pages of others must not steer this server."""
+    """Refuse requests from other servers' pages, which browsers identify by their origin."""
     origin = request.headers.get("origin")
     if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
         raise InputError("origin", "a page of another server", "this server's page, or an app")
 
 
 async def _body(request: Request) -> bytes:
-    """The whole body; a larger one is refused before it is there."""
+    """Read the whole body; refuse one that is too large before it has arrived."""
     parts, size = [], 0
     try:
         async for part in request.stream():
             size += len(part)
             if size > MOST_BYTES:
-                raise InputError("body", "a larger one", f"at most {MOST_BYTES} bytes")
+                raise InputError("body", "a larger body", f"at most {MOST_BYTES} bytes")
             parts.append(part)
     except ClientDisconnect:
-        raise InputError("body", "a part of it", "a whole one") from None
+        raise InputError("body", "only a part", "a complete body") from None
     return b"".join(parts)
 
 
@@ -208,7 +209,7 @@ def _fix_values(message: Any) -> dict[str, float]:
     for name in ("x", "y", "sigma"):
         value = message.get(name) if isinstance(message, dict) else None
         if not isinstance(value, (int, float)) or not abs(value) <= _FURTHEST:
-            raise InputError(name, "none, or no number", f"a number up to {_FURTHEST:g} m")
+            raise InputError(name, "nothing, or no number", f"a number up to {_FURTHEST:g} m")
         values[name] = float(value)
     low, high = _SIGMAS
     if not low <= values["sigma"] <= high:

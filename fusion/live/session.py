@@ -1,4 +1,4 @@
-"""One device: its samples on the way into a recording, a navigator and the points of its track."""
+"""One device: passes its samples to a recording, a navigator and the displayed track."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 
 BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
-"""A jump of the device's clock beyond these [ns] begins a new track."""
+"""A jump of the device's clock beyond these [ns] starts a new track."""
 
 _HEALTH_SECONDS = 1.0
 
 _SURE = 0.7
-"""Cosine between up and the force from which its sign is known."""
+"""Cosine between the vertical and the force above which the force's sign is certain."""
 
 
 class Session:
-    """A device's stream. Not for several threads at once: its caller holds `hub`'s lock.
+    """Stream of one device. Not thread-safe: the caller holds `hub`'s lock.
 
     Args:
-        device: its name.
-        folder: for recordings.
-        new_navigator: makes a navigator for each track.
+        device: name of the device.
+        folder: folder for recordings.
+        new_navigator: returns a new navigator for each track.
     """
 
     def __init__(self, device: str, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
@@ -64,19 +64,19 @@ class Session:
 
     @property
     def path(self) -> Path | None:
-        """The recording in progress, or the last one; None before the first sample."""
+        """Path of the current recording, or of the last; None before the first sample."""
         return None if self._file is None else self._file.path
 
     def take(self, batch: Batch, received: float, accel_factor: float = 1.0) -> int:
-        """Take a batch in: first to disk, then to the navigator.
+        """Write a batch to disk, then pass it to the navigator.
 
         Args:
-            batch: of this device.
-            received: when it came [s since 1970].
-            accel_factor: turns its accelerometer into specific force in m/s^2.
+            batch: batch of this device.
+            received: time of receipt [s since 1970].
+            accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
 
         Returns:
-            How many samples were taken.
+            Number of samples taken.
         """
         self.received = received
         if not self.running:
@@ -90,7 +90,7 @@ class Session:
             (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
             for time, gyro, a in self._merger.add(batch.readings)
         ]
-        # Until they are on disk they wait: a push that failed is sent again, without them.
+        # Samples wait until they are on disk: when a failed push is repeated, they count as late.
         samples = [*self._unwritten[0], *samples]
         if not samples:
             return 0
@@ -112,18 +112,18 @@ class Session:
         return len(samples)
 
     def start(self, recording: str = "") -> None:
-        """Begin a new track and a new recording."""
+        """Start a new track and a new recording."""
         if self._file is not None:
             self._file.close()
         self._begin(recording)
         self.running = True
 
     def stop(self) -> None:
-        """End the track; what comes is ignored until `start`."""
+        """End the track; ignore data until `start`."""
         self.running = False
 
     def zero(self) -> None:
-        """Draw the newest position as the origin; the estimate and the recording stay.
+        """Display the newest position as the origin, without changing estimate or recording.
 
         Raises:
             InputError: there is no position yet.
@@ -132,7 +132,7 @@ class Session:
         self.drawn.revision += 1
 
     def fix(self, x: float, y: float, sigma: float) -> None:
-        """The device is at x, y of the drawn map [m], known to sigma [m]; nothing of its height.
+        """Apply a fix at x, y of the displayed map [m] with sigma [m]; the height is left free.
 
         Raises:
             InputError: there is no position yet.
@@ -152,19 +152,19 @@ class Session:
         self._tell_health(after.time)
 
     def close(self) -> None:
-        """Nothing follows."""
+        """Close the recording."""
         if self._file is not None:
             self._file.close()
 
     def status(self) -> dict[str, Any]:
-        """What the page shows beside the track."""
+        """Return what the page shows next to the track."""
         problem = self.problem
         if not problem and self._merger.missing:
-            problem = f"no samples of {self._merger.missing}: switch it on in the logger"
+            problem = f"no samples of {self._merger.missing}: enable it in the logger"
         if not problem and self._factor * self._merger.upward < -_SURE:
             other = "-m/s2" if self._factor > 0 else "m/s2"
             problem = (
-                "the accelerometer points down where the phone's own attitude says up, as on an "
+                "the accelerometer points down where the phone's own attitude points up, as on an "
                 f"iPhone: send to the address with accel_unit={other}"
             )
         return {
@@ -182,7 +182,7 @@ class Session:
         }
 
     def _is_new(self, batch: Batch) -> bool:
-        """Whether a batch belongs to another recording than those before."""
+        """Return whether a batch belongs to a different recording than those before."""
         if self._newest_ns < 0 or not batch.readings:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
@@ -214,7 +214,7 @@ class Session:
         self.words = [{"level": f.level, "text": f.text, "advice": f.advice} for f in found]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
-        """Samples so far, and their rate, smoothed over some batches."""
+        """Update the number of samples and their rate, smoothed over some batches."""
         since = self._newest_ns if self._newest_ns >= 0 else first_ns
         self._newest_ns = max(self._newest_ns, last_ns)
         self.samples += count

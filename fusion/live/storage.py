@@ -1,9 +1,8 @@
-"""A live recording on disk: StarIO's own CSV, complete up to the last batch at any moment.
+"""Live recording on disk: StarIO's own CSV, complete up to the last batch at any moment.
 
-Whole lines are handed to the system with one unbuffered write per batch, so that a program that is
-killed loses nothing of what it took in. `read_recording` reads the file while it grows, too. The
-last column, the time of receipt, is no data of the device: a line that was cut short lacks it, and
-is told from a whole one.
+Each batch is one unbuffered write of whole lines, so that a killed program loses nothing that it
+accepted. `read_recording` can also read the file while it grows. The last column, the time of
+receipt, does not come from the device: a truncated line lacks it and can thus be recognised.
 """
 
 from __future__ import annotations
@@ -24,25 +23,25 @@ HEADER = (
     "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],received [unix s]\n"
 )
 MAGNETIC_HEADER = HEADER.replace("received", "mx [uT],my [uT],mz [uT],received")
-"""Of a device with a magnetometer, whose fields stand in rows of their own."""
+"""Header for a device with a magnetometer, whose readings have rows of their own."""
 
 FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
 
 class LiveFile:
-    """A recording that grows, and its fixes beside it.
+    """Growing recording, with its fixes in a file next to it.
 
     Args:
-        folder: to write into; it is made where it is missing.
+        folder: folder to write into; created if missing.
         device: part of the file's name.
-        magnetic: whether it has columns for a magnetic field.
+        magnetic: whether the file has columns for a magnetic field.
 
     Attributes:
-        path: of the recording.
-        fixes_path: of the fixes; there is a file once there is a fix.
+        path: path of the recording.
+        fixes_path: path of the fixes; the file exists once there is a fix.
 
     Raises:
-        InputError: the folder or file cannot be made.
+        InputError: the folder or file cannot be created.
     """
 
     def __init__(self, folder: Path, device: str, magnetic: bool = False) -> None:
@@ -51,7 +50,7 @@ class LiveFile:
             self.path, self._file = _new_file(folder, device)
         except OSError as error:
             found = f"{folder}: {error.strerror or error}"
-            raise InputError("out", found, "a folder that can be written to") from error
+            raise InputError("out", found, "a writable folder") from error
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
         self._between = ",,,," if magnetic else ","
         self._file.write((MAGNETIC_HEADER if magnetic else HEADER).encode())
@@ -59,10 +58,10 @@ class LiveFile:
     def append(
         self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
     ) -> None:
-        """Add samples and magnetic fields, received at a time [s since 1970].
+        """Append samples and magnetic fields received at a time [s since 1970].
 
         Raises:
-            OSError: not all of them could be written; none is then.
+            OSError: they could not all be written, in which case none is.
         """
         end = f"{received:.3f}\n"
         rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
@@ -73,7 +72,7 @@ class LiveFile:
         _write_whole(self._file, "".join(rows).encode())
 
     def append_fix(self, fix: Fix) -> None:
-        """Add a position fix as `stario run --fixes` reads it, its time since the first sample."""
+        """Append a position fix for `stario run --fixes`; its time counts from the first sample."""
         (x, y, z), sigma = fix.value.tolist(), fix.covariance.diagonal() ** 0.5
         sx, sy, sz = sigma.tolist()
         new = not self.fixes_path.exists()
@@ -82,12 +81,12 @@ class LiveFile:
             _write_whole(file, ((FIXES_HEADER if new else "") + line).encode())
 
     def close(self) -> None:
-        """No more follows."""
+        """Close the file."""
         self._file.close()
 
 
 def _write_whole(file: BinaryIO, data: bytes) -> None:
-    """Append all of it or nothing: a nearly full disk takes a part."""
+    """Append all data or nothing, as a nearly full disk may take only a part."""
     before = file.tell()
     try:
         if file.write(data) < len(data):
@@ -99,7 +98,7 @@ def _write_whole(file: BinaryIO, data: bytes) -> None:
 
 
 def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:
-    """A file that was not there before, named by time and device."""
+    """Create a new file, named by time and device."""
     slug = re.sub(r"[^A-Za-z0-9]+", "-", device).strip("-")[:32] or "device"
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{slug}"
     for number in range(1, 1000):
@@ -108,4 +107,4 @@ def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:
             return path, path.open("xb", buffering=0)
         except FileExistsError:
             continue
-    raise InputError("out", f"1000 files named {stem}", "room for another", "choose another folder")
+    raise InputError("out", f"999 files named {stem}", "an unused name", "choose another folder")

@@ -1,1 +1,1 @@
-"""A report to look at: what a run found, as one HTML file that needs nothing else."""
+"""Reports of a run: a self-contained HTML file, and a file for the rerun viewer."""

@@ -1,4 +1,4 @@
-"""The report's two figures, as plotly's own: the map, and all panels over one time axis."""
+"""The report's two plotly figures: the map, and all panels over one time axis."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from stario.fusion.report.series import Series, ellipse
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PANEL_HEIGHT = 190
-"""Of a panel over time [px]."""
+"""Height of a panel over time [px]."""
 
 _ELLIPSES = 12
-"""Drawn along a track."""
+"""Number of ellipses drawn along a track."""
 
 _FONT = {"family": "system-ui, sans-serif", "size": 13, "color": INK}
 _LEFT = 58
-"""Left margin [px]: the panels' labels need no more, and a phone has no more to give."""
+"""Left margin [px]: enough for the panels' labels, and all that a phone can spare."""
 
 
 def map_figure(
     tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None = None
 ) -> go.Figure:
-    """All tracks from above on equal axes, with 3-sigma ellipses along those that state them.
+    """Draw all tracks from above on equal axes, with 3-sigma ellipses where there is covariance.
 
     Args:
-        tracks: by name.
-        truth: in the same frame, None where there is no true track.
-        known: positions or waypoints, likewise, that there are instead.
+        tracks: tracks by name.
+        truth: ground truth in the same frame, or None.
+        known: positions or waypoints in the same frame, in place of a true track, or None.
     """
     figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
@@ -69,7 +69,7 @@ def map_figure(
 
 
 def time_figure(panels: Sequence[Panel]) -> go.Figure:
-    """All panels below each other with one time axis."""
+    """Stack all panels over one time axis."""
     count = len(panels)
     height = PANEL_HEIGHT * count + 60
     figure = make_subplots(
@@ -88,7 +88,7 @@ def time_figure(panels: Sequence[Panel]) -> go.Figure:
         title={"text": "time since the first sample [s]", "standoff": 6, "font": {"size": 13}},
         row=count,
     )
-    # Titles begin at the panels' left edge: on a phone there is no room around a centred one.
+    # Titles start at the panels' left edge: on a phone there is no room around a centred one.
     figure.update_annotations(x=0.0, xanchor="left", font={"size": 13, "color": INK})
     figure.update_layout(
         font=_FONT,
@@ -134,15 +134,15 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
 
 
 def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
-    """Some outlines in one trace, nan between them; none that would cross all of the map.
+    """Draw some outlines in one trace, separated by nan; skip any too large for the map.
 
     Args:
-        name: of the track.
-        series: with a covariance.
-        largest: half axis that is drawn [m]; beyond, the slider's ellipse tells it.
+        name: name of the track.
+        series: track with a covariance.
+        largest: largest semi-axis drawn [m]; larger ellipses appear only at the slider's time.
     """
     _, colour, _ = style(name)
-    assert series.position_covariance is not None  # asked for only where there is one
+    assert series.position_covariance is not None  # called only where there is one
     known = np.flatnonzero(np.isfinite(series.position[:, 0]))
     rows = np.unique(known[np.linspace(0, len(known) - 1, _ELLIPSES).round().astype(int)])
     outlines = [(k, ellipse(series.position_covariance[k])) for k in rows]
@@ -166,7 +166,7 @@ def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
 
 
 def _ends(name: str, series: Series) -> go.Scatter:
-    """Where it begins, an open circle, and ends, a square."""
+    """Mark the start with an open circle and the end with a square."""
     known = np.flatnonzero(np.isfinite(series.position[:, 0]))
     at = series.position[known[[0, -1]], :2]
     return go.Scatter(
@@ -185,7 +185,7 @@ def _ends(name: str, series: Series) -> go.Scatter:
 
 
 def _known(known: PositionTrack) -> go.Scatter:
-    """Crosses where somebody, or a satellite, said the device was."""
+    """Mark known positions, such as waypoints or satellite fixes, with crosses."""
     return go.Scatter(
         x=known.position_W[:, 0].round(3),
         y=known.position_W[:, 1].round(3),
@@ -198,10 +198,10 @@ def _known(known: PositionTrack) -> go.Scatter:
 
 
 def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
-    """Limits (2, 2) of x and y that fit the truth, or the estimates that are no mere drift."""
+    """Return limits (2, 2) of x and y that fit the truth and all but the inertial-only track."""
     own = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
     at = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + own])
-    if truth is not None:  # a track that ran away must not make the truth a dot
+    if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]
         at = np.clip(at, low - (high - low).max(), high + (high - low).max())
     low, high = np.nanmin(at, axis=0), np.nanmax(at, axis=0)

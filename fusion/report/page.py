@@ -1,4 +1,4 @@
-"""The report as one HTML file: figures, cursor, health in words, table; it loads nothing else."""
+"""The report as one self-contained HTML file: figures, time cursor, health in words, table."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def write_report(
     metrics: Mapping[str, Metrics],
     alignment: Alignment = "first",
 ) -> Path:
-    """Write the report of one recording's tracks, whole or not at all.
+    """Write the report of one recording's tracks, completely or not at all.
 
     Args:
         path: the HTML file; its folder must exist.
-        sequence: the recording; its truth is drawn where it has one.
-        tracks: by name, as of `compare`, or the one of a run.
-        config: the filter's settings, for the gate.
-        metrics: figures by track, for the table.
-        alignment: of the tracks with the truth.
+        sequence: the recording; its ground truth is drawn if it has one.
+        tracks: tracks by name, as from `compare`, or the only one of a run.
+        config: settings, for the filter's gate.
+        metrics: metrics by track, for the table.
+        alignment: alignment of the tracks with the truth.
 
     Returns:
         The path.
@@ -67,7 +67,7 @@ def write_report(
 
 
 def write_comparison_report(folder: Path, comparison: Comparison, config: NavigatorConfig) -> Path:
-    """`report.html` of a comparison's recording; errors as of `write_report`."""
+    """Write `report.html` for a comparison; raises the errors of `write_report`."""
     return write_report(
         folder / "report.html",
         comparison.sequence,
@@ -85,7 +85,7 @@ def report_html(
     metrics: Mapping[str, Metrics],
     alignment: Alignment,
 ) -> str:
-    """The report's text; arguments as of `write_report`."""
+    """Return the report as HTML; arguments as for `write_report`."""
     from plotly.offline import get_plotlyjs
 
     from stario.fusion.evaluation.known_positions import shown_positions
@@ -105,7 +105,7 @@ def report_html(
     }
     known = None if truth is None else trajectory_series(truth, start)
     main = main_track(tracks)
-    # The IMU alone is kilometres off within a minute: no axis could hold it beside the others.
+    # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
     steady = {name: s for name, s in series.items() if name != "inertial"} or series
     panels = motion_panels(steady, known) + bias_panels(main, series[main])
     innovations = tracks[main].innovations or next(
@@ -139,7 +139,7 @@ def report_html(
 
 
 def main_track(tracks: Mapping[str, Track]) -> str:
-    """The track that facts, health and innovations are told of."""
+    """Return the name of the track whose facts, health and innovations are shown."""
     for name in ("ekf", "graph"):
         if name in tracks:
             return name
@@ -147,38 +147,38 @@ def main_track(tracks: Mapping[str, Track]) -> str:
 
 
 def asset(name: str) -> str:
-    """A text file of this package."""
+    """Read a text file of this package."""
     return importlib.resources.files("stario.fusion.report").joinpath(name).read_text("utf-8")
 
 
 def _filled(parts: Mapping[str, str]) -> str:
-    """The template with its parts; split first, so that a part may hold anything."""
+    """Fill the template; it is split first, so that a part may contain anything."""
     pieces = asset("report.html").split("%%")
     return "".join(piece if k % 2 == 0 else parts[piece] for k, piece in enumerate(pieces))
 
 
 def _script_json(content: object) -> str:
-    """JSON for a script element, which `</script>` in a name must not end."""
+    """Encode JSON for a script element, which `</script>` in a name must not end."""
     return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
     duration = sequence.duration
     facts = [
-        (_clock(duration), "min:s recorded"),
-        (f"{track.trajectory.path_length():.0f} m", "travelled by the estimate"),
-        (f"{len(sequence) / max(duration, 1e-9):.0f} Hz", "samples"),
+        (_clock(duration), "recorded (min:s)"),
+        (f"{track.trajectory.path_length():.0f} m", "estimated path length"),
+        (f"{len(sequence) / max(duration, 1e-9):.0f} Hz", "sampling rate"),
     ]
     if series.horizontal_sigma is not None and series.yaw_sigma is not None:
-        facts.append((f"{series.horizontal_sigma[-1]:.2f} m", "1 sigma of position at the end"))
-        facts.append((f"{series.yaw_sigma[-1]:.1f} deg", "1 sigma of yaw at the end"))
+        facts.append((f"{series.horizontal_sigma[-1]:.2f} m", "final position, 1 sigma"))
+        facts.append((f"{series.yaw_sigma[-1]:.1f} deg", "final yaw, 1 sigma"))
     end = track.trajectory.position_W[-1] - track.trajectory.position_W[0]
-    facts.append((f"{float(np.hypot(*end[:2])):.1f} m", "from start to end"))
+    facts.append((f"{float(np.hypot(*end[:2])):.1f} m", "between start and end"))
     return "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in facts)
 
 
 def _legend(names: Sequence[str]) -> str:
-    """A button for each track, with its line; it hides and shows the track everywhere."""
+    """Return a button for each track, with its line, that hides and shows it everywhere."""
     from stario.fusion.report.panels import style
 
     dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
@@ -226,14 +226,14 @@ def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
     )
     aligned = f"<li><b>Alignment</b> {html.escape(words['alignment'])}.</li>"
     return (
-        "<h2>Against the truth</h2><div class='wide'><table>"
+        "<h2>Accuracy against ground truth</h2><div class='wide'><table>"
         f"<tr><th></th>{head}</tr>{''.join(rows)}</table></div>"
         f"<ul class='words'>{told}{aligned}</ul>"
     )
 
 
 def _cursors(tracks: Mapping[str, Series], main: str) -> list[dict[str, Any]]:
-    """What the slider moves: place, ellipse and figures of each track over time, the main first."""
+    """Return what the slider moves: position, ellipse and values of each track, the main first."""
     from stario.fusion.report.panels import style
 
     cursors = []

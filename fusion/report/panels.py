@@ -1,4 +1,4 @@
-"""The report's panels over time: each a quantity with its bands, one below the other."""
+"""The report's panels over time: one quantity each, with its bands."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST_INNOVATIONS = 1500
 
 
 Column = Callable[[Series], FloatArray | None]
-"""What a panel draws of a track."""
+"""Function from a track to the column that a panel draws."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class Panel:
     """One row of the figure over time.
 
     Attributes:
-        title: with unit.
-        traces: of plotly.
-        layout: of its y axis.
+        title: title with unit.
+        traces: plotly traces.
+        layout: layout of its y axis.
     """
 
     title: str
@@ -43,7 +43,7 @@ class Panel:
 
 
 def style(name: str) -> tuple[str, str, str]:
-    """Label, colour and dash of a track."""
+    """Return label, colour and dash of a track."""
     if name == TRUTH:
         return TRUTH, "#000000", "solid"
     label, colour = TRACK_STYLES.get(name, (name, "#7F5539"))
@@ -51,13 +51,13 @@ def style(name: str) -> tuple[str, str, str]:
 
 
 def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
-    """Height, speed and yaw of every track; the error where there is truth."""
+    """Return panels of height, speed and yaw of every track, and of error if there is truth."""
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     panels = [] if truth is None else [_error_panel(tracks, truth)]
     columns: tuple[tuple[str, str, Column, Column], ...] = (
         ("Height [m]", "m", lambda s: s.position[:, 2], lambda s: s.height_sigma),
         ("Speed [m/s]", "m/s", lambda s: s.speed, lambda s: s.speed_sigma),
-        ("Yaw, turns counted [deg]", "deg", lambda s: s.yaw, lambda s: s.yaw_sigma),
+        ("Yaw, unwrapped [deg]", "deg", lambda s: s.yaw, lambda s: s.yaw_sigma),
     )
     for title, unit, value_of, sigma_of in columns:
         traces = []
@@ -67,12 +67,12 @@ def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Pa
             if title.startswith("Yaw"):
                 value = value + _whole_turns(value, next(iter(shown.values())).yaw)
             traces += curve(name, series.time, value, unit, sigma)
-        panels.append(Panel(f"{title}, band 3 sigma", traces, {"range": _limits(traces)}))
+        panels.append(Panel(f"{title}, band: 3 sigma", traces, {"range": _limits(traces)}))
     return panels
 
 
 def bias_panels(name: str, series: Series) -> list[Panel]:
-    """Both biases of a track by axis."""
+    """Return panels of both biases of a track by axis."""
     panels = []
     for title, unit, bias in (
         ("Gyroscope bias", "deg/s", series.gyro_bias),
@@ -93,24 +93,24 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
 def innovation_panels(
     innovations: Innovations, start: float, gate: float, unit: str
 ) -> list[Panel]:
-    """Innovations by axis within 3 sigma, and their NIS with the gate.
+    """Return panels of the innovations by axis with 3 sigma, and of their NIS with the gate.
 
     Args:
-        innovations: of an estimator's updates.
+        innovations: innovations of an estimator's updates.
         start: time of the recording's first sample [s].
         gate: probability of the chi-square test.
-        unit: of the residuals.
+        unit: unit of the residuals.
     """
     count = len(innovations.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MOST_INNOVATIONS)).round().astype(int))
-    rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # each of these is drawn
+    rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # draw all of these
     time, gated = innovations.time[rows] - start, innovations.gated[rows]
     panels = []
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
         traces = _band("innovation", time, 0.0 * residual, sigma, FAINT)
         traces += _dots(time, residual, gated, unit)
-        title = f"Innovation {axis} [{unit}], band 3 sigma"
+        title = f"Innovation {axis} [{unit}], band: 3 sigma"
         panels.append(Panel(title, traces, {"range": _limits(traces)}))
     limit = chi2_quantile(gate, 3)
     nis = np.maximum(innovations.nis[rows], 1e-2)
@@ -120,7 +120,7 @@ def innovation_panels(
         _line(ends, limit, f"gate {limit:.1f} ({gate:.1%})", "dash"),
         _line(ends, 3.0, "expected 3", "dot"),
     ]
-    title = f"NIS [1]: dotted expected 3, dashed gate {limit:.1f}"
+    title = f"NIS [1], dotted: expected 3, dashed: gate {limit:.1f}"
     panels.append(Panel(title, traces, {"type": "log", "dtick": 1}))
     return panels
 
@@ -133,7 +133,7 @@ def curve(
     sigma: FloatArray | None = None,
     look: tuple[str, str, str] | None = None,
 ) -> list[go.Scatter]:
-    """A line with hover, and its band of 3 sigma where there is one."""
+    """Return a line with hover text, and its 3-sigma band if there is a sigma."""
     label, colour, dash = look or style(name)
     line = go.Scatter(
         x=_rounded(time),
@@ -220,7 +220,7 @@ def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
 
 
 def _limits(traces: Sequence[go.Scatter]) -> list[float]:
-    """Of the axis: all curves, and of the bands what is not wide for moments only, as at first."""
+    """Return axis limits that fit all curves, and the bands except where briefly wide."""
     curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
     bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
     low, high = np.nanmin(curves), np.nanmax(curves)
@@ -232,11 +232,11 @@ def _limits(traces: Sequence[go.Scatter]) -> list[float]:
 
 
 def _whole_turns(yaw: FloatArray, reference: FloatArray) -> float:
-    """Degrees that bring a yaw to the turn of another one."""
+    """Return the whole turns [deg] that bring a yaw nearest to a reference."""
     off = np.nanmedian(yaw) - np.nanmedian(reference)
     return -360.0 * float(np.round(off / 360.0)) if np.isfinite(off) else 0.0
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """Digits beyond any screen's only make the file large."""
+    """Round to screen precision, to keep the file small."""
     return np.round(values, 5).astype(np.float32)

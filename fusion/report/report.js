@@ -1,5 +1,5 @@
 "use strict";
-// The slider's time moves a cursor on the map and on every panel; so does a pointer on a panel.
+// The slider moves a cursor on the map and on every panel; so does a click on a track or panel.
 (() => {
   const data = JSON.parse(document.getElementById("data").textContent);
   const [map, time] = ["map", "time"].map((id) => document.getElementById(id));
@@ -23,13 +23,13 @@
     }
     return t - times[low] <= times[high] - t ? low : high;
   };
-  const axis = (c, k) => {  // larger and smaller half axis of 1 sigma, and the larger one's direction
+  const axis = (c, k) => {  // semi-axes of 1 sigma, larger first, and the direction of the larger
     const mean = 0.5 * (c.xx[k] + c.yy[k]);
     const off = Math.hypot(0.5 * (c.xx[k] - c.yy[k]), c.xy[k]);
     return [Math.sqrt(mean + off), Math.sqrt(Math.max(0, mean - off)), 0.5 * Math.atan2(2 * c.xy[k], c.xx[k] - c.yy[k])];
   };
   const hidden = new Set();
-  // Shapes, for they are redrawn without the traces.
+  // Shapes, since they can be redrawn without the traces.
   const outline = (c, k) => {
     const [a, b, turn] = axis(c, k);
     const corners = Array.from({ length: 48 }, (_, n) => {

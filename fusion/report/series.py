@@ -1,4 +1,4 @@
-"""What the report draws of a track: columns over time, thinned, with their standard deviations."""
+"""Columns of a track over time as drawn by the report: thinned, with standard deviations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray, Trajectory
 
 MOST_POINTS = 1500
-"""Poses drawn of a track; a screen shows no more, and the file stays small."""
+"""Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,10 +20,10 @@ class Series:
     """A track as columns of N rows, nan where poses are not valid.
 
     Attributes:
-        time: [s] since the recording's first sample.
+        time: time since the recording's first sample [s].
         position: (N, 3) [m].
         speed: [m/s].
-        yaw: [deg], without jumps of a turn.
+        yaw: [deg], unwrapped.
         position_covariance: (N, 3, 3) [m^2], or None.
         speed_sigma: [m/s], or None.
         yaw_sigma: [deg], or None.
@@ -50,7 +50,7 @@ class Series:
 
     @property
     def horizontal_sigma(self) -> FloatArray | None:
-        """The larger axis of the horizontal 1-sigma ellipse (N,) [m]."""
+        """Larger semi-axis of the horizontal 1-sigma ellipse (N,) [m]."""
         if self.position_covariance is None:
             return None
         largest = np.linalg.eigvalsh(self.position_covariance[:, :2, :2])[:, 1]
@@ -58,11 +58,11 @@ class Series:
 
 
 def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
-    """Columns of a track.
+    """Return the columns of a track.
 
     Args:
-        track: with biases and covariance where it has them.
-        aligned: its trajectory as it is drawn, pose by pose the same.
+        track: track, with biases and covariance if it has them.
+        aligned: its trajectory as drawn, pose for pose.
         start: time of the recording's first sample [s].
     """
     rows = _thinned(len(track.time))
@@ -91,7 +91,7 @@ def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
 
 
 def trajectory_series(trajectory: Trajectory, start: float) -> Series:
-    """Columns of a trajectory; a speed that it does not hold is that of the positions."""
+    """Return the columns of a trajectory; without velocities, speed is taken from positions."""
     rows = _thinned(len(trajectory.time))
     time = trajectory.time[rows] - start
     valid = trajectory.valid[rows]
@@ -112,12 +112,12 @@ def trajectory_series(trajectory: Trajectory, start: float) -> Series:
 
 
 def ellipse(covariance: FloatArray, sigmas: float = 3.0, points: int = 49) -> FloatArray:
-    """Outline (points, 2) of the horizontal error ellipse about zero [m].
+    """Return the outline (points, 2) of the horizontal error ellipse about zero [m].
 
     Args:
         covariance: (3, 3) or (2, 2) [m^2].
-        sigmas: its size.
-        points: of the outline, the last equal to the first.
+        sigmas: size in standard deviations.
+        points: number of points, the last equal to the first.
     """
     values, axes = np.linalg.eigh(covariance[:2, :2])
     angle = np.linspace(0.0, 2.0 * np.pi, points)
@@ -132,9 +132,9 @@ def _thinned(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
 
 
 def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Of the norm of v: the root of u'Pu with u the direction of v, to first order."""
+    """Return the sigma of the norm of v to first order: sqrt(u'Pu), u the direction of v."""
     norm = np.linalg.norm(velocity, axis=1, keepdims=True)
-    # At rest there is no direction: the largest of all is what the norm may be off by.
+    # At rest there is no direction: take the largest variance of any.
     largest = np.linalg.eigvalsh(covariance)[:, -1]
     u = velocity / np.maximum(norm, 1e-9)
     along = np.einsum("ni,nij,nj->n", u, covariance, u)
@@ -142,7 +142,7 @@ def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _speed_of(trajectory: Trajectory) -> FloatArray:
-    """Central differences over half a second either way, so that noise of poses is no speed."""
+    """Take central differences over half a second either way, to suppress noise of poses."""
     t, half = trajectory.time, 0.5
     known = np.flatnonzero(trajectory.valid)
     if len(known) < 2:

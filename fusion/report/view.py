@@ -1,6 +1,6 @@
-"""A run for the viewer rerun: track, attitude, covariance and sensors over time.
+"""A run for the rerun viewer: track, attitude, covariance and sensors over time.
 
-The content goes to a file, which the viewer opens; it can be opened again, or sent to somebody.
+The content is written to a file, which the viewer opens; the file can be reopened or shared.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _AXIS_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115))
 
 
 def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Trajectory) -> Path:
-    """Write a run as rerun's file.
+    """Write a run as a rerun file.
 
     Args:
-        path: ends in .rrd; its folder must exist.
-        sequence: the recording, for the sensors and the truth.
-        track: for biases and covariance.
-        trajectory: the track's poses as they are drawn, aligned with the truth where there is one.
+        path: file to write, ending in .rrd; its folder must exist.
+        sequence: the recording, for the sensors and the ground truth.
+        track: the track, for biases and covariance.
+        trajectory: the track's poses as drawn, aligned with the truth if there is one.
 
     Returns:
         The path.
@@ -45,7 +45,7 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
     try:
         stream.save(path)
     except (OSError, RuntimeError) as error:
-        raise InputError("view", f"{path}: {error}", "a place that can be written to") from error
+        raise InputError("view", f"{path}: {error}", "a writable path") from error
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _log_path(rr, stream, "world/track", trajectory, _BLUE)
@@ -59,10 +59,10 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
 
 
 def open_view(path: Path) -> None:
-    """Open a file in the viewer, which goes on by itself.
+    """Open a file in the viewer, which keeps running on its own.
 
     Raises:
-        InputError: it cannot be started.
+        InputError: the viewer cannot be started.
     """
     command = [sys.executable, "-m", "rerun", str(path)]
     try:
@@ -70,13 +70,13 @@ def open_view(path: Path) -> None:
             command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
     except OSError as error:
-        raise InputError("view", str(error), "rerun's viewer") from error
+        raise InputError("view", str(error), "the rerun viewer") from error
 
 
 def _log_path(
     rr: Any, stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
 ) -> None:
-    """All of it at once, broken where poses are not valid."""
+    """Log a whole path at once, broken where poses are not valid."""
     known = trajectory.valid
     cuts = np.flatnonzero(np.diff(known.astype(int))) + 1
     parts = np.split(trajectory.position_W, cuts)
@@ -85,7 +85,7 @@ def _log_path(
 
 
 def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
-    """The device's axes where it is, and the ellipsoid of its position."""
+    """Log the device's axes at its position, and the ellipsoid of its position."""
     index = _times(rr, trajectory.time[trajectory.valid] - start)
     position = trajectory.position_W[trajectory.valid]
     columns = rr.Transform3D.columns(
@@ -100,7 +100,7 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
     from scipy.spatial.transform import Rotation
 
     values, vectors = np.linalg.eigh(covariance[trajectory.valid])
-    vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, no mirror
+    vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, not a reflection
     count = np.ones(len(position), dtype=int)
     columns = rr.Ellipsoids3D.columns(
         centers=position,

@@ -80,7 +80,7 @@ def test_a_tracks_button_hides_it_on_map_and_panels(show, report):
 
 def test_report_names_units_on_every_panel(report):
     text = report.read_text()
-    for title in ("Height [m]", "Speed [m/s]", "Yaw, turns counted [deg]", "NIS [1]", "x [m]"):
+    for title in ("Height [m]", "Speed [m/s]", "Yaw, unwrapped [deg]", "NIS [1]", "x [m]"):
         assert title in text
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=\"http", text.split("<script>")[0])
 
@@ -89,7 +89,7 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     sequence = start_of(demonstration(), "bare").without_truth()
     track = Navigator(load_model()).run(sequence)
     path = write_report(tmp_path / "r.html", sequence, {"ekf": track}, NavigatorConfig(), {})
-    assert "Against the truth" not in path.read_text()
+    assert "Accuracy against ground truth" not in path.read_text()
 
 
 def test_ellipse_is_where_the_mahalanobis_distance_is_three():

@@ -243,7 +243,7 @@ def test_lists_in_the_package_are_not_chosen_from_by_attributes(stario) -> None:
 def test_a_recording_is_not_learned_from_and_kept(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text(f"{recording}\n")
     done = stario("train", recording, "--validation", "list.txt", "--generated", 1)
-    done.assert_one_line_error("--validation", f"{recording}, which is learned from")
+    done.assert_one_line_error("--validation", f"{recording}, which is also trained on")
     assert not (tmp_path / "runs").exists()
 
 

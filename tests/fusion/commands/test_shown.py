@@ -29,7 +29,7 @@ def test_run_leaves_a_report_where_it_is_asked_for(stario, recording, tmp_path, 
     text = (tmp_path / "told/report.html").read_text()
     assert "<h1>walk</h1>" in text
     assert "factor graph" in text
-    assert "Against the truth" in text
+    assert "Accuracy against ground truth" in text
 
 
 def test_compare_leaves_a_report_beside_the_tracks(stario, recording, tmp_path, undrawn):

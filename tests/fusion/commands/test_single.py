@@ -451,19 +451,19 @@ def test_a_setting_that_does_not_fit_is_named_in_one_line(
 
 def test_nothing_is_written_over_unasked(stario, recording: Path, tmp_path: Path) -> None:
     before = recording.read_bytes()
-    stario("convert", recording, recording).assert_one_line_error("read as well", "another file")
-    stario("convert", recording, recording, "--overwrite").assert_one_line_error("read as well")
+    stario("convert", recording, recording).assert_one_line_error("also an input", "another file")
+    stario("convert", recording, recording, "--overwrite").assert_one_line_error("also an input")
     assert recording.read_bytes() == before
     there = tmp_path / "there.csv"
     there.write_text("mine")
-    stario("convert", recording, there).assert_one_line_error("there already", "--overwrite")
+    stario("convert", recording, there).assert_one_line_error("already exists", "--overwrite")
     assert there.read_text() == "mine"
     assert stario("convert", recording, there, "--overwrite").code == 0
     assert there.read_text() != "mine"
     assert stario("convert", recording, there, "two.h5").code == 0
     before = Path("two.h5").read_bytes()
     for source in ("two.h5:walk", "."):
-        stario("convert", source, "two.h5", "--overwrite").assert_one_line_error("read as well")
+        stario("convert", source, "two.h5", "--overwrite").assert_one_line_error("also an input")
     assert Path("two.h5").read_bytes() == before
 
 

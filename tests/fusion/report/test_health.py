@@ -60,7 +60,7 @@ def test_one_dropped_sample_of_thousands_is_not_none() -> None:
 
 def test_only_sensor_weights_and_filter_together_condemn_the_data() -> None:
     [verdict] = told(SHAKEN)
-    assert verdict.startswith("! This track is not to be trusted")
+    assert verdict.startswith("! This track cannot be trusted")
     assert "3 spike, 9 saturated" in verdict
     assert "17%" in verdict
     for agrees in ({"flagged": {"spike": 1}}, {"gated": 3}, {"notes": []}):
@@ -78,5 +78,5 @@ def test_a_board_shaken_by_hand_gets_one_line_and_one_turned_by_hand_does_not() 
     assert shaken is not None
     assert turned is not None
     [warning] = [line for line in told(shaken) if line.startswith("!")]
-    assert "not to be trusted" in warning
+    assert "cannot be trusted" in warning
     assert not any("trusted" in line for line in told(turned))
