@@ -1,4 +1,4 @@
-"""What is learned: the networks, their training and their use."""
+"""Neural networks: architectures, training and inference."""
 
 from typing import TYPE_CHECKING
 

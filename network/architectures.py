@@ -1,4 +1,4 @@
-"""Every network by the name it has in the paper's table, imported when it is built."""
+"""Registry of networks by their names in the paper's table; each is imported when it is built."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Architecture:
-    """Where a network is built, and what the paper's table says of it.
+    """A network's class and its figures in the paper's table.
 
     Attributes:
-        module: below `stario.network`.
-        attribute: class there, which takes the number of outputs.
-        parameters: of the paper's table [millions].
-        flops: of the paper's table [millions], for one window.
-        heads: 2 where displacement and log sigma have a head each, both counted by the table.
-        options: arguments of the class beside the number of outputs.
+        module: module of the class, below `stario.network`.
+        attribute: name of the class, which takes the number of outputs.
+        parameters: parameters in the paper's table [millions].
+        flops: FLOPs for one window in the paper's table [millions].
+        heads: 2 if displacement and log sigma have a head each, both counted by the table.
+        options: arguments of the class besides the number of outputs.
     """
 
     module: str
@@ -34,7 +34,7 @@ class Architecture:
 
     @property
     def table_outputs(self) -> int:
-        """Outputs that the paper's table counts: the horizontal mean velocity, of each head."""
+        """Number of outputs counted in the paper's table: horizontal mean velocity, per head."""
         return 2 * self.heads
 
 
@@ -53,7 +53,7 @@ ARCHITECTURES = {
     ),
     "StarIO": Architecture("stario", "StarIO", 2.762, 25.122),
 }
-"""In the order of the paper's table."""
+"""Networks by name, in the order of the paper's table."""
 
 
 def architecture(name: str) -> Architecture:
@@ -68,10 +68,10 @@ def architecture(name: str) -> Architecture:
 
 
 def build_network(name: str, outputs: int = 6) -> nn.Module:
-    """A fresh network: (B, 6, 200) to (B, outputs).
+    """Build an untrained network that maps (B, 6, 200) to (B, outputs).
 
     Args:
-        name: of the architecture.
+        name: name of the architecture.
         outputs: 6 for displacement and log standard deviation; an architecture's `table_outputs`
             for the paper's table.
 

@@ -1,7 +1,7 @@
-"""The card that travels with weights: what they are, what they eat, what they were trained on.
+"""Card of a weights file: architecture, inputs, calibration, training data.
 
-Weights are a safetensors file; the card is the JSON beside it. Loading refuses a pair that does
-not match: another architecture, window, frame or checksum. Nothing is ever unpickled.
+Weights are a safetensors file; the card is the JSON file next to it. Loading rejects a pair that
+does not match in architecture, window, frame or checksum. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 FORMAT = 1
 FRAME = "gravity-aligned, z up, the device's heading zero"
 FRAMES = (FRAME, "gravity-aligned, z up, yaw arbitrary")
-"""Of a network that was shown windows at any yaw, the device's heading is one of them."""
+"""Accepted frames; a network trained at any yaw can also use windows at the device's heading."""
 
 MAX_SIGMA = 5.0
-"""Nobody walks further in a second: a larger sigma [m] says nothing more."""
+"""Upper limit of sigma [m]: nobody walks further in a second."""
 
 _STEEPEST = 10.0
-"""An exponent beyond any that a calibration finds."""
+"""Largest accepted exponent, beyond any that a calibration finds."""
 
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How log standard deviations become honest ones, fitted on validation recordings.
+    """Calibration of a network's log standard deviations, fitted on validation recordings.
 
     sigma = sqrt((scale * exp(exponent * log_sigma))^2 + floor^2), each per axis x, y, z of the
-    window's frame (x and y share theirs: the frame's yaw is arbitrary).
+    window's frame (x and y share their values, because the frame's yaw is arbitrary).
 
     Attributes:
         scale: factors on the network's sigma.
         exponent: powers of the network's sigma.
-        floor: smallest sigma [m], above 0.
+        floor: minimum sigma [m], above 0.
     """
 
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -52,7 +52,7 @@ class Calibration:
     floor: tuple[float, float, float] = (0.005, 0.005, 0.005)
 
     def variance(self, log_sigma: FloatArray) -> FloatArray:
-        """Calibrated variances (M, 3) [m^2] of log sigmas (M, 3)."""
+        """Return calibrated variances (M, 3) [m^2] for log sigmas (M, 3)."""
         sigma = np.array(self.scale) * np.exp(np.array(self.exponent) * log_sigma)
         return np.asarray(np.minimum(sigma, MAX_SIGMA) ** 2 + np.square(self.floor))
 
@@ -63,17 +63,17 @@ class Card:
 
     Attributes:
         architecture: a name in `architectures.ARCHITECTURES`.
-        outputs: 3 displacements [m], then 3 log standard deviations.
-        rate: samples per second of a window [Hz].
-        samples: samples of a window.
-        frame: of the window and the displacement.
+        outputs: number of outputs: 3 displacements [m], then 3 log standard deviations.
+        rate: sampling rate of a window [Hz].
+        samples: number of samples of a window.
+        frame: frame of the window and the displacement.
         channels: rows of a window; gyroscope in rad/s, accelerometer in m/s^2.
         sha256: checksum of the weights file.
-        calibration: of the standard deviations.
-        trained_on: recordings and simulations, in words.
-        recipe: the command and settings that made the weights.
+        calibration: calibration of the standard deviations.
+        trained_on: descriptions of the training recordings and simulations.
+        recipe: the command and settings that produced the weights.
         figures: results on named recordings.
-        known_motion: the training windows summed up, None where nobody did.
+        known_motion: summary of the training windows, None if there is none.
     """
 
     architecture: str
@@ -92,12 +92,12 @@ class Card:
 
 
 def card_path(weights: Path) -> Path:
-    """The card of `NAME.safetensors` is `NAME.json` beside it."""
+    """Return the card's path: `NAME.json` next to `NAME.safetensors`."""
     return weights.with_suffix(".json")
 
 
 def dump_card(card: Card) -> str:
-    """The card as JSON text."""
+    """Return the card as JSON text."""
     known = card.known_motion
     content = {k: v for k, v in asdict(card).items() if k != "known_motion" or known is not None}
     if known is not None:
@@ -115,7 +115,7 @@ def read_card(weights: Path) -> Card:
     path = card_path(weights)
     for needed in (weights, path):
         if not needed.is_file():
-            raise WeightsError(needed, "file", "nothing there", "weights and card side by side")
+            raise WeightsError(needed, "file", "nothing there", "weights and card in one folder")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -128,20 +128,20 @@ def read_card(weights: Path) -> Card:
             "sha256",
             digest[:12],
             f"{card.sha256[:12]} as on the card",
-            "the file is cut short or belongs to another card",
+            "the file is truncated or belongs to another card",
         )
     return card
 
 
 def parse_card(text: str, path: Path) -> Card:
-    """A card from its JSON text.
+    """Parse a card from its JSON text.
 
     Args:
-        text: as `dump_card` gives it.
-        path: of the file it came from, for the error.
+        text: JSON text as returned by `dump_card`.
+        path: path of the file that the text is from, for the error.
 
     Raises:
-        WeightsError: the text is no card, or one of another kind of windows.
+        WeightsError: the text is not a card, or the card describes other windows.
     """
     try:
         content = json.loads(text)
@@ -172,7 +172,7 @@ def _calibration(content: dict[str, list[float]]) -> Calibration:
         if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
             raise ValueError(f"calibration.{name} {values!r}")
     if min(content["floor"]) <= 0.0:
-        raise ValueError(f"calibration.floor {content['floor']!r}, a covariance of 0")
+        raise ValueError(f"calibration.floor {content['floor']!r}, allowing a covariance of 0")
     if max(content["exponent"]) > _STEEPEST:
         raise ValueError(f"calibration.exponent {content['exponent']!r}, above {_STEEPEST:g}")
     return Calibration(**{name: (x, y, z) for name, (x, y, z) in content.items()})

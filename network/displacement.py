@@ -1,4 +1,4 @@
-"""The trainable module around every network: windows to displacement and log sigma."""
+"""Trainable module around every network, from windows to displacement and log sigma."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _LOG_SIGMA_RANGE = (-6.0, 3.0)
 
 
 class DisplacementNetwork(nn.Module):
-    """A network with its input centred: gravity is taken off the vertical specific force.
+    """A network with centred input: gravity is subtracted from the vertical specific force.
 
     Args:
-        network: (B, 6, 200) to (B, 6); one that remembers also has `first_state` and `step`, and
-            takes (B, K, 6, 200) to (B, K, 6).
+        network: maps (B, 6, 200) to (B, 6); a recurrent one also has `first_state` and `step`, and
+            maps (B, K, 6, 200) to (B, K, 6).
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -30,25 +30,25 @@ class DisplacementNetwork(nn.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether the network has a state that goes from window to window."""
+        """Whether the network is recurrent: it carries a state from window to window."""
         return hasattr(self.network, "step")
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
+        """Map windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
         return _parted(self.network(windows - self.gravity))
 
     def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `forward`, for a network that remembers, after its state (2, B, H).
+        """Run a recurrent network as in `forward`, starting from its state (2, B, H).
 
         Returns:
-            displacement, log sigma, and the state after these windows.
+            Displacement, log sigma, and the state after these windows.
         """
         network: Any = self.network
         output, after = network.step(windows - self.gravity, state)
         return *_parted(output), after
 
     def first_state(self, batch: int) -> Tensor:
-        """The state (2, B, H) of a network that remembers, before the first window."""
+        """Return the state (2, B, H) of a recurrent network before the first window."""
         network: Any = self.network
         state: Tensor = network.first_state(self.gravity.new_zeros(batch, 0))
         return state

@@ -1,11 +1,11 @@
-"""What motion weights know: how far a window is from all that they were trained on.
+"""Known motion: the distance of a window from those that weights were trained on.
 
-A window is described by five numbers that do not change with its yaw; those of the training windows
-are summed up by their k-means centres (Lloyd 1982), which travel on the card. A window further from
-every centre than 95 % of the training windows lies outside what the weights know: there a network
-errs more than it says. Single numbers within their training range say little: of people, phones
-and places that weights had not met, 84 to 99 % of the windows lay outside by the centres, with
-twice the mean NIS, but only 2 to 22 % by the ranges.
+Five features that do not depend on its yaw describe a window; those of the training windows are
+summarised by their k-means centres (Lloyd 1982), which are stored on the card. A window further
+from every centre than 95 % of the training windows is outside the known motion: there a network's
+errors exceed its stated sigma. Ranges of single features are a weak test: for people, phones and
+places unseen in training, 84 to 99 % of the windows lay outside according to the centres, with
+twice the mean NIS, but only 2 to 22 % according to the ranges.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
-"""Root mean square of linear acceleration [m/s^2] and rate [rad/s]; shares [1] of the
+"""Root mean squares of linear acceleration [m/s^2] and angular rate [rad/s]; shares [1] of the
 acceleration's power above 10 Hz, between 3 and 10 Hz, and along the vertical."""
 
 STEP_SECONDS = 5.0
-"""Length of the stretches whose step rate is told [s]."""
+"""Length of the stretches whose step rate is estimated [s]."""
 
 _CENTRES = 200
 _WINDOWS_OF_CENTRE = 20
-"""Windows without overlap for each centre: of fewer the centres are the windows themselves, and
-nothing else is near them."""
+"""Minimum number of windows without overlap per centre: with fewer, the centres become the windows
+themselves, and no other window is near them."""
 
 _LEAST_WINDOWS = 60
-"""Of so many on, a minute, it is told what is known."""
+"""Minimum number of windows without overlap, a minute, to summarise known motion."""
 
 _MOST_WINDOWS = 20_000
 _AT_ONCE = 256
@@ -45,18 +45,18 @@ _WALKING = 0.3
 _PERCENTILE = 95.0
 
 OUTSIDE_VARIANCE = 2.0
-"""Factor on the variance well outside: the mean NIS there was 5 to 7 against 2 to 3 inside."""
+"""Variance factor well outside, where the mean NIS was 5 to 7 against 2 to 3 inside."""
 
 
 @dataclass(frozen=True)
 class KnownMotion:
-    """Training windows summed up.
+    """Summary of the training windows.
 
     Attributes:
-        centres: of the described windows, each five numbers as of `described`.
-        limit: distance to the nearest centre that 95 % of the training windows keep within.
+        centres: k-means centres of the windows, each five numbers on the scales of `described`.
+        limit: distance to the nearest centre that 95 % of the training windows do not exceed.
         ranges: 1st and 99th percentile of each of `FEATURES`, of "step_rate" [Hz] and of "speed"
-            [m/s], for words.
+            [m/s], for reports.
     """
 
     centres: tuple[tuple[float, ...], ...]
@@ -64,7 +64,7 @@ class KnownMotion:
     ranges: dict[str, tuple[float, float]]
 
     def strangeness(self, windows: NDArray[np.float32]) -> FloatArray:
-        """Distance of windows (B, 6, 200) to what is known (B,), 1 at the limit."""
+        """Return the distance (B,) of windows (B, 6, 200) to known motion, 1 at the limit."""
         distances, _ = self._tree.query(described(features(windows)))
         return np.asarray(distances / self.limit)
 
@@ -75,20 +75,20 @@ class KnownMotion:
         return KDTree(np.array(self.centres))
 
     def variance_factor(self, windows: NDArray[np.float32]) -> FloatArray:
-        """Factors (B,) on the variance of a network's answers: 1 inside, rising outside."""
+        """Return factors (B,) on the variance of predictions: 1 inside, rising outside."""
         return np.asarray(np.clip(2.0 * self.strangeness(windows) - 1.0, 1.0, OUTSIDE_VARIANCE))
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for the card; a centre is a line of numbers."""
+        """Return plain values for the card; each centre is a line of numbers."""
         lines = [" ".join(f"{x:g}" for x in row) for row in self.centres]
         return {"limit": self.limit, "ranges": self.ranges, "centres": lines}
 
 
 def known_from(content: dict[str, Any]) -> KnownMotion:
-    """What `as_dict` gave.
+    """Rebuild known motion from the values of `as_dict`.
 
     Raises:
-        ValueError, TypeError, KeyError: it is something else.
+        ValueError, TypeError, KeyError: the values are malformed.
     """
     centres = tuple(tuple(float(x) for x in line.split()) for line in content["centres"])
     limit = float(content["limit"])
@@ -100,7 +100,7 @@ def known_from(content: dict[str, Any]) -> KnownMotion:
 
 
 def features(windows: NDArray[np.float32]) -> FloatArray:
-    """`FEATURES` of windows (B, 6, 200) in a gravity-aligned frame, (B, 5)."""
+    """Return `FEATURES` (B, 5) of windows (B, 6, 200) in a gravity-aligned frame."""
     gyro, accel = windows[:, :3].astype(np.float64), windows[:, 3:].astype(np.float64)
     accel[:, 2] -= STANDARD_GRAVITY
     varying = accel - accel.mean(axis=2, keepdims=True)
@@ -121,9 +121,9 @@ def features(windows: NDArray[np.float32]) -> FloatArray:
 
 
 def described(values: FloatArray) -> FloatArray:
-    """Features (B, 5) brought to scales on which equal distances mean equally much (B, 5).
+    """Rescale features (B, 5) so that equal distances are equally significant.
 
-    Sizes count by their ratio, above the sensors' noise.
+    Magnitudes are compared by their ratio, above the sensors' noise.
     """
     acceleration, turning, fast, middle, vertical = values.T
     return np.stack(
@@ -139,13 +139,13 @@ def described(values: FloatArray) -> FloatArray:
 
 
 def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
-    """Step rate [Hz] of each stretch of 5 s that is walked, (K,).
+    """Return the step rate (K,) [Hz] of each stretch of 5 s with walking.
 
-    The strongest frequency of the vertical acceleration between 1.2 and 3.2 Hz: a walker's and a
-    runner's cadence, above the swing of an arm or a leg.
+    It is the strongest frequency of the vertical acceleration between 1.2 and 3.2 Hz: the cadence
+    of walking and running, above that of swinging arms or legs.
 
     Args:
-        imu_N: (N, 6) at 200 Hz in a gravity-aligned frame.
+        imu_N: (N, 6) samples at 200 Hz in a gravity-aligned frame.
     """
     samples = round(STEP_SECONDS * WINDOW_RATE)
     count = len(imu_N) // samples
@@ -162,12 +162,12 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
 def known_motion(
     streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
 ) -> KnownMotion | None:
-    """What weights know that were trained on these streams, None of less than a minute of them.
+    """Summarise the motion in training streams; return None for less than a minute of them.
 
     Args:
-        streams: with full truth.
-        legs: with weak truth.
-        seed: of the choice of windows and of the first centres.
+        streams: streams with full ground truth.
+        legs: streams with weak truth.
+        seed: seed of the initial centres.
     """
     imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
     count = sum(len(imu) // WINDOW_SAMPLES for imu in imus)
@@ -186,7 +186,7 @@ def known_motion(
 
 
 def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
-    """Windows (B, 6, 200) every `stride` samples, few at a time."""
+    """Yield windows (B, 6, 200) every `stride` samples, a few at a time."""
     starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
     for first in range(0, len(starts), _AT_ONCE):
         rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
@@ -194,7 +194,7 @@ def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]
 
 
 def _speeds(stream: WorldStream, stride: int) -> FloatArray:
-    """Horizontal speeds over the windows (B,) [m/s]."""
+    """Return the horizontal speeds (B,) [m/s] over the windows."""
     moved = stream.position_W[WINDOW_SAMPLES::stride] - stream.position_W[:-WINDOW_SAMPLES:stride]
     return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
 
@@ -205,7 +205,7 @@ def _centres(
     from scipy.cluster.vq import kmeans2, vq
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of a centre that no window is nearest to
+        warnings.simplefilter("ignore", UserWarning)  # about a centre without windows
         found, _ = kmeans2(known, count, minit="points", seed=seed)
     rounded = np.round(found, 3)
     limit = max(float(np.percentile(vq(known, rounded)[1], _PERCENTILE)), 1e-3)

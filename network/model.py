@@ -1,6 +1,6 @@
-"""Displacement and covariance from windows: what callers use, NumPy in and NumPy out.
+"""Public interface: displacements and covariances from windows, all as NumPy arrays.
 
-A `DisplacementModel` is an engine that computes a network and the card with its calibration.
+A `DisplacementModel` combines an engine, which runs a network, and the card with its calibration.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
 
-if TYPE_CHECKING:  # an exported graph does without PyTorch
+if TYPE_CHECKING:  # an exported graph needs no PyTorch
     from stario.network.displacement import DisplacementNetwork
 
 
 class DisplacementModel:
-    """Displacements with calibrated covariance from windows of IMU data.
+    """Model that predicts displacements with calibrated covariance from windows of IMU data.
 
     Args:
-        engine: computes the network.
+        engine: engine that runs the network.
         card: description of its weights.
     """
 
@@ -39,12 +39,12 @@ class DisplacementModel:
 
     @property
     def name(self) -> str:
-        """The architecture's name."""
+        """Name of the architecture."""
         return self.card.architecture
 
     @property
     def training_form(self) -> DisplacementNetwork:
-        """The network as it is trained, in evaluation mode.
+        """Trainable form of the network, in evaluation mode.
 
         Raises:
             InputError: the model is an exported graph.
@@ -52,30 +52,30 @@ class DisplacementModel:
         return self._engine.training_form
 
     def stateful_inference(self, updates: int = 1) -> DisplacementModel | StatefulModel:
-        """What predicts the windows of one unbroken track, in the order of time.
+        """Return a model that predicts the windows of one unbroken track, in order of time.
 
         Args:
-            updates: windows that begin within the length of one: a window follows the one so many
-                before it.
+            updates: number of windows that begin within the length of one: the state of a window
+                comes from the window that many places before it.
 
         Returns:
-            The model itself, or a `StatefulModel` if the network remembers earlier windows.
+            The model itself, or a `StatefulModel` if the network is recurrent.
         """
         return StatefulModel(self, updates) if self._engine.remembers else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Displacement over each window, from its start to one second later.
+        """Predict the displacement over each window, from its start to one second later.
 
         Args:
             windows: (B, 6, 200), gyroscope [rad/s] then specific force [m/s^2] at 200 Hz, rotated
                 into a gravity-aligned frame (z up, any yaw).
 
         Returns:
-            displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; wider
-            where a window lies outside what the weights know (`stario.network.known_motion`).
+            Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; inflated
+            if a window is outside the known motion of the weights (`stario.network.known_motion`).
 
         Raises:
-            InputError: the shape does not fit or a value is not finite.
+            InputError: the shape is wrong or a value is not finite.
         """
         batch = _checked_windows(windows)
         if len(batch) == 0:
@@ -86,15 +86,15 @@ class DisplacementModel:
     def predict_after(
         self, window: NDArray[np.float32], state: NDArray[np.float32] | None
     ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
-        """Of a network that remembers: one window (1, 6, 200) after the one that left the state.
+        """Predict one window (1, 6, 200) with a recurrent network, from the previous state.
 
         Returns:
-            displacement (1, 3) [m], covariance (1, 3, 3) [m^2], and the state that it leaves.
+            Displacement (1, 3) [m], covariance (1, 3, 3) [m^2], and the new state.
         """
         if state is None:
             state = self._engine.first_state()
         mean, log_sigma, after = self._engine.run(window, state)
-        assert after is not None  # a state that is given comes back
+        assert after is not None  # given a state, an engine returns one
         return *self._calibrated(window, mean, log_sigma), after
 
     def _calibrated(
@@ -110,19 +110,19 @@ class DisplacementModel:
 
 
 Memory = tuple[int, tuple[NDArray[np.float32] | None, ...]]
-"""Of a network along a track: windows so far, and what each series of them left."""
+"""State along a track: number of windows so far, and the network's state for each series."""
 
 
 class StatefulModel:
-    """A model whose network remembers earlier windows, along one track.
+    """A model with a recurrent network, along one track.
 
     Args:
-        model: whose network remembers.
-        updates: windows that begin within the length of one; each such series of windows, one
-            second apart, has a memory of its own, as in training.
+        model: model with a recurrent network.
+        updates: number of windows that begin within the length of one; each such series of
+            windows, one second apart, has its own state, as in training.
 
     Attributes:
-        memory: how many windows there were, and what each series remembers; may be put back.
+        memory: number of windows so far and the state of each series; may be restored.
     """
 
     def __init__(self, model: DisplacementModel, updates: int) -> None:
@@ -130,7 +130,7 @@ class StatefulModel:
         self.memory: Memory = (0, (None,) * updates)
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The track's next windows; arguments, results and errors as of `DisplacementModel`."""
+        """Predict the track's next windows, with the interface of `DisplacementModel.predict`."""
         batch = _checked_windows(windows)
         mean, covariance = np.zeros((len(batch), 3)), np.zeros((len(batch), 3, 3))
         count, (*states,) = self.memory
@@ -145,7 +145,7 @@ class StatefulModel:
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
-    """Write weights and card side by side, each whole or not at all.
+    """Write weights and card into one folder, each atomically.
 
     Returns:
         The card with the checksum filled in.
@@ -164,7 +164,7 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
 
 
 def packaged_names() -> str:
-    """Weights in the package, as words."""
+    """Return the names of the packaged weights as text, for messages."""
     folder = importlib.resources.files("stario.network.weights")
     found = (Path(str(file)) for file in folder.iterdir())
     *names, last = sorted(file.stem for file in found if file.suffix == ".safetensors")
@@ -175,14 +175,14 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: of weights in the package ("default"; "open", whose sources allow any use;
-            "first-stage", which left groups out; "walks-36min", those before), a safetensors file
-            with its card beside it, or an ONNX file of `export_onnx`, which ONNX Runtime then
-            computes.
+        name_or_path: name of packaged weights ("default"; "open", whose sources allow any use;
+            "first-stage", trained without the held-out groups; "walks-36min", the earlier ones), a
+            safetensors file with its card next to it, or an ONNX file written by `export_onnx`,
+            which runs in ONNX Runtime.
 
     Raises:
-        WeightsError: the file or its card is missing, cut short, or they do not match.
-        InputError: an ONNX file, but onnxruntime is not installed.
+        WeightsError: the file or its card is missing or truncated, or they do not match.
+        InputError: neither a name nor a path, or an ONNX file without onnxruntime installed.
     """
     if not isinstance(name_or_path, str | Path):
         raise InputError("name_or_path", f"{name_or_path!r:.60}", f"{packaged_names()}, or a file")
@@ -208,7 +208,7 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     try:
         network.network.load_state_dict(safetensors.torch.load_file(path))
     except (safetensors.SafetensorError, RuntimeError) as error:
-        # PyTorch lists what does not fit below a headline that says nothing.
+        # PyTorch lists the mismatches below an uninformative headline.
         lines = [line.strip() for line in str(error).splitlines()]
         raise WeightsError(
             path, "weights", lines[min(1, len(lines) - 1)], f"tensors of {card.architecture}"
@@ -217,11 +217,11 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
 
 
 def weights_named(name: str, runs: Path) -> str | Path:
-    """What `load_model` takes for a network's name, a file or "default".
+    """Return the argument of `load_model` for a network's name, a file or "default".
 
     Args:
         name: "default"; an architecture, whose training run is the folder of that name in `runs`
-            (StarIO without one means the default weights); or a file.
+            (for StarIO without a run, the default weights); or a file.
         runs: folder of training runs.
 
     Raises:
@@ -239,7 +239,7 @@ def weights_named(name: str, runs: Path) -> str | Path:
 
 
 def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:
-    batch = np.require(windows, np.float32, ["C", "W"])  # torch warns of what is read-only
+    batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):
         raise InputError("windows", f"shape {batch.shape}", f"(B, 6, {WINDOW_SAMPLES})")
     if not np.isfinite(batch).all():

@@ -1,9 +1,9 @@
 """StarIO: star operation, dual-wing attention, multi-scale gated convolution unit.
 
-A stem and four stages of residual blocks over a window of IMU data. Each block is a DWSB (the
-star operation, element-wise product of two pointwise branches, weighted by the two wings of its
-average and deviation over time and over channels) followed by an MSGCU (a depthwise value branch
-gated per channel). Widths, expansion and biases are those whose counts match the published table.
+A stem and four stages of residual blocks process a window of IMU data. Each block is a DWSB (the
+star operation, an element-wise product of two pointwise branches, weighted by two wings that use
+its mean and deviation over time and over channels) followed by an MSGCU (a depthwise value branch
+gated per channel). Widths, expansion and biases are chosen to match the published counts.
 
 Shapes below: B windows, C channels, L time steps.
 """
@@ -21,7 +21,7 @@ EPSILON = 1e-5
 
 
 def moments(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation along `dim`, in one pass over x.
+    """Return mean and standard deviation along `dim`, in one pass over x.
 
     sqrt(E[x^2] - E[x]^2 + eps) is several times faster than `torch.std`, and the epsilon keeps
     its gradient finite where x does not vary.
@@ -32,7 +32,7 @@ def moments(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
 
 
 class Wing(nn.Module):
-    """Attention weights along one axis from average and deviation over the other.
+    """Attention weights along one axis from mean and deviation over the other.
 
     `mu` and `xi` mix the two pooled vectors; a convolution of width 3 along the axis and a sigmoid
     turn them into weights.
@@ -45,7 +45,7 @@ class Wing(nn.Module):
         self.convolution = nn.Conv1d(1, 1, 3, padding=1, bias=False)
 
     def forward(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Weights (B, 1, A) from pooled vectors (B, 1, A)."""
+        """Return weights (B, 1, A) from pooled vectors (B, 1, A)."""
         return torch.sigmoid(self.convolution(self.mu * mean + self.xi * deviation))
 
 
@@ -64,7 +64,7 @@ class DualWingStarBlock(nn.Module):
         self.project = nn.Conv1d(inner, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, C, L)."""
+        """Map (B, C, L) to (B, C, L)."""
         x = self.norm(self.depthwise(x))
         star = rms_normalised(F.relu6(self.branch_gate(x)) * self.branch_value(x))
         over_time = [m.transpose(1, 2) for m in moments(star, dim=2)]
@@ -86,7 +86,7 @@ class GatedUnit(nn.Module):
         self.project = nn.Conv1d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, C, L)."""
+        """Map (B, C, L) to (B, C, L)."""
         x = self.norm(x)
         gate = F.softmax(self.excite(F.relu(self.squeeze(x.mean(dim=2)))), dim=1)
         gated: Tensor = self.project(rms_normalised(self.value(x) * gate.unsqueeze(2)))
@@ -94,16 +94,16 @@ class GatedUnit(nn.Module):
 
 
 def rms_normalised(x: Tensor) -> Tensor:
-    """X over its root mean square of each window.
+    """Divide x by its root mean square over each window.
 
-    Star products have heavy tails and a softmax gate averages 1/C: without this the blocks start
-    almost silent and single batches explode later. It has no parameter, so the counts stay.
+    Star products have heavy tails and a softmax gate averages 1/C: without this the blocks' outputs
+    are almost zero at first and single batches explode later. It adds no parameter to the counts.
     """
     return x * torch.rsqrt((x * x).mean(dim=(1, 2), keepdim=True) + EPSILON)
 
 
 class Block(nn.Module):
-    """X' = X + DWSB(X), then X' + MSGCU(X')."""
+    """Residual block: X' = X + DWSB(X), then X' + MSGCU(X')."""
 
     def __init__(self, channels: int, gated_unit: bool) -> None:
         super().__init__()
@@ -111,17 +111,17 @@ class Block(nn.Module):
         self.gated = GatedUnit(channels) if gated_unit else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, C, L)."""
+        """Map (B, C, L) to (B, C, L)."""
         x = x + self.star(x)
         return x if self.gated is None else x + self.gated(x)
 
 
 class StarIO(nn.Module):
-    """The network: (B, 6, 200) of gyroscope and accelerometer to (B, outputs).
+    """The network: maps (B, 6, 200) of gyroscope and accelerometer to (B, outputs).
 
     Args:
-        outputs: 6 for displacement and log standard deviation, 2 as the paper's table counts it.
-        gated_unit: False leaves out the MSGCU (the paper's ablation).
+        outputs: 6 for displacement and log standard deviation, 2 for the counts of the table.
+        gated_unit: whether blocks have the MSGCU; False is the paper's ablation.
     """
 
     def __init__(self, outputs: int = 6, gated_unit: bool = True) -> None:
@@ -150,6 +150,6 @@ class StarIO(nn.Module):
         )
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         output: Tensor = self.head(self.trunk(windows))
         return output

@@ -1,1 +1,1 @@
-"""The networks that the paper compares StarIO with, one file each."""
+"""The networks that the paper compares StarIO with."""

@@ -1,4 +1,4 @@
-"""DeepILS: RoNIN's residual network of separable convolutions with attention in every block.
+"""DeepILS: RoNIN's residual network with separable convolutions and attention in every block.
 
 Tariq et al.: DeepILS: Toward Accurate Domain-Invariant AIoT-Enabled Inertial Localization System,
 IEEE Internet of Things Journal, 2025. The attention is that of Woo et al.: CBAM: Convolutional
@@ -28,7 +28,7 @@ class Attention(nn.Module):
         self.spatial = nn.Conv1d(2, 1, 7, padding=3, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, C, L)."""
+        """Map (B, C, L) to (B, C, L)."""
         average, largest = self.average(x), x.amax(2, keepdim=True)
         x = x * torch.sigmoid(self.shared(average) + self.shared(largest))
         seen = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
@@ -52,13 +52,13 @@ class SeparableBlock(nn.Module):
         self.relu = nn.ReLU()
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, outputs, L / stride)."""
+        """Map (B, C, L) to (B, outputs, L / stride)."""
         result: Tensor = self.relu(self.layers(x) + self.shortcut(x))
         return result
 
 
 class DeepIls(RoninResNet):
-    """R-ResNet of other blocks."""
+    """R-ResNet with separable attention blocks."""
 
     block = SeparableBlock
 

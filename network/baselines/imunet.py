@@ -15,11 +15,11 @@ _BLOCKS = (
     (64, 1), (64, 1), (64, 1), (64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2), (512, 1),
     (1024, 2), (1024, 1),
 )  # fmt: skip
-"""Channels and stride of each; the third and every other one from there on is a "down" block."""
+"""Channels and stride of each; the third and every second one after it is a "down" block."""
 
 
 class ImuNetBlock(nn.Module):
-    """Depthwise and pointwise convolution, with a residual that is a convolution in `down` ones."""
+    """Depthwise and pointwise convolution; in `down` blocks the residual is a convolution."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, down: bool) -> None:
         super().__init__()
@@ -29,14 +29,14 @@ class ImuNetBlock(nn.Module):
         self.elu = nn.ELU()
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, outputs, L / stride)."""
+        """Map (B, C, L) to (B, outputs, L / stride)."""
         inner = self.elu(self.pointwise(self.elu(self.depthwise(x))))
         result: Tensor = self.elu(inner + self.residual(x))
         return result
 
 
 class NoiseLayer(nn.Module):
-    """Takes a weighted copy of the raw window off the features, and adds an offset."""
+    """Layer that subtracts a weighted copy of the raw window from features and adds an offset."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -44,12 +44,12 @@ class NoiseLayer(nn.Module):
         self.bias = nn.Parameter(torch.zeros(1, size))
 
     def forward(self, features: Tensor, raw: Tensor) -> Tensor:
-        """Features and raw input (B, size)."""
+        """Combine features and raw input, both (B, size)."""
         return features - self.weight * raw + self.bias
 
 
 class ImuNet(nn.Module):
-    """(B, 6, 200) to (B, outputs)."""
+    """I-IMUNet: maps (B, 6, 200) to (B, outputs)."""
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class ImuNet(nn.Module):
         self.output = nn.Linear(1200, outputs)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         features = self.last(self.trunk(windows))
         output: Tensor = self.output(self.elu(self.noise(features, windows.flatten(1))))
         return output

@@ -1,4 +1,4 @@
-"""Layers that several of the paper's networks share.
+"""Layers shared by several of the paper's networks.
 
 Shapes below: B windows, C channels, L time steps.
 """
@@ -9,14 +9,14 @@ from torch import Tensor, nn
 
 
 class ConvNorm(nn.Sequential):
-    """Convolution without bias and the batch norm behind it.
+    """Convolution without bias, followed by batch norm.
 
     Args:
-        inputs: channels that come in.
-        outputs: channels that go out.
+        inputs: input channels.
+        outputs: output channels.
         kernel: width of the convolution, zero-padded to keep the length at stride 1.
-        stride: of the convolution.
-        groups: of the convolution; `inputs` for a depthwise one.
+        stride: stride of the convolution.
+        groups: groups of the convolution; `inputs` for a depthwise one.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class FCOut(nn.Sequential):
     """Head of the RoNIN networks: 1x1 convolution, then three linear layers.
 
     Args:
-        channels: of the features (B, C, L).
+        channels: channels C of the features (B, C, L).
         transition: channels after the 1x1 convolution.
-        length: L of the features.
+        length: length L of the features.
         hidden: width of both hidden layers.
-        outputs: numbers per window.
+        outputs: number of outputs per window.
     """
 
     def __init__(
@@ -74,21 +74,21 @@ class BasicBlock(nn.Module):
         self.relu = nn.ReLU()
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, outputs, L / stride)."""
+        """Map (B, C, L) to (B, outputs, L / stride)."""
         inner = self.second(self.relu(self.first(x)))
         result: Tensor = self.relu(inner + self.shortcut(x))
         return result
 
 
 def shortcut(inputs: int, outputs: int, stride: int) -> nn.Module:
-    """Identity, or a strided 1x1 convolution where the shape changes."""
+    """Return the identity, or a strided 1x1 convolution if the shape changes."""
     if inputs == outputs and stride == 1:
         return nn.Identity()
     return ConvNorm(inputs, outputs, 1, stride)
 
 
 def resnet_stem(pool: bool = True) -> nn.Sequential:
-    """(B, 6, 200) to (B, 64, 50), or (B, 64, 100) without the pooling."""
+    """Return a stem that maps (B, 6, 200) to (B, 64, 50), or (B, 64, 100) without pooling."""
     layers: list[nn.Module] = [ConvNorm(6, 64, 7, 2), nn.ReLU()]
     if pool:
         layers.append(nn.MaxPool1d(3, 2, padding=1))
@@ -96,7 +96,7 @@ def resnet_stem(pool: bool = True) -> nn.Sequential:
 
 
 def residual_groups(block: type[nn.Module]) -> nn.Sequential:
-    """Four groups of two blocks, each built with (inputs, outputs, stride): 64 to 512 channels."""
+    """Return four groups of two blocks `block(inputs, outputs, stride)`: 64 to 512 channels."""
     blocks = []
     previous = 64
     for width, stride in ((64, 1), (128, 2), (256, 2), (512, 2)):
@@ -106,7 +106,7 @@ def residual_groups(block: type[nn.Module]) -> nn.Sequential:
 
 
 def initialise_as_ronin(network: nn.Module) -> None:
-    """Convolutions Kaiming-normal over their outputs, linear layers N(0, 0.01), without offset."""
+    """Initialise convolutions Kaiming-normal (fan-out), linear layers N(0, 0.01) with zero bias."""
     for module in network.modules():
         if isinstance(module, nn.Conv1d):
             nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -116,17 +116,17 @@ def initialise_as_ronin(network: nn.Module) -> None:
 
 
 class InvertedResidual(nn.Module):
-    """MBConv: 1x1 expansion, depthwise, 1x1 back; a skip where the shape stays.
+    """MBConv: 1x1 expansion, depthwise, 1x1 projection; a skip if the shape stays the same.
 
     Sandler et al. 2018 (MobileNet V2), in one dimension, without squeeze and excitation.
 
     Args:
-        inputs: channels that come in.
-        outputs: channels that go out.
-        expand: factor of the expansion.
-        stride: of the depthwise convolution.
-        kernel: its width.
-        activation: after expansion and depthwise convolution.
+        inputs: input channels.
+        outputs: output channels.
+        expand: expansion factor.
+        stride: stride of the depthwise convolution.
+        kernel: width of the depthwise convolution.
+        activation: activation after expansion and depthwise convolution.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class InvertedResidual(nn.Module):
         self.skip = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, L) to (B, outputs, L / stride)."""
+        """Map (B, C, L) to (B, outputs, L / stride)."""
         result: Tensor = self.layers(x)
         return x + result if self.skip else result
 
@@ -160,7 +160,7 @@ def inverted_residuals(
     rows: tuple[tuple[int, int, int, int, int], ...],
     activation: type[nn.Module],
 ) -> nn.Sequential:
-    """Blocks from rows of (expand, channels, repeats, stride of the first, kernel)."""
+    """Return blocks from rows of (expand, channels, repeats, stride of the first, kernel)."""
     blocks = []
     for expand, width, repeats, stride, kernel in rows:
         for index in range(repeats):
@@ -171,7 +171,7 @@ def inverted_residuals(
 
 
 def mobile_head(inputs: int, activation: type[nn.Module], outputs: int) -> nn.Sequential:
-    """Features (B, C, L) of `inverted_residuals` to (B, outputs): 1280 channels, their mean."""
+    """Return a head that maps features (B, C, L) to (B, outputs) by the mean of 1280 channels."""
     return nn.Sequential(
         ConvNorm(inputs, 1280),
         activation(),

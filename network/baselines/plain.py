@@ -1,15 +1,15 @@
 """The small networks of the paper's table, and those of RoNIN.
 
 - R-ResNet, R-LSTM: Herath, Yan, Furukawa: RoNIN: Robust Neural Inertial Navigation in the Wild,
-  ICRA 2020. The table's count of R-LSTM is that of a head which sees every time step at once,
-  larger than RoNIN's own.
+  ICRA 2020. The table's count of R-LSTM is that of a head that uses all time steps at once, larger
+  than RoNIN's own.
 - TLIO: Liu et al.: TLIO: Tight Learned Inertial Odometry, IEEE Robotics and Automation Letters
   5(4), 2020. RoNIN's trunk with two heads, for the displacement and for its log standard deviation.
-- I-MobileNet, I-MnasNet, I-EfficientNetB0 in one dimension, as IMUNet's authors compare with
+- I-MobileNet, I-MnasNet, I-EfficientNetB0 in one dimension, as compared by IMUNet's authors
   (Zeinali, Zanddizari, Chang: IMUNet, 2024). Howard et al.: MobileNets, 2017; Tan et al.: MnasNet,
   CVPR 2019; Tan, Le: EfficientNet, ICML 2019, without squeeze and excitation.
 
-All take (B, 6, 200) to (B, outputs).
+All map (B, 6, 200) to (B, outputs).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _EFFICIENT_ROWS = (
 
 
 class RoninResNet(nn.Module):
-    """Residual groups of a block, and a head."""
+    """R-ResNet: residual groups of `block`, and a head."""
 
     block: type[nn.Module] = BasicBlock
 
@@ -58,13 +58,13 @@ class RoninResNet(nn.Module):
         initialise_as_ronin(self)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         output: Tensor = self.head(self.trunk(windows))
         return output
 
 
 class Tlio(nn.Module):
-    """The first half of the outputs from one head, the second from the other."""
+    """TLIO: the first half of the outputs is from one head, the second from the other."""
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
@@ -74,13 +74,13 @@ class Tlio(nn.Module):
         initialise_as_ronin(self)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         features = self.trunk(windows)
         return torch.cat([self.mean(features), self.log_sigma(features)], dim=1)
 
 
 class RoninLstm(nn.Module):
-    """Its state begins at zero in every window."""
+    """R-LSTM, whose state starts at zero in every window."""
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class RoninLstm(nn.Module):
         self.head = FCOut(100, 128, WINDOW_SAMPLES, 512, outputs)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         features, _ = self.lstm(windows.transpose(1, 2))
         output: Tensor = self.head(features.transpose(1, 2))
         return output
@@ -100,7 +100,7 @@ class _Layers(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         output: Tensor = self.layers(windows)
         return output
 
@@ -120,7 +120,7 @@ class MobileNet(_Layers):
 
 
 class MnasNet(_Layers):
-    """Inverted residuals found by search."""
+    """MnasNet: inverted residuals found by architecture search."""
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__(
@@ -135,7 +135,7 @@ class MnasNet(_Layers):
 
 
 class EfficientNetB0(_Layers):
-    """Its activation is the swish, x sigmoid(x)."""
+    """EfficientNet-B0, whose activation is the swish, x sigmoid(x)."""
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__(

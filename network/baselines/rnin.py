@@ -15,11 +15,11 @@ _HIDDEN = 256
 
 
 class Rnin(nn.Module):
-    """Displacements of windows whose LSTM state comes from the windows before them.
+    """RNIN, whose LSTM state comes from the preceding windows.
 
-    A call with (B, 6, 200) takes each window as the first of its own; `step` takes up the state
-    that an earlier call left; a call with (B, K, 6, 200) runs through K windows in a row, as
-    training does.
+    A call with (B, 6, 200) treats each window as the first of a chain; `step` continues from the
+    state after an earlier call; a call with (B, K, 6, 200) runs through K windows in a row, as in
+    training.
     """
 
     def __init__(self, outputs: int = 6) -> None:
@@ -32,25 +32,25 @@ class Rnin(nn.Module):
         self.log_sigma = _head(outputs // 2)
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs), or (B, K, 6, 200) to (B, K, outputs)."""
+        """Map (B, 6, 200) to (B, outputs), or (B, K, 6, 200) to (B, K, outputs)."""
         if windows.dim() == 3:
             return self.step(windows, self.first_state(windows))[0]
         features = self.trunk(windows.flatten(0, 1)).unflatten(0, windows.shape[:2])
         return self._heads(self.lstm(features)[0])
 
     def first_state(self, windows: Tensor) -> Tensor:
-        """State (2, B, 256) before the first window: zero."""
+        """Return the zero state (2, B, 256) before the first window."""
         return windows.new_zeros(2, len(windows), _HIDDEN)
 
     def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """One window of each of B chains.
+        """Process one window of each of B chains.
 
         Args:
             windows: (B, 6, 200).
             state: (2, B, 256) hidden and cell state after each chain's last window.
 
         Returns:
-            outputs (B, outputs) and the state after these windows.
+            Outputs (B, outputs) and the state after these windows.
         """
         features = self.trunk(windows).unsqueeze(1)
         recalled, (hidden, cell) = self.lstm(features, (state[:1], state[1:]))

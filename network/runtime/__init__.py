@@ -1,1 +1,1 @@
-"""What computes a trained network, and what that costs."""
+"""Inference with trained networks, and its cost."""

@@ -1,4 +1,4 @@
-"""What a displacement costs: both forms of a network, timed in turn."""
+"""Time per displacement of both forms of a network, measured in turn."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from stario.sequences.windows import WINDOW_SAMPLES
 
 @dataclass(frozen=True)
 class NetworkSpeed:
-    """Milliseconds per window on the CPU.
+    """Time per window on the CPU.
 
     Attributes:
-        batch: windows per call.
-        training_form: median of the network as it is trained, in evaluation mode [ms].
-        inference_form: median of the form that is used [ms].
-        training_form_least: fastest call; other jobs on the machine disturb it least [ms].
+        batch: number of windows per call.
+        training_form: median for the training form, in evaluation mode [ms].
+        inference_form: median for the inference form [ms].
+        training_form_least: fastest call [ms]; other jobs on the machine disturb it least.
         inference_form_least: fastest call [ms].
-        threads: that PyTorch used.
+        threads: number of threads that PyTorch used.
     """
 
     batch: int
@@ -41,13 +41,13 @@ class NetworkSpeed:
 def network_speed(
     network: DisplacementNetwork, batches: Sequence[int] = (1, 64), runs: int = 30, seed: int = 0
 ) -> list[NetworkSpeed]:
-    """Time both forms of a network, call by call in turn, so that both meet the same load.
+    """Time both forms of a network in alternating calls, so that both run under the same load.
 
     Args:
-        network: on the CPU; it is left in evaluation mode.
+        network: network on the CPU; it is left in evaluation mode.
         batches: numbers of windows per call, each at least 1.
-        runs: calls of each form per batch, at least 1.
-        seed: of the windows.
+        runs: number of calls of each form per batch, minimum 1.
+        seed: seed of the windows.
 
     Returns:
         One entry per batch.

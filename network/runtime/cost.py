@@ -1,9 +1,9 @@
-"""What a network costs by the convention of the paper's table.
+"""Cost of a network by the convention of the paper's table.
 
-The table's figures are those of a counter that knows a few kinds of modules and nothing of what
-happens between them: the rules below, for one window, in evaluation mode. Multiplications and
-additions of a convolution count as one, a bias not at all; parameters count where their module has
-a rule.
+The table's figures come from a counter that covers a few kinds of modules and ignores operations
+between them: the rules below, for one window, in evaluation mode. In a convolution, a
+multiplication and its addition count as one, and the bias does not count; parameters count if
+their module has a rule.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Cost:
     """Counts for one window.
 
     Attributes:
-        parameters: of modules that have a rule.
-        flops: by the rules.
+        parameters: parameters of modules that have a rule.
+        flops: FLOPs by the rules.
     """
 
     parameters: int
@@ -33,7 +33,7 @@ class Cost:
 
 
 def table_cost(name: str) -> Cost:
-    """Counts of an architecture with the outputs that the paper's table counts.
+    """Count an architecture with the outputs that the paper's table counts.
 
     Raises:
         InputError: no network has that name.
@@ -42,7 +42,7 @@ def table_cost(name: str) -> Cost:
 
 
 def cost(network: nn.Module) -> Cost:
-    """Count a network (B, 6, 200) to (B, outputs); it is left in evaluation mode."""
+    """Count a network that maps (B, 6, 200) to (B, outputs); it is left in evaluation mode."""
     flops = 0
     counted: dict[nn.Module, int] = {}
 

@@ -1,7 +1,7 @@
-"""What computes a network: PyTorch from weights, ONNX Runtime from an exported file.
+"""Engines that run a network: PyTorch from weights, ONNX Runtime from an exported file.
 
-Both answer windows with displacement and log sigma. A network with a memory (RNIN) also takes the
-state that a window left, and gives the one that the next window takes up.
+Both map windows to displacement and log sigma. A recurrent network (RNIN) also takes the state
+after the previous window and returns the state for the next one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stario.sequences.errors import InputError
 
-if TYPE_CHECKING:  # ONNX Runtime alone must do without PyTorch
+if TYPE_CHECKING:  # ONNX Runtime alone must work without PyTorch
     from stario.network.displacement import DisplacementNetwork
 
 Float32Array = NDArray[np.float32]
@@ -25,24 +25,24 @@ _BATCH = 64
 
 
 class Engine(Protocol):
-    """What a model needs of the thing that computes."""
+    """Interface that a model requires of an engine."""
 
     @property
     def remembers(self) -> bool:
-        """Whether the network has a state that goes from window to window."""
+        """Whether the network is recurrent: it carries a state from window to window."""
         ...
 
     @property
     def training_form(self) -> DisplacementNetwork:
-        """The network with weights that can be trained."""
+        """Network with trainable weights."""
         ...
 
     def first_state(self) -> Float32Array:
-        """The state (2, 1, H) before the first window, of a network that remembers."""
+        """Return the state (2, 1, H) of a recurrent network before the first window."""
         ...
 
     def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
         ...
 
 
@@ -50,7 +50,7 @@ class TorchEngine:
     """PyTorch on the CPU, in the network's fastest form.
 
     Args:
-        network: with its weights; it is left in evaluation mode.
+        network: network with its weights; it is left in evaluation mode.
     """
 
     def __init__(self, network: DisplacementNetwork) -> None:
@@ -61,20 +61,20 @@ class TorchEngine:
 
     @property
     def training_form(self) -> DisplacementNetwork:
-        """The network with weights that can be trained, in evaluation mode."""
+        """Network with trainable weights, in evaluation mode."""
         return self._training_form
 
     @property
     def remembers(self) -> bool:
-        """Whether the network has a state that goes from window to window."""
+        """Whether the network is recurrent: it carries a state from window to window."""
         return self._network.remembers
 
     def first_state(self) -> Float32Array:
-        """The state (2, 1, H) before the first window, of a network that remembers."""
+        """Return the state (2, 1, H) of a recurrent network before the first window."""
         return self._network.first_state(1).numpy()
 
     def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
         import torch
 
         tensor = torch.from_numpy(windows)
@@ -91,7 +91,7 @@ class OnnxEngine:
     """ONNX Runtime on the CPU.
 
     Args:
-        session: an `onnxruntime.InferenceSession` on a graph that `export_onnx` wrote.
+        session: an `onnxruntime.InferenceSession` of a graph written by `export_onnx`.
     """
 
     def __init__(self, session: Any) -> None:
@@ -101,16 +101,16 @@ class OnnxEngine:
 
     @property
     def remembers(self) -> bool:
-        """Whether the network has a state that goes from window to window."""
+        """Whether the network is recurrent: it carries a state from window to window."""
         return self._state_size > 0
 
     def first_state(self) -> Float32Array:
-        """The state (2, 1, H) before the first window, of a network that remembers."""
+        """Return the state (2, 1, H) of a recurrent network before the first window."""
         return np.zeros((2, 1, self._state_size), np.float32)
 
     @property
     def training_form(self) -> DisplacementNetwork:
-        """There is none.
+        """Not available in an exported graph.
 
         Raises:
             InputError: always.
@@ -118,7 +118,7 @@ class OnnxEngine:
         raise InputError("model", "an exported graph", "a safetensors file of weights")
 
     def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Windows (B, 6, 200), each after its own state, zero where there is none."""
+        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
         if state is not None:
             mean, log_sigma, after = self._session.run(None, {"windows": windows, "state": state})
             return mean, log_sigma, after

@@ -1,9 +1,9 @@
-"""Export to ONNX; `onnx_file` reads the files again.
+"""Export to ONNX; `onnx_file` loads the files.
 
-The graph takes `windows` (batch, 6, 200) as `DisplacementModel.predict` does, and gives
-`displacement` (batch, 3) [m] and `log_sigma` (batch, 3); that of a network which remembers takes
-`state` (2, batch, H) and gives `next_state` besides. Its metadata hold the card: window, rate,
-frame, units and the calibration of the covariance.
+The graph maps `windows` (batch, 6, 200), as in `DisplacementModel.predict`, to `displacement`
+(batch, 3) [m] and `log_sigma` (batch, 3); that of a recurrent network also takes `state`
+(2, batch, H) and returns `next_state`. Its metadata hold the card: window, rate, frame, units and
+the calibration of the covariance.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _UNITS = {
 
 
 def export_onnx(model: DisplacementModel, path: Path) -> None:
-    """Write a model as ONNX file with a dynamic batch.
+    """Write a model as an ONNX file with a dynamic batch size.
 
     Args:
-        model: with weights that PyTorch computes.
-        path: of the file, in an existing folder.
+        model: model that runs in PyTorch.
+        path: path of the file, in an existing folder.
 
     Raises:
-        InputError: the extra `onnx` is not installed, the model is an exported graph itself, or
+        InputError: the extra `onnx` is not installed, the model is itself an exported graph, or
             the folder does not exist.
     """
     onnx_packages("onnx", "onnxscript")
@@ -68,7 +68,7 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
 
 
 class _Step(nn.Module):
-    """A network that remembers, with its state as input and output."""
+    """A recurrent network with its state as input and output."""
 
     def __init__(self, network: DisplacementNetwork) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ def _shapes(network: DisplacementNetwork) -> tuple[dict[int, Any], ...]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporter warns of its own parts, and of packages that are not needed here."""
+    """Silence the exporter's warnings about its own parts and packages not needed here."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -1,19 +1,20 @@
-"""StarIO for use on a CPU: the same numbers from a recording of in-place operations.
+"""StarIO for inference on a CPU: the same outputs from a recording of in-place operations.
 
-What makes it fast, each step exact up to rounding:
+These steps make it fast; each is exact up to rounding:
 
 - Activations are rows of channels, (B, L, C): 1x1 convolutions, and strided ones whose taps do not
-  overlap, are matrix products. The two branches of the star operation are one product.
-- Trained batch norms are affine and go into the convolution next to them. Where a norm comes
-  before zero padding, the padded taps miss its offset, so that a depthwise convolution gets a bias
-  per position and channel.
-- Biases of the blocks' last convolutions only shift the residual stream by a constant: it is left
-  out, and what reads the stream has it in its own bias.
-- The root mean square of a window is one number: what follows is linear in it, so it scales
-  pooled vectors instead of the large tensors. Sums stand for means, counts go into weights.
-- Both wings lie side by side in one vector; taps per position keep their convolutions apart.
-- A single window is a few hundred operations of about a microsecond each, less than it takes to
-  ask for their memory: for every size of batch they are recorded once, with buffers and views.
+  overlap, become matrix products. The two branches of the star operation are one product.
+- Trained batch norms are affine and are folded into the adjacent convolution. If a norm precedes
+  zero padding, the padded taps lack its offset, so that a depthwise convolution gets a bias per
+  position and channel.
+- Biases of the blocks' last convolutions only shift the residual stream by a constant. The
+  constant is omitted and added to the biases of the layers that read the stream.
+- The root mean square of a window is one number, and the operations after it are linear in it, so
+  it scales pooled vectors instead of the large tensors. Sums replace means, with the counts folded
+  into weights.
+- Both wings share one vector; taps per position keep their convolutions separate.
+- A single window takes a few hundred operations of about a microsecond each, less than allocating
+  their memory takes: they are recorded once per batch size, with buffers and views.
 
 Shapes below: B windows, L time steps, C channels, D channels of the star operation.
 """
@@ -40,14 +41,14 @@ from stario.network.stario import Block, StarIO
 from stario.sequences.windows import WINDOW_SAMPLES
 
 _RECORDINGS = 4
-"""Sizes of batches whose buffers are kept, for each thread."""
+"""Number of batch sizes whose buffers are kept, per thread."""
 
 
 class FastStarIO(nn.Module):
-    """StarIO in evaluation mode: (B, 6, 200) to (B, outputs), without gradients.
+    """StarIO in evaluation mode: maps (B, 6, 200) to (B, outputs), without gradients.
 
     Args:
-        network: whose weights are copied; later changes do not reach the copy.
+        network: network whose weights are copied; later changes do not affect the copy.
     """
 
     def __init__(self, network: StarIO) -> None:
@@ -67,12 +68,12 @@ class FastStarIO(nn.Module):
         self._local = threading.local()
 
     def forward(self, windows: Tensor) -> Tensor:
-        """(B, 6, 200) to (B, outputs)."""
+        """Map (B, 6, 200) to (B, outputs)."""
         with torch.no_grad():
             return self._recording(len(windows)).play(windows)
 
     def weights(self) -> list[Tensor]:
-        """Every folded weight."""
+        """Return all folded weights."""
         found: list[Tensor] = []
         held: list[object] = [*self.stages, *self.head]
         while held:
@@ -89,16 +90,16 @@ class FastStarIO(nn.Module):
         known: dict[int, _Batch] = self._local.__dict__.setdefault("recordings", {})
         found = known.pop(batch, None)
         if found is None:
-            # Buffers made in inference mode could not be written outside of it.
+            # Buffers made in inference mode could not be written outside it.
             with torch.inference_mode(False):
                 found = _Batch(self.stages, self.head, batch)
-        known[batch] = found  # the newest is the last
+        known[batch] = found  # the most recent is last
         while len(known) > _RECORDINGS:
             del known[next(iter(known))]
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        """Buffers stay behind when the network is sent to another process."""
+        """Exclude buffers when the network is sent to another process."""
         return {k: v for k, v in self.__dict__.items() if k != "_local"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -107,7 +108,7 @@ class FastStarIO(nn.Module):
 
 
 class _Batch(Recording):
-    """What is done to a batch of one size."""
+    """Recorded operations for one batch size."""
 
     def __init__(self, stages: list[Stage], head: list[Product], batch: int) -> None:
         super().__init__()
@@ -131,18 +132,18 @@ class _Batch(Recording):
 
 
 class Stage:
-    """Strided convolution with its norm, and the blocks behind it.
+    """Strided convolution with its norm, and the blocks after it.
 
     Args:
-        convolution: of width 3.
-        norm: of its output.
-        blocks: at the stage's width.
-        length: of the convolution's input.
-        offset: (C,) what the input lacks.
+        convolution: convolution of width 3.
+        norm: norm of its output.
+        blocks: blocks at the stage's width.
+        length: length of the convolution's input.
+        offset: (C,) constant omitted from the input.
 
     Attributes:
         length: L of the stage's output.
-        offset: (C,) what the output lacks.
+        offset: (C,) constant omitted from the output.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class Stage:
         assert isinstance(convolution, nn.Conv1d)
         assert isinstance(norm, nn.BatchNorm1d)
         self.stride = convolution.stride[0]
-        # Only the stem pads; its input lacks nothing.
+        # Only the stem pads, and nothing is omitted from its input.
         self.length = (length + 2 * int(convolution.padding[0]) - 3) // self.stride + 1
         scale, shift = affine(norm)
         weight = convolution.weight.double() * scale[:, None, None]
@@ -175,10 +176,10 @@ class Stage:
         self.offset = self.offset + layer.left_out
 
     def record(self, recording: Recording, x: Tensor) -> Tensor:
-        """The buffer (B, L, C) of the result for an input buffer, padded already."""
+        """Record the stage on a buffer that is already padded; return the result's (B, L, C)."""
         taps = x.unfold(1, 3, self.stride)[:, : self.length].transpose(2, 3)
         if x.shape[1] == self.stride * self.length and self.stride == 3:
-            rows = x  # the taps lie there one after the other
+            rows = x  # the taps are already contiguous
         else:
             rows = torch.empty(taps.shape)
             recording.do(rows.copy_, taps)
@@ -192,7 +193,7 @@ class Stage:
 
 
 def _head(head: nn.Sequential, length: int, offset: Tensor) -> list[Product]:
-    """Linear layers; the first reads the channels of a time step together, not the reverse."""
+    """Return the linear layers, the first reordered for inputs (L, C) instead of (C, L)."""
     first, *others = [layer for layer in head if isinstance(layer, nn.Linear)]
     weight = first.weight.double().view(len(first.weight), -1, length)
     products = [Product(weight.transpose(1, 2).flatten(1), first.bias + weight.sum(2) @ offset)]

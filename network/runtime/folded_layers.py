@@ -1,7 +1,7 @@
-"""StarIO's layers with what is fixed after training folded in, as operations on buffers.
+"""StarIO's layers as operations on buffers, with everything fixed after training folded in.
 
-Shapes: B windows, L time steps, C channels, D channels of the star operation. What is folded, and
-why the numbers stay the same: `fast_stario`.
+Shapes: B windows, L time steps, C channels, D channels of the star operation. `fast_stario`
+explains what is folded and why the outputs stay the same.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stario.network.stario import EPSILON, DualWingStarBlock, GatedUnit
 
 
 class Recording:
-    """Operations in order, with everything they write to."""
+    """Ordered operations with all buffers that they write to."""
 
     def __init__(self) -> None:
         self.operations: list[Callable[[], Any]] = []
@@ -36,7 +36,7 @@ class Product:
         self.bias = None if bias is None else _own(bias)
 
     def record(self, recording: Recording, rows: Tensor) -> Tensor:
-        """The buffer (N, D) of the result."""
+        """Record the product and return its buffer (N, D)."""
         result = torch.empty(len(rows), self.weight.shape[1])
         if self.bias is None:
             recording.do(torch.mm, rows, self.weight, out=result)
@@ -45,7 +45,7 @@ class Product:
         return result
 
     def onto(self, recording: Recording, rows: Tensor, x: Tensor) -> None:
-        """Add the product to x (B, L, D)."""
+        """Record the addition of the product to x (B, L, D)."""
         flat = x.view(-1, x.shape[2])
         recording.do(torch.addmm, flat, rows, self.weight, out=flat)
 
@@ -57,7 +57,7 @@ class Scratch:
         batch, length, channels = x.shape
         inner = 2 * channels
         self.depthwise = torch.empty(batch, length, channels)
-        # The star and its square lie one after the other, so that they are pooled together.
+        # The star and its square are adjacent, so that they are pooled together.
         self.powers = torch.empty(2, batch, length, inner)
         self.sums = torch.empty(2, batch, inner + length)
         self.wings = torch.empty(batch, inner + length)
@@ -68,7 +68,7 @@ class Depthwise:
     """Depthwise convolution of width 3, zero-padded, with norms before and after it folded in.
 
     Args:
-        convolution: of the channels.
+        convolution: depthwise convolution.
         before: scale and offset (C,) of its input.
         after: scale and offset (C,) of its output.
         length: L of its input.
@@ -86,24 +86,24 @@ class Depthwise:
         if convolution.bias is not None:
             bias = bias + convolution.bias
         reach = torch.ones(3, length, 1, dtype=torch.float64)
-        reach[0, 0] = reach[2, -1] = 0.0  # the padding is zero, it has no offset
+        reach[0, 0] = reach[2, -1] = 0.0  # zero padding has no offset
         bias = bias + (reach * (taps * before[1])[:, None]).sum(0)
         taps = taps * before[0] * after[0]
         self.bias = _own(bias * after[0] + after[1])
         self.taps = [_own(tap) for tap in taps]
 
     def record(self, recording: Recording, x: Tensor, y: Tensor) -> None:
-        """From buffer to buffer, both (B, L, C)."""
+        """Record the convolution from buffer x to buffer y, both (B, L, C)."""
         previous, present, following = self.taps
         recording.do(torch.addcmul, self.bias, x, present, out=y)
         _record_neighbours(recording, x, previous, following, y)
 
 
 class Star:
-    """DWSB and its shortcut.
+    """DWSB with its residual connection.
 
     Attributes:
-        left_out: (C,) bias that is missing in the result.
+        left_out: (C,) bias omitted from the result.
     """
 
     def __init__(self, block: DualWingStarBlock, length: int, offset: Tensor) -> None:
@@ -118,7 +118,7 @@ class Star:
         self.left_out = bias_of(block.project).double()
 
     def record(self, recording: Recording, x: Tensor, scratch: Scratch) -> None:
-        """Change x (B, L, C)."""
+        """Record the in-place update of x (B, L, C)."""
         do = recording.do
         self.depthwise.record(recording, x, scratch.depthwise)
         rows = scratch.depthwise.flatten(0, 1)
@@ -141,11 +141,11 @@ class Star:
 class Wings:
     """Weights of both wings from the pooled star operation, before its normalisation.
 
-    With q the mean square, r = 1 / sqrt(q + eps), and mean m and variance v before normalising,
+    With q the mean square, r = 1 / sqrt(q + eps), and mean m and variance v before normalisation,
     the normalised star has mean r m and deviation sqrt(r^2 v + eps) = r sqrt(v + eps (q + eps)).
-    The convolution is linear in r too, and the weights take up the r of the star they multiply.
-    With sums s and s2 over n positions, n^2 v = n s2 - s^2; and E = L D (q + eps) is a sum. The
-    `factor` sqrt(L D) by which 1 / sqrt(E) is less than r is left to fixed weights.
+    The convolution is linear in r too, and the weights include the r of the star they multiply.
+    With sums s and s2 over n positions, n^2 v = n s2 - s^2, and E = L D (q + eps) is a sum. As
+    r = sqrt(L D) / sqrt(E), the `factor` sqrt(L D) is folded into fixed weights.
 
     Vectors hold D positions of the channel wing, then L of the time wing.
     """
@@ -170,13 +170,13 @@ class Wings:
         kernels = channel.convolution.weight.view(3), time.convolution.weight.view(3)
         taps = [side_by_side(a, b) * self.factor for a, b in zip(*kernels, strict=True)]
         seam = torch.ones(inner + length - 1)
-        seam[inner - 1] = 0.0  # neither wing sees the other
+        seam[inner - 1] = 0.0  # the wings stay separate
         self.previous = _own(taps[0][1:] * seam)
         self.present = _own(taps[1])
         self.following = _own(taps[2][:-1] * seam)
 
     def record(self, recording: Recording, scratch: Scratch) -> None:
-        """From `scratch.sums` of star and square to `scratch.wings`: weights x r / factor."""
+        """Record `scratch.wings`, weights x r / factor, from `scratch.sums` of star and square."""
         do = recording.do
         (total, square), weights, energy = scratch.sums.unbind(), scratch.wings, scratch.energy
         do(torch.sum, square[:, self.inner :], 1, keepdim=True, out=energy)
@@ -197,10 +197,10 @@ class Wings:
 
 
 class Gate:
-    """MSGCU and its shortcut.
+    """MSGCU with its residual connection.
 
     Attributes:
-        left_out: (C,) bias that is missing in the result.
+        left_out: (C,) bias omitted from the result.
     """
 
     def __init__(self, unit: GatedUnit, length: int, offset: Tensor) -> None:
@@ -218,7 +218,7 @@ class Gate:
         self.left_out = bias_of(unit.project).double()
 
     def record(self, recording: Recording, x: Tensor, scratch: Scratch) -> None:
-        """Change x (B, L, C)."""
+        """Record the in-place update of x (B, L, C)."""
         do = recording.do
         pooled = torch.empty(len(x), x.shape[2])
         do(torch.sum, x, 1, out=pooled)
@@ -239,7 +239,7 @@ class Gate:
 def _record_neighbours(
     recording: Recording, x: Tensor, previous: Tensor, following: Tensor, y: Tensor
 ) -> None:
-    """Add to y (B, N, ...) the two outer taps of a convolution of width 3 along N of x."""
+    """Record adding to y (B, N, ...) the two outer taps of a width-3 convolution along N of x."""
     later, earlier = y[:, 1:], y[:, :-1]
     recording.do(torch.addcmul, later, x[:, :-1], previous, out=later)
     recording.do(torch.addcmul, earlier, x[:, 1:], following, out=earlier)
@@ -250,6 +250,6 @@ def _own(value: Tensor) -> Tensor:
 
 
 def bias_of(convolution: nn.Conv1d) -> Tensor:
-    """The bias (C,) that a convolution has."""
+    """Return the bias (C,) of a convolution that has one."""
     assert convolution.bias is not None
     return convolution.bias.detach()

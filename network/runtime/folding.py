@@ -1,4 +1,4 @@
-"""Trained batch norms folded into the convolutions before them."""
+"""Folding of trained batch norms into the convolutions before them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stario.network.baselines.parts import ConvNorm
 
 
 def affine(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
-    """Scale and offset (C,) of a trained batch norm, in double precision."""
+    """Return the scale and offset (C,) of a trained batch norm, in double precision."""
     assert norm.running_var is not None
     assert norm.running_mean is not None
     variance, mean = norm.running_var.double(), norm.running_mean.double()
@@ -20,7 +20,7 @@ def affine(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
 
 
 def folded(network: nn.Module) -> nn.Module:
-    """A copy in evaluation mode whose every `ConvNorm` is one convolution with bias."""
+    """Return a copy in evaluation mode with every `ConvNorm` as one convolution with bias."""
     network = copy.deepcopy(network).eval().requires_grad_(False)
     for parent in list(network.modules()):
         for name, child in parent.named_children():

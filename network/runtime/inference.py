@@ -1,4 +1,4 @@
-"""The inference form of a network: the same numbers, faster on a CPU."""
+"""Inference form of a network: the same outputs, faster on a CPU."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def inference_form(network: DisplacementNetwork) -> DisplacementNetwork:
-    """A copy of a network in evaluation mode, in the form that runs fastest.
+    """Return a copy of a network in evaluation mode, in its fastest form.
 
-    Its outputs agree to 1e-5; weights that change later do not reach it. StarIO becomes
-    `FastStarIO`; others get their batch norms folded into their convolutions.
+    Its outputs agree to 1e-5; later changes of the weights do not affect it. StarIO becomes
+    `FastStarIO`; other networks get their batch norms folded into their convolutions.
 
     Args:
-        network: (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3); it is left in
+        network: maps (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3); it is left in
             evaluation mode.
     """
     inner = network.eval().network

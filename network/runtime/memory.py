@@ -1,4 +1,4 @@
-"""How much memory a computation in PyTorch takes beyond what it begins with."""
+"""Peak memory that a computation in PyTorch takes in addition to its inputs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch.utils._pytree import tree_leaves
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
-    """The most that the results of operations take at once, beyond what was there before.
+    """Return the peak memory [bytes] of operations' results, in addition to existing tensors.
 
-    What an operation takes within itself and gives back, such as a packed copy of its weights, is
-    not seen.
+    Memory that an operation takes and frees internally, such as a packed copy of its weights, is
+    not counted.
     """
     watch = _Watch()
     with torch.no_grad(), watch:
@@ -24,7 +24,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 
 class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Adds the storage of every new tensor and takes it off when it is freed."""
+    """Counter that adds the storage of every new tensor and subtracts it when it is freed."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""Models that ONNX Runtime computes, from files of `export_onnx`; PyTorch is not imported."""
+"""Loading of files written by `export_onnx` into ONNX Runtime, without importing PyTorch."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.errors import InputError, WeightsError
 
 CARD_KEY = "stario_card"
-"""Of the metadata that holds the card as JSON."""
+"""Metadata key of the card, stored as JSON."""
 
 
 def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
-    """The engine and the card of an exported file.
+    """Load the engine and the card of an exported file.
 
     Args:
-        path: written by `export_onnx`.
+        path: file written by `export_onnx`.
 
     Raises:
         InputError: the extra `onnx` is not installed.
-        WeightsError: the file is missing, cut short, or no file of `export_onnx`.
+        WeightsError: the file is missing, truncated, or not written by `export_onnx`.
     """
     runtime = onnx_packages("onnxruntime")
     if not path.is_file():
         raise WeightsError(path, "file", "nothing there", "an exported model")
     options = runtime.SessionOptions()
-    # As many threads as PyTorch takes: those that the environment grants, else all (0).
+    # As many threads as PyTorch uses: those that the environment grants, else all (0).
     granted = os.environ.get("OMP_NUM_THREADS", "")
     options.intra_op_num_threads = int(granted) if granted.isdecimal() else 0
     options.log_severity_level = 3
@@ -40,18 +40,18 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
     # ONNX Runtime's errors have no common base of their own.
     except Exception as error:
         found = str(error).splitlines()[0]
-        raise WeightsError(path, "graph", found, "a whole ONNX file") from error
+        raise WeightsError(path, "graph", found, "a complete ONNX file") from error
     metadata = session.get_modelmeta().custom_metadata_map
     if CARD_KEY not in metadata:
-        raise WeightsError(path, CARD_KEY, "no such metadata", "a file of `stario export`")
+        raise WeightsError(path, CARD_KEY, "no such metadata", "a file from `stario export`")
     return OnnxEngine(session), parse_card(metadata[CARD_KEY], path)
 
 
 def onnx_packages(*names: str) -> Any:
-    """The last of some packages of the extra `onnx`.
+    """Import packages of the extra `onnx` and return the last.
 
     Raises:
-        InputError: one is not installed.
+        InputError: a package is not installed.
     """
     module = None
     for name in names:

@@ -1,4 +1,4 @@
-"""Every network side by side: counts, time and memory of an inference on this machine."""
+"""Comparison of all networks: counts, time and memory of an inference on this machine."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ Milliseconds = dict[str, dict[str, float] | None]
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One network.
+    """Figures of one network.
 
     Attributes:
-        name: of the architecture.
-        parameters: by the convention of the paper's table, with two outputs.
-        flops: likewise.
-        numel: numbers in all parameters, with two outputs.
-        milliseconds: per window, by engine and size of batch, with six outputs; None where the
+        name: name of the architecture.
+        parameters: parameters by the convention of the paper's table, with two outputs per head.
+        flops: FLOPs by the same convention and with the same outputs.
+        numel: number of elements of all parameters, with two outputs per head.
+        milliseconds: time per window [ms], by engine and batch size, with six outputs; None if the
             engine is not installed.
-        peak_memory_mb: of an inference of one window in PyTorch, in 10^6 bytes.
+        peak_memory_mb: peak memory of an inference of one window in PyTorch [10^6 bytes].
     """
 
     name: str
@@ -57,25 +57,25 @@ class ModelRow:
     peak_memory_mb: float
 
     def as_dict(self) -> dict[str, object]:
-        """The row as plain values."""
+        """Return the row as plain values."""
         return dict(vars(self))
 
 
 def measured() -> dict[str, str]:
-    """How each column comes about, in words."""
+    """Return a description of how each column is obtained."""
     threads = torch.get_num_threads()
     return {
-        "parameters": "of modules that the rules of the paper's table know, with two outputs "
-        "(stario.network.runtime.cost); here in millions, the paper's own figure beside",
+        "parameters": "those of modules covered by the rules of the paper's table, two outputs per "
+        "head (stario.network.runtime.cost); here in millions, the paper's figure in parentheses",
         "flops": "by the same rules, for one window; likewise",
-        "numel": "numbers in all parameters of the same network; in millions",
-        "milliseconds": "per window with six outputs, in the form that is used, weights random: "
+        "numel": "number of elements of all parameters of the same network; in millions",
+        "milliseconds": "per window with six outputs, in the inference form, with random weights: "
         "median over calls in turn with all other networks, "
         + ", ".join(f"{runs} calls at batch {batch}" for batch, runs in _RUNS.items())
         + f"; {threads} threads in PyTorch and in ONNX Runtime",
-        "peak_memory_mb": "weights of the form that is used, and the most that the results of "
-        "PyTorch's operations take at once in the first inference of one window; what libraries "
-        "take within an operation is not seen",
+        "peak_memory_mb": "weights of the inference form, and the peak size of the results of "
+        "PyTorch's operations in the first inference of one window; memory that libraries take "
+        "within an operation is not counted",
     }
 
 
@@ -84,16 +84,16 @@ def survey(
     cache: Path | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[ModelRow]:
-    """Count, time and weigh networks.
+    """Count the parameters and FLOPs of networks and measure their time and memory.
 
     Args:
-        names: of architectures.
-        cache: folder that keeps exported graphs, which take up to half a minute each to make; None
-            leaves ONNX Runtime out.
-        progress: called with the share of the work done.
+        names: names of architectures.
+        cache: folder that keeps exported graphs, each of which takes up to half a minute to make;
+            None skips ONNX Runtime.
+        progress: called with the fraction of the work done.
 
     Raises:
-        InputError: an unknown name.
+        InputError: a name is unknown.
     """
     entries = [architecture(name) for name in names]
     models = [_model(name) for name in names]
@@ -132,7 +132,7 @@ def survey(
 
 
 def survey_table(rows: Sequence[ModelRow]) -> str:
-    """The same for a person, the paper's figures beside ours."""
+    """Return the rows as a text table, with the paper's figures in parentheses."""
     columns = "parameters (paper),FLOPs (paper),numel,torch 1,torch 64,onnx 1,onnx 64,peak MB"
     titles = columns.split(",")
     table = [["", *titles]]
@@ -157,7 +157,7 @@ def _model(name: str) -> DisplacementModel:
 
 
 def _graph_engine(model: DisplacementModel, cache: Path) -> Engine:
-    """The exported graph, from the cache where the code that makes it is still the same."""
+    """Return the exported graph, from the cache if the code that makes it is unchanged."""
     from stario.network.runtime.export import export_onnx
     from stario.network.runtime.onnx_file import load_onnx
 
@@ -173,7 +173,7 @@ def _graph_engine(model: DisplacementModel, cache: Path) -> Engine:
 
 
 def _times(engines: Sequence[Engine]) -> dict[str, list[float]]:
-    """Milliseconds per window of each engine, by size of batch."""
+    """Return the time per window [ms] of each engine, by batch size."""
     generator = np.random.default_rng(_SEED)
     result = {}
     for batch in BATCHES:
@@ -193,7 +193,7 @@ def _peak_memory(network: DisplacementNetwork) -> int:
 
 
 def _weights(form: nn.Module) -> int:
-    """Bytes of parameters and buffers, also of those that StarIO's fast form keeps to itself."""
+    """Return the bytes of parameters and buffers, including the folded weights of `FastStarIO`."""
     from stario.network.runtime.fast_stario import FastStarIO
 
     known = [*form.parameters(), *form.buffers()]

@@ -1,4 +1,4 @@
-"""Timing of several things in turn, so that all of them meet the same load."""
+"""Timing of several functions in turn, so that all run under the same load."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _WARM_UP = 3
 
 
 def seconds_in_turn(calls: Sequence[Callable[[], object]], runs: int) -> FloatArray:
-    """Seconds of each call (runs, calls), made one after the other in every run.
+    """Return the time (runs, calls) [s] of each call; every run makes all calls in turn.
 
     Args:
-        calls: what is timed.
-        runs: of all of them, after a few that are not counted.
+        calls: functions to time.
+        runs: number of timed runs, after a few warm-up runs.
     """
     seconds = np.zeros((_WARM_UP + runs, len(calls)))
     for row in seconds:

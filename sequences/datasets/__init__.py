@@ -1,1 +1,1 @@
-"""Many recordings: lists, splits, caches, conversion."""
+"""Collections of recordings: lists, splits, caches, conversion."""

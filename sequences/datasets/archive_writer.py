@@ -1,7 +1,7 @@
-"""Writing StarIO's archive: many recordings in one HDF5 file, each a group under its name.
+"""Writer of StarIO's archive: many recordings in one HDF5 file, each in a group of its name.
 
-The layout is the one that `stario.sequences.readers.archive` reads. Numbers are written as they
-are, in double precision and compressed, so that they come back bit for bit (attitudes to the last
+The layout is the one that `stario.sequences.readers.archive` reads. Numbers are written unchanged,
+in double precision and compressed, so that they are read back bit for bit (attitudes to the last
 digit of their quaternions).
 """
 
@@ -25,15 +25,15 @@ _COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[str]:
-    """Write recordings into one archive, whole or not at all; one that is there is replaced.
+    """Write recordings into one archive, atomically; an existing file is replaced.
 
     Args:
-        path: the file, `.h5` or `.hdf5`.
-        sequences: taken one by one, so that they need not fit into memory together.
+        path: the archive file, `.h5` or `.hdf5`.
+        sequences: recordings, consumed one by one, so that they need not fit into memory together.
 
     Returns:
-        The names under which they are stored: their own, with `-2`, `-3`, ... where one is taken
-        and `-` for a slash.
+        The names under which they are stored: their own, with `-2`, `-3`, ... appended if a name
+        is taken, and with `-` instead of a slash.
 
     Raises:
         InputError: the file's name has another suffix, its folder does not exist, there is no
@@ -41,7 +41,7 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError("path", str(path), f"an archive's name, {' or '.join(SUFFIXES)}")
+        raise InputError("path", str(path), f"a file name ending in {' or '.join(SUFFIXES)}")
     h5py = optional_package("h5py", "readers")
     names: list[str] = []
     with atomic_path(path) as temporary:
@@ -50,7 +50,7 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
                 names.append(_free_name(sequence.name, file))
                 _write(file.create_group(names[-1]), sequence)
         if not names:
-            raise InputError(str(path), "no recording", "at least one to write")
+            raise InputError(str(path), "no recording", "at least one recording")
     return names
 
 
@@ -96,7 +96,7 @@ def _position_columns(sequence: ImuSequence, track: PositionTrack) -> dict[str, 
     elif sequence.truth is None:
         stem, place = "truth", "p"
     else:
-        _log.warning("%s: positions beside a pose truth are not written", sequence.name)
+        _log.warning("%s: positions alongside true poses are not written", sequence.name)
         return {}
     columns: dict[str, Any] = {f"{stem}/t": track.time, f"{stem}/{place}": track.position_W}
     if not track.valid.all():

@@ -1,6 +1,6 @@
-"""Many recordings through one function: in parallel, past those that fail.
+"""Apply one function to many recordings in parallel, skipping those that fail.
 
-joblib does the work: processes of this machine by default, a Dask or Ray cluster within
+joblib runs the work: in processes of this machine by default, on a Dask or Ray cluster within
 `joblib.parallel_config("dask")` or "ray".
 """
 
@@ -18,11 +18,11 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Skipped:
-    """What could not be used.
+    """An item that could not be used.
 
     Attributes:
-        item: what it is called: a path.
-        reason: the error's line, which names what was wrong where.
+        item: name of the item: its path.
+        reason: the one-line error message, which names what was wrong and where.
     """
 
     item: str
@@ -32,15 +32,16 @@ class Skipped:
 def each(
     work: Callable[[Item], Result], items: Iterable[Item], jobs: int | None = None
 ) -> Iterator[Result | Skipped]:
-    """What `work` makes of each item, in order, as soon as it is there; with Ray in the end.
+    """Yield the result of `work` for each item, in order and as soon as it is ready.
 
-    An item for which it raises a `StarioError` comes back as `Skipped`; any other exception is a
-    bug and ends the batch.
+    With Ray all results come at the end. An item for which `work` raises a `StarioError` comes back
+    as `Skipped`; any other exception is a bug and ends the batch.
 
     Args:
-        work: a function that can be pickled, where more than one process works.
-        items: anything that can be pickled.
-        jobs: processes; -1 for one per core, None for what `joblib.parallel_config` says (1).
+        work: function to apply; it must be picklable if there is more than one process.
+        items: picklable items.
+        jobs: number of processes; -1 for one per core, None for that of `joblib.parallel_config`
+            (default 1).
     """
     from joblib import Parallel, delayed
     from joblib.parallel import get_active_backend

@@ -1,4 +1,4 @@
-"""Recordings from any format into a CSV of one's own, the EuRoC layout or an archive."""
+"""Conversion of recordings of any format to StarIO's CSV, the EuRoC layout or an archive."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ _VELOCITY_HEADER = ",v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1]"
 
 
 def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> list[Path]:
-    """Write a recording, whole or not at all.
+    """Write a recording atomically.
 
-    Numbers are written with the digits that bring them back bit for bit; the EuRoC layout holds
-    times in integer nanoseconds. An archive keeps everything, the others not: truth's poses that
-    are not valid, its covariance, positions without attitude, attributes; CSV no velocity, EuRoC
-    no magnetometer. What is lost is logged.
+    Numbers have enough digits to be read back bit for bit; the EuRoC layout holds times in integer
+    nanoseconds. CSV and EuRoC drop the truth's covariance and invalid poses, the device's own
+    attitude, attributes, and positions alongside true poses; CSV also drops the truth's velocity,
+    EuRoC all positions and the magnetometer. An archive only drops positions alongside true poses,
+    unless they are waypoints. A warning lists most losses.
 
     Args:
         sequence: the recording.
         path: a file to write or replace, or the EuRoC recording's new folder.
-        layout: one of `LAYOUTS`; None for what the path's end says, see `layout_of`.
+        layout: one of `LAYOUTS`; None to infer it from the path's suffix, see `layout_of`.
 
     Returns:
         The files written.
@@ -64,7 +65,7 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
 
 
 def convert_all(sequences: Iterable[ImuSequence], path: Path) -> list[str]:
-    """Write recordings into one archive, whole or not at all; returns their names in it.
+    """Write recordings into one archive, atomically, and return their names in it.
 
     Raises:
         InputError: as for `convert` and `write_archive`.
@@ -73,29 +74,29 @@ def convert_all(sequences: Iterable[ImuSequence], path: Path) -> list[str]:
 
 
 def layout_of(path: Path, layout: str | None = None) -> str:
-    """The layout that is named, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
+    """Return the given layout, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
 
     Raises:
-        InputError: the layout, or the path's end, is unknown.
+        InputError: the layout or the path's suffix is unknown.
     """
     if layout is None:
         by_suffix = {".csv": "csv", "": "euroc", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
         if path.suffix.lower() in by_suffix:
             return by_suffix[path.suffix.lower()]
-        known = ".csv, .h5, or a folder's name without a dot"
-        raise InputError(str(path), path.suffix, known, "name the layout: --to")
+        known = ".csv, .h5 or a folder name without a dot"
+        raise InputError(str(path), path.suffix, known, "choose the layout with --to")
     if layout not in LAYOUTS:
         raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
     return layout
 
 
 def check_content(sequence: ImuSequence) -> ImuSequence:
-    """The recording, if its numbers can be in the units that a file would claim.
+    """Return the recording if its numbers are plausible in the units that the file will state.
 
     Raises:
         InputError: as for `check_units`.
     """
-    if sequence.duration >= MIN_SECONDS:  # a shorter one shows too little to be judged
+    if sequence.duration >= MIN_SECONDS:  # a shorter one is too short to check
         check_units(sequence)
     return sequence
 
@@ -103,14 +104,14 @@ def check_content(sequence: ImuSequence) -> ImuSequence:
 def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
     """Write `mav0/imu0/data.csv` and, with truth, `mav0/state_groundtruth_estimate0/data.csv`.
 
-    Times are those of the sequence in whole nanoseconds, counted from its earliest. Truth has
-    EuRoC's first eight columns, w first, and its velocity's three where that is known.
+    Times are those of the sequence in whole nanoseconds, counted from the earliest if that is
+    negative. The truth has EuRoC's first eight columns, w first, and three of velocity if known.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: a time is not finite, or the folder is there already.
+        InputError: a time is not finite, or the folder exists and is not empty.
     """
     if not np.isfinite(sequence.time).all():
         row = int(np.argmin(np.isfinite(sequence.time)))
@@ -147,7 +148,7 @@ def _poses(truth: Trajectory) -> FloatArray:
 
 
 def _nanoseconds(time: FloatArray, first: float) -> NDArray[np.int64]:
-    """Whole nanoseconds; those of `first` are 0 where it is negative, for stamps have no sign."""
+    """Return whole nanoseconds, counted from `first` if that is negative: stamps have no sign."""
     origin = round(min(first, 0.0) * 1e9)
     return np.asarray(np.round(time * 1e9), dtype=np.int64) - origin
 
@@ -174,8 +175,8 @@ def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
             f"{sequence.positions.kind} have no file in the EuRoC layout: write .csv or .h5"
         )
     if sequence.magnetometer is not None and layout == "euroc":
-        lost.append("the magnetometer has no file in the EuRoC layout: write a .csv or .h5")
+        lost.append("the magnetometer has no file in the EuRoC layout: write .csv or .h5")
     if sequence.device_attitude is not None:
-        lost.append("the device's own attitude has no column: write an .h5")
+        lost.append("the device's own attitude has no column: write .h5")
     for words in lost:
         log.warning("%s: %s", sequence.name, words)

@@ -1,4 +1,4 @@
-"""Which recordings train, validate and test: here, in the paper, by the data sets' own lists."""
+"""Splits of recordings for training, validation and testing: lists, groups, the paper's split."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ class Listed:
     """A recording of a list and the group that it belongs to.
 
     Attributes:
-        path: of the recording.
-        group: words from the coarse to the fine, as "ilc site2 F1"; empty where none is named.
+        path: path of the recording.
+        group: words from coarse to fine, such as "ilc site2 F1"; empty if the list gives none.
     """
 
     path: Path
     group: str
 
     def within(self, group: str) -> bool:
-        """Whether the recording belongs to a group, or to one that the group is part of."""
+        """Return whether the recording belongs to a group or to a part of it."""
         return f"{self.group} ".startswith(f"{group} ")
 
 
 def read_list(file: Path, data: Path) -> list[Listed]:
-    """Recordings of a list that names them below a data folder.
+    """Read a list of recordings whose names are relative to a data folder.
 
-    Each line is `name` or `name, group`; a name may be a recording in an archive,
-    `file.h5:name`. Comments from `#` on are dropped.
+    Each line is `name` or `name, group`; a name may be that of a recording in an archive,
+    `file.h5:name`. Text from `#` on is a comment.
 
     Raises:
         ReadError: the list cannot be read.
-        InputError: one of its recordings is not there.
+        InputError: a recording of the list does not exist.
     """
     listed = []
     for line in read_lines(file):
@@ -50,30 +50,30 @@ def read_list(file: Path, data: Path) -> list[Listed]:
         path = data / name
         if not split_name(path)[0].exists():
             raise InputError(
-                str(path), "nothing there", f"a recording of {file.name}", "name the data: --data"
+                str(path), "nothing", f"a recording of {file.name}", "set the data folder: --data"
             )
         listed.append(Listed(path, group))
     return listed
 
 
 def leave_out(recordings: Iterable[Listed], group: str) -> tuple[list[Listed], list[Listed]]:
-    """Recordings outside a group, to train on, and those within it, to judge by.
+    """Return the recordings outside a group, for training, and those within it, for evaluation.
 
     Raises:
-        InputError: the group has no recording, or all of them.
+        InputError: the group contains no recording, or all of them.
     """
     known = list(recordings)
     outside = [one for one in known if not one.within(group)]
     inside = [one for one in known if one.within(group)]
     if not inside or not outside:
         groups = ", ".join(sorted({one.group for one in known}))
-        raise InputError("group", repr(group), f"some, but not all, of {groups}")
+        raise InputError("group", repr(group), f"a prefix of some, but not all, of {groups}")
     return outside, inside
 
 
 @dataclass(frozen=True)
 class Split:
-    """Recordings to train on, to stop early by, and to test on; each in sorted order."""
+    """Recordings for training, for early stopping and for testing, each in sorted order."""
 
     training: tuple[Path, ...]
     validation: tuple[Path, ...]
@@ -81,10 +81,10 @@ class Split:
 
 
 def random_split(recordings: Iterable[Path], seed: int) -> Split:
-    """The paper's split: at random, 8:1:1, by whole recordings.
+    """Split whole recordings at random 8:1:1, as the paper does.
 
-    The same recordings and seed give the same split, in whatever order they come. With three
-    recordings or more no part is empty.
+    The same recordings and seed give the same split, whatever their order. With three recordings
+    or more no part is empty.
 
     Raises:
         InputError: there are fewer than three recordings.

@@ -1,14 +1,14 @@
-"""World-frame streams kept on disk: built once, then memory-mapped, so that they need no memory.
+"""Disk cache of world-frame streams: built once, then memory-mapped, so that they need no memory.
 
-One file per recording and set of options, in the layout of safetensors: a header, then the numbers
-of all stretches. A file takes its name only when it is whole, so a killed writer leaves nothing
-that is read, and of two writers at once the second replaces the first by the same content. The
-folder may be deleted at any time.
+There is one file per recording and set of options, in the layout of safetensors: a header, then
+the numbers of all stretches. A file gets its name only when it is complete: a killed writer leaves
+nothing that would be read, and if two write at once, the second replaces the first's file by the
+same content. The folder may be deleted at any time.
 
-The key of a recording is its path, the name, size and modification time of its files, the
+A recording's key consists of its path, the names, sizes and modification times of its files, the
 options it is read with, and the code that reads it. Hashing the files' bytes instead would read
-100 hours of recordings, and the images beside some of them, at every start; what it would notice
-besides is a file that was replaced by one of the same size and the same time.
+100 hours of recordings, and the images next to some of them, at every start; it would only detect
+one case more, a file replaced by one of the same size and modification time.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from stario.sequences.windows import Attitude, WorldStream, world_streams
 log = logging.getLogger(__name__)
 
 Stream = WorldStream | LegStream
-"""What a network learns from: with poses, or with legs between known positions."""
+"""Training data of a network: with poses, or with legs between known positions."""
 
 _TABLES = {"poses": ("imu_W", "position_W", "facing_W"), "legs": ("imu_N", "facing_N", "legs")}
 
@@ -52,7 +52,7 @@ _ABANDONED_S = 3600.0
 
 
 def cache_folder() -> Path:
-    """The folder `STARIO_CACHE`, or `stario` in `XDG_CACHE_HOME`, or in `~/.cache`."""
+    """Return the folder `STARIO_CACHE`, else `stario` in `XDG_CACHE_HOME`, else in `~/.cache`."""
     if named := os.environ.get("STARIO_CACHE"):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stario"
@@ -66,19 +66,19 @@ def recorded(
     jobs: int | None = None,
     attitude: Attitude = "levelled",
 ) -> Iterator[list[Stream] | Skipped]:
-    """The streams of each recording, from the cache or read, checked and put there.
+    """Yield each recording's streams: from the cache, or read, checked and added to it.
 
     Args:
         paths: recordings with poses, positions or waypoints.
-        read: how a path is read; can be pickled.
-        options: what `read` depends on besides the path, as plain values.
-        folder: the cache's; shared with the processes that read.
-        jobs: processes, as for `stario.sequences.datasets.batch.each`.
+        read: picklable function that reads a path.
+        options: everything that `read` depends on besides the path, as plain values.
+        folder: cache folder, shared with the processes that read.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
         attitude: as for `world_streams`.
     """
     work = partial(_stored, read=read, options=dict(options), folder=folder, attitude=attitude)
     for path, outcome in zip(paths, each(work, paths, jobs), strict=True):
-        # Another process hands over a file's name rather than what is in it.
+        # Worker processes return the name of a cache file rather than its content.
         streams = _opened(outcome) if isinstance(outcome, Path) else outcome
         if streams is None:
             try:
@@ -91,12 +91,12 @@ def recorded(
 def cached(
     key: Mapping[str, object], build: Callable[[], Sequence[Stream]], folder: Path
 ) -> Sequence[Stream]:
-    """What `build` returns, from the cache where something of this key is there.
+    """Return the cached streams of a key, or else build them and add them to the cache.
 
     Args:
-        key: plain values that say all that the result depends on, but for this package's code.
-        build: makes the streams.
-        folder: the cache's.
+        key: plain values that determine the result, except for this package's code.
+        build: function that makes the streams.
+        folder: cache folder.
     """
     file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
     streams = _opened(file)
@@ -107,11 +107,11 @@ def cached(
 
 
 def recording_key(path: Path, options: Mapping[str, object]) -> str:
-    """Digest of what is made of a recording: of its files, what they are read with, the code.
+    """Return a digest of a recording's path, files and options and of this package's code.
 
     Args:
-        path: that exists.
-        options: what the result depends on besides the files and this package's code.
+        path: path of a recording that exists.
+        options: everything that the result depends on besides the files and this package's code.
     """
     stamps = [
         (str(file), stat.st_size, stat.st_mtime_ns)
@@ -124,16 +124,16 @@ def recording_key(path: Path, options: Mapping[str, object]) -> str:
 
 
 def recording_files(path: Path) -> list[Path]:
-    """The files that a recording's content comes from, and perhaps others beside them."""
+    """Return the files that a recording is read from, and possibly others next to them."""
     path, member = split_name(path)
     if member is not None:
         return [path]
     while path != path.parent and _is_recording(path.parent, path.parent.stat().st_mtime_ns):
-        path = path.parent  # imu0/data.csv belongs to the folder that holds its truth as well
+        path = path.parent  # imu0/data.csv belongs to the folder that also holds its truth
     if path.is_dir():
         return sorted(p for p in path.rglob("*") if p.is_file())
     if any(FORMATS[name].recognises(path) for name in ("phone", "wide")):
-        return sorted(p for p in path.parent.iterdir() if p.is_file())  # sensors, poses beside
+        return sorted(p for p in path.parent.iterdir() if p.is_file())  # other sensors, poses
     if not FORMATS["oxiod"].recognises(path):
         return [path]
     number = "".join(filter(str.isdigit, path.stem))
@@ -144,7 +144,7 @@ def recording_files(path: Path) -> list[Path]:
 
 @cache
 def _is_recording(folder: Path, changed_ns: int) -> bool:
-    """Asked once for all the files of a folder, which may be thousands."""
+    """Return whether a folder is a recording; cached, as it may hold thousands of files."""
     return any(known.recognises(folder) for known in FORMATS.values())
 
 
@@ -155,7 +155,7 @@ def _stored(
     folder: Path,
     attitude: Attitude,
 ) -> Path | list[Stream]:
-    """The cache's file of a recording, or its streams where nothing can be written."""
+    """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
     file = folder / (recording_key(path, {**options, "attitude": attitude}) + _SUFFIX)
@@ -172,14 +172,14 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
         if not legs:
             raise InputError(
                 f"{sequence.name}: {sequence.positions.kind}",
-                "no two legs in an unbroken stretch of 12 s",
-                "legs of 1.5 s and more at walking speed",
+                "no unbroken stretch of 12 s with two legs",
+                "legs of at least 1.5 s at walking speed",
             )
         return list(legs)
     streams: list[Stream] = list(world_streams(sequence, attitude=attitude))
     if not streams:
         raise InputError(
-            f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to learn from",
+            f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to train on",
             "" if sequence.truth is None else too_slow(sequence.truth),
         )  # fmt: skip
     return streams
@@ -192,7 +192,7 @@ def _digest(key: Mapping[str, object]) -> str:
 
 @cache
 def _code() -> str:
-    """Digest of this package: streams that other code has made are not found again."""
+    """Return a digest of this package, so that streams made by other code are not reused."""
     digest = hashlib.blake2b(digest_size=20)
     for file in code_files():
         digest.update(file.read_bytes())
@@ -200,12 +200,12 @@ def _code() -> str:
 
 
 def code_files() -> list[Path]:
-    """All that streams are made by: readers, levelling, windows, simulation."""
+    """Return the source files that streams depend on: readers, levelling, windows, simulation."""
     return sorted(Path(str(importlib.resources.files("stario.sequences"))).rglob("*.py"))
 
 
 def _written(file: Path, streams: Sequence[Stream]) -> bool:
-    """Whether the streams could be put into the cache, which runs do without if need be."""
+    """Write streams to the cache and return whether it worked; a run continues if it did not."""
     if not streams:
         return False
     tables = [_tables(stream) for stream in streams]
@@ -229,7 +229,7 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
 
 
 def _sweep(file: Path) -> None:
-    """Remove what killed writers of this file have left."""
+    """Remove temporary files that killed writers of this file have left."""
     for left in file.parent.glob(f".{file.name}.*.tmp"):
         with suppress(FileNotFoundError):  # its writer has just finished
             if time.time() - left.stat().st_mtime > _ABANDONED_S:
@@ -237,7 +237,7 @@ def _sweep(file: Path) -> None:
 
 
 def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
-    """A stream's numbers, by name; those of one name have their rows in common over streams."""
+    """Return a stream's arrays by name; those of the same name are stacked over all streams."""
     if isinstance(stream, WorldStream):
         return {name: getattr(stream, name) for name in _TABLES["poses"]}
     legs = [stream.start, stream.stop, stream.displacement, stream.sigma]
@@ -249,7 +249,7 @@ def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
 
 
 def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
-    """The stream of `_tables`."""
+    """Return the stream that `_tables` took apart."""
     if kind == "poses":
         return WorldStream(name, **tables)
     legs = tables["legs"]
@@ -260,7 +260,7 @@ def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
 
 
 def _opened(file: Path) -> list[Stream] | None:
-    """Streams whose numbers are read when they are used; None where the file is not whole."""
+    """Return memory-mapped streams, or None if the file is missing or incomplete."""
     try:
         size = file.stat().st_size
         with file.open("rb") as source:
@@ -273,7 +273,7 @@ def _opened(file: Path) -> list[Stream] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        log.warning("%s: not whole, built anew: %s", file, error)
+        log.warning("%s: incomplete, will be rebuilt: %s", file, error)
         return None
     names = list(_TABLES["poses" if told[0]["kind"] == "poses" else "legs"])
     first = dict.fromkeys(names, 0)

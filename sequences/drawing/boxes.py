@@ -1,4 +1,4 @@
-"""Boxes around paths, for a plan view: which tracks share a frame and how large it is [m]."""
+"""Bounding boxes of paths [m], which determine the tracks and the size of a plan view."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from stario.sequences.sequence import FloatArray
 
 
 def box_of(path: FloatArray) -> FloatArray:
-    """Corners (2, 2), lower left and upper right, of a path (n, 2)."""
+    """Return the corners (2, 2), lower left and upper right, of a path (n, 2)."""
     return np.array([np.nanmin(path, axis=0), np.nanmax(path, axis=0)])
 
 
 def size_of(box: FloatArray) -> float:
-    """Its longer side [m], at least one metre."""
+    """Return the longer side of a box [m], minimum one metre."""
     return max(float(np.ptp(box, axis=0).max()), 1.0)
 
 
 def excess(box: FloatArray, home: FloatArray) -> float:
-    """How far [m] one box reaches beyond another, in x or y."""
+    """Return how far [m] a box extends beyond another, in x or y."""
     return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
 
 
 def rounds(path: FloatArray, box: FloatArray) -> float:
-    """Length of a path over the size of its box: how often it comes by the same place."""
+    """Return a path's length over the size of its box: how often it revisits the same place."""
     return float(np.nansum(np.linalg.norm(np.diff(path, axis=0), axis=1))) / size_of(box)
 
 
 def frame_around(boxes: FloatArray) -> FloatArray:
-    """Corners (2, 2), lower left and upper right, of a frame around boxes (n, 2, 2)."""
+    """Return the corners (2, 2), lower left and upper right, of a frame around boxes (n, 2, 2)."""
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     half = np.maximum(0.5 * (high - low), 0.5) * 1.08
-    half = np.maximum(half, 0.6 * half.max())  # a straight path, too, gets a frame of some width
+    half = np.maximum(half, 0.6 * half.max())  # even a straight path gets a frame of some width
     center = 0.5 * (low + high)
     return np.array([center - half, center + half])

@@ -1,4 +1,4 @@
-"""What figures share: colours, panels, lines that break at gaps, curves through many samples."""
+"""Common parts of figures: colours, panels, lines broken at gaps, curves of many samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette: told apart by the colour-blind and, mostly, in grey.
+# Okabe and Ito's palette: distinguishable for the colour-blind and, mostly, in grey.
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
 RED, SKY, GREY, INK, BROWN = "#D55E00", "#56B4E9", "#999999", "#333333", "#7F5539"
 TRACK_STYLES = {
@@ -36,7 +36,7 @@ _BLOCKS = 600
 
 
 def save_figure(fig: Figure, path: Path | str) -> None:
-    """Write a figure as PNG, whole or not at all.
+    """Write a figure as PNG, atomically.
 
     Raises:
         InputError: the folder does not exist.
@@ -46,7 +46,7 @@ def save_figure(fig: Figure, path: Path | str) -> None:
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
-    """An empty one with its title, width and height in inches."""
+    """Return an empty figure with a title; width and height are in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -57,7 +57,7 @@ def new_figure(width: float, height: float, title: str) -> Figure:
 
 
 def panels_of(fig: Figure, *heights: float) -> list[Axes]:
-    """Panels above each other with these relative heights and one abscissa; one without any."""
+    """Return stacked panels of these relative heights that share the x axis; one by default."""
     ratios = heights or (1,)
     panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     for axes in panels:
@@ -67,7 +67,7 @@ def panels_of(fig: Figure, *heights: float) -> list[Axes]:
 
 
 def dress(axes: Axes) -> None:
-    """Axes as all figures have them."""
+    """Style axes as in all figures."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
     axes.tick_params(colors=INK, labelsize=9)
@@ -76,7 +76,7 @@ def dress(axes: Axes) -> None:
 
 
 def style_of(name: str, index: int) -> tuple[str, str]:
-    """Legend text and colour of a track; unknown names take spare colours by their position."""
+    """Return a track's legend text and colour; unknown names take spare colours by index."""
     return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
 
 
@@ -86,9 +86,9 @@ def broken(
     valid: BoolArray | None = None,
     max_gap: float = MAX_TRUTH_GAP,
 ) -> tuple[FloatArray, FloatArray]:
-    """The valid rows of time (N,) and values (N, k), with a row of nan in each gap.
+    """Return the valid rows of time (N,) and values (N, k), with a row of nan in each gap.
 
-    A gap is as of `behind_gaps`.
+    Gaps are those of `behind_gaps`.
     """
     if valid is not None:
         time, values = time[valid], values[valid]
@@ -100,9 +100,9 @@ def broken(
 
 
 def behind_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
-    """Which of the times (N,) [s] follow a gap.
+    """Return the indices of the times (N,) [s] that follow a gap.
 
-    It is longer than `max_gap` [s] and than three usual steps.
+    A gap is longer than `max_gap` [s] and than three median steps.
     """
     steps = np.diff(time)
     longest = max(max_gap, 3 * float(np.median(steps))) if len(steps) else max_gap
@@ -110,14 +110,14 @@ def behind_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
 
 
 def distance(metres: float) -> str:
-    """In words: metres, or kilometres where there are many."""
+    """Format a distance in metres, or in kilometres from 1000 m on."""
     return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
 
 
 def draw_path(
     axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
 ) -> None:
-    """A path (N, 2) [m] with its start and its end marked."""
+    """Draw a path (N, 2) [m] with its start and end marked."""
     axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
     known = path[np.isfinite(path).all(axis=1)]
     axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
@@ -125,7 +125,7 @@ def draw_path(
 
 
 def draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
-    """Values (N,) as dots, those gated as crosses."""
+    """Draw values (N,) as dots, gated ones as crosses."""
     axes.plot(time[~gated], value[~gated], ".", color=BLUE, ms=3, label="used")
     # An empty line has no extent; unclipped, it would leave the layout without any bounds.
     clipped = not gated.any()
@@ -133,7 +133,7 @@ def draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray)
 
 
 def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
-    """A curve through the samples; through block means, within their extremes, if they are many."""
+    """Draw a curve through samples; if they are many, through block means within the extremes."""
     block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)
     starts = np.arange(0, len(time), block)
     mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
@@ -145,6 +145,6 @@ def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, co
 
 
 def reach_of(*values: FloatArray) -> float:
-    """A little more than the largest finite magnitude."""
+    """Return 1.1 times the largest finite magnitude; 1 if that is 0."""
     finite = np.abs(np.concatenate([value[np.isfinite(value)] for value in values]))
     return 1.1 * float(finite.max(initial=0.0)) or 1.0

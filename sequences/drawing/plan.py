@@ -1,4 +1,4 @@
-"""Tracks from above."""
+"""Plan view of tracks."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CROWDED = 12.0
-"""Rounds from which on lines are drawn finer."""
+"""Number of rounds above which lines are drawn thinner."""
 
 _MARKED_GAP = 1.0
-"""Behind gaps longer than this [s] it is marked where a track goes on."""
+"""Length of a gap [s] above which the track's next pose is marked."""
 
 
 def plan_view(
@@ -40,18 +40,18 @@ def plan_view(
     title: str,
     known: PositionTrack | None = None,
 ) -> Figure:
-    """All tracks from above, on equal axes that fit the truth and the tracks near it.
+    """Draw all tracks from above, on equal axes that fit the ground truth and the tracks near it.
 
-    A track that drifts far beyond these is cut at the frame and the legend says how far it goes.
-    Invalid poses and gaps show as breaks; where a track goes on behind a gap of more than a
-    second it is marked. Tracks are drawn as given: align them before.
+    A track that drifts far beyond these is cut at the frame, and the legend states how far it goes.
+    Invalid poses and gaps appear as breaks; the first pose after a gap of more than a second is
+    marked. Tracks are drawn as given: align them first.
 
     Args:
-        tracks: by name; "inertial", "network", "network_true_attitude", "ekf" and "graph" have
-            fixed colours.
+        tracks: tracks by name; "inertial", "pdr", "network", "network_true_attitude", "ekf" and
+            "graph" have fixed colours.
         truth: the true track in the same frame, or None.
-        title: of the figure.
-        known: positions or waypoints in the same frame, (n, 2), where there is no true track.
+        title: title of the figure.
+        known: positions or waypoints (n, 2) in the same frame, if there is no true track.
 
     Raises:
         InputError: there is nothing to draw.
@@ -62,7 +62,7 @@ def plan_view(
     if path_truth is not None and np.isfinite(path_truth[1]).any():
         typical = path_truth[1]
     elif boxes:
-        # Drift only makes a track larger, so the lower median is a track that did not run away.
+        # Drift only makes a track larger, so the lower median is a track without large drift.
         by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
         typical = paths[by_size[(len(boxes) - 1) // 2]]
     else:
@@ -82,7 +82,7 @@ def plan_view(
         label, colour = style_of(name, k)
         far = excess(box, home)
         if far > 0.5 * size_of(home):
-            label += f" (leaves the figure, by {distance(far)})"
+            label += f" (leaves the figure by {distance(far)})"
         draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     _mark_gaps(axes, tracks)
     if known is not None:
@@ -98,10 +98,10 @@ def plan_view(
 
 
 def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
-    """Where each track goes on behind a gap: there its direction is guessed at best."""
-    label = "behind a gap"
+    """Mark where each track continues after a gap: its direction there is a guess at best."""
+    label = "after a gap"
     for name, track in tracks.items():
-        if name == "pdr":  # has no pose while nobody steps
+        if name == "pdr":  # it has no poses while the person stands
             continue
         behind = behind_gaps(track.time, _MARKED_GAP)
         if len(behind):

@@ -1,4 +1,4 @@
-"""Every figure: plan view, errors over time, innovations, and the IMU's samples.
+"""Figures of errors over time, innovations and the IMU's samples.
 
 Functions return a `matplotlib.figure.Figure` drawn by Agg, without pyplot and its global state,
 so that they work headless and in threads. matplotlib is imported where it is used, because it is
@@ -55,14 +55,14 @@ _CLIP_FACTOR = 3.0
 def error_over_time(
     tracks: Mapping[str, Trajectory], truth: Trajectory, title: str = "Position error"
 ) -> Figure:
-    """Horizontal error of all tracks, and the error per axis within 3 sigma where one is stated.
+    """Draw all tracks' horizontal error, and the error per axis with 3 sigma if available.
 
-    The axes fit the better tracks; one with more than thrice the error of the others is cut. Per
-    axis only tracks with `position_covariance_W` are drawn, or all where none has one. Tracks are
-    compared as given: align them before.
+    The axes fit the better tracks; a track is cut if its largest error is over three times the
+    lower median of all. Per axis only tracks with `position_covariance_W` are drawn, or, if none
+    has one, the better tracks. Tracks are compared as given: align them first.
 
     Raises:
-        InputError: no track, or one that has no time in common with the truth.
+        InputError: there is no track, or one has no time in common with the truth.
     """
     if not tracks:
         raise InputError("tracks", "none", "at least one track")
@@ -103,17 +103,17 @@ def innovations(
     title: str = "Innovations of the filter",
     unit: str = "m",
 ) -> Figure:
-    """What the filter's measurements said beyond its prediction, against what it expected.
+    """Draw a filter's innovations with their 3 sigma bands, and the NIS.
 
     Args:
-        time: (M,) of the updates [s].
+        time: (M,) times of the updates [s].
         residual: (M, 3) innovation, x y z [unit].
-        sigma: (M, 3) its standard deviation as the filter states it [unit].
+        sigma: (M, 3) standard deviation of the innovation according to the filter [unit].
         nis: (M,) normalised innovation squared.
-        dof: expectation of the NIS.
-        gated: (M,) True where the gate refused or weakened the update.
-        title: of the figure.
-        unit: of what was measured.
+        dof: degrees of freedom, the expected NIS.
+        gated: (M,) True where the gate rejected or weakened the update.
+        title: title of the figure.
+        unit: unit of the measurement.
 
     Raises:
         InputError: shapes do not agree or there is no update.
@@ -130,7 +130,7 @@ def innovations(
         band_time, band = broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
         axes.fill_between(band_time, -band[:, 0], band[:, 0], color=BLUE, alpha=0.15, lw=0)
         reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
-        # A gated residual can be huge: marked at the edge, it leaves the others their room.
+        # A gated residual can be huge: drawn at the edge, it leaves room for the others.
         draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
         axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
     panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
@@ -146,16 +146,16 @@ def imu_overview(
     rest: Iterable[tuple[float, float]] = (),
     gaps: Iterable[tuple[float, float]] = (),
 ) -> Figure:
-    """Angular rate, specific force and its norm, and the true speed where there is a truth.
+    """Draw angular rate, specific force and its norm, and the true speed if there is a truth.
 
     Long recordings are drawn as mean and envelope, so that no peak is lost.
 
     Args:
         sequence: the recording.
-        rotation: times [s] and the truth's angular rate there [rad/s], to be drawn over the
-            gyroscope's.
-        rest: first and last time of stretches to be shaded as rest [s].
-        gaps: first and last time of stretches to be shaded as gaps [s].
+        rotation: times [s] and norm of the true angular rate [rad/s], drawn with that of the
+            gyroscope.
+        rest: first and last time of stretches to shade as stationary [s].
+        gaps: first and last time of stretches to shade as gaps [s].
 
     Raises:
         InputError: no sample has finite values.
@@ -197,7 +197,7 @@ def imu_overview(
 
 
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Speed [m/s] along 1 s chords, as the length of the path is measured."""
+    """Return times [s] and speed [m/s] along 1 s chords, from which path length is measured."""
     step = 1.0
     ticks = second_ticks(truth.time)
     if len(ticks) < 2 or truth.valid.sum() < 2:

@@ -1,4 +1,4 @@
-"""Tables of figures for a person, as lines of text."""
+"""Plain-text tables of numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _APART = 3
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """A line for each row of cells: the first column to the left, the others to the right."""
+    """Return one line per row of cells: the first column left-aligned, the others right-aligned."""
     first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [
         f"{name:<{first}}"
@@ -19,5 +19,5 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def figure(value: float | None, form: str = ".3f") -> str:
-    """A number in a table, "-" where there is none."""
+    """Format a number for a table; "-" if there is none."""
     return "-" if value is None or math.isnan(value) else format(value, form)

@@ -1,1 +1,1 @@
-"""Simulated walks and the IMU that would have been carried along them."""
+"""Simulated walks, and the IMU data of a device carried along them."""

@@ -1,14 +1,15 @@
-"""How a walking person carries a device: its motion against the person, in the heading frame H.
+"""Carrying modes: how a device moves relative to a walking person, in the heading frame H.
 
-H has x forward, y left, z up and its origin on the floor below the person. Every carry gives the
-device's offset in H [m] and its turn against a neutral attitude as a rotation vector in H [rad].
-A gait repeats with the stride (two steps); with phase phi the step's angle, so that phi / 2 is
-the stride's, the trunk rises and falls with phi, sways with phi / 2, surges with phi, and each
-heel strike rings at 5 to 12 Hz through the body.
+H has x forward, y left, z up and its origin on the floor below the person. Every carrying mode
+gives the device's offset in H [m] and its rotation from a neutral attitude as a rotation vector in
+H [rad]. A gait repeats with the stride (two steps). With phi the phase of the step, and so phi / 2
+that of the stride, the trunk rises, falls and surges with phi and sways with phi / 2; each heel
+strike excites ringing at 5 to 12 Hz in the body.
 
-The phases between these are those of people, with some spread, never arbitrary: they are what
-tells forward from backward. The trunk is highest at mid-stance (phi = 0), slowest there as well
-(kinetic energy has become potential), and every heel strike brakes it (Cavagna et al., 1976).
+The phase offsets between these motions are those of real people, with some spread, never arbitrary:
+they distinguish forward from backward. The trunk is highest at mid-stance (phi = 0) and slowest
+there too (kinetic energy has become potential), and every heel strike brakes it (Cavagna et al.,
+1976).
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ _STRIKE_HARMONICS = 9
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """What the carries see of the walk.
+    """Quantities of a walk that the carrying modes depend on.
 
     Attributes:
-        rng: source of every draw.
-        rate: of the samples [Hz].
-        phase: (N,) the step's angle [rad], 2 pi per step.
-        step_rate: (N,) [Hz].
-        effort: (N,) 0 standing to about 1 at a brisk walk of 1.4 m/s.
-        speed: (N,) over the floor [m/s].
-        height: of the person [m].
-        vigor: of the person: 1 is common, arms swing and heels strike in proportion.
+        rng: random generator for all draws.
+        rate: sampling rate [Hz].
+        phase: (N,) phase of the step [rad], 2 pi per step.
+        step_rate: (N,) step rate [Hz].
+        effort: (N,) strength of the gait, from 0 standing to about 1 at a brisk walk of 1.4 m/s.
+        speed: (N,) speed over the floor [m/s].
+        height: height of the person [m].
+        vigor: 1 is typical; heel strikes scale with it, limb swings with its square root.
     """
 
     rng: np.random.Generator
@@ -54,23 +55,23 @@ class Gait:
 
 @dataclass(frozen=True, eq=False)
 class CarryMotion:
-    """Offset in H (N, 3) [m] and turn against the neutral attitude in H (N, 3) [rad]."""
+    """Offset (N, 3) [m] in H and rotation vector (N, 3) [rad] in H from the neutral attitude."""
 
     offset_H: FloatArray
     turn_H: FloatArray
 
 
 def trunk(gait: Gait) -> FloatArray:
-    """Motion (N, 3) of the trunk in H [m]: bounce at the step rate, sway at half of it, surge.
+    """Return the trunk's motion (N, 3) in H [m]: bounce and surge per step, sway per stride.
 
-    The bounce follows the inverted pendulum: a step of length L on legs of length l lifts the
-    trunk by L^2 / (8 l), of which knees and ankles take about a third (Zijlstra & Hof, 2003).
+    The bounce follows an inverted pendulum: a step of length L on legs of length l lifts the
+    trunk by L^2 / (8 l), of which knees and ankles absorb about a third (Zijlstra & Hof, 2003).
     """
     rng, phi = gait.rng, gait.phase
     bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
     rise = 0.5 * bounce * gait.effort * step_length(gait) ** 2 / (8.0 * 0.53 * gait.height)
     shift = rng.uniform(-np.pi, np.pi, 4)
-    shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest where highest
+    shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest at the highest point
     z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
     x = 0.012 * surge * gait.effort * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
@@ -78,16 +79,16 @@ def trunk(gait: Gait) -> FloatArray:
 
 
 def step_length(gait: Gait) -> FloatArray:
-    """Length (N,) of a step [m]: speed over step rate."""
+    """Return the step length (N,) [m]: speed over step rate."""
     return gait.speed / gait.step_rate
 
 
 def heel_strikes(gait: Gait, strength: float) -> FloatArray:
-    """Displacement (N, 3) in H [m] of the ringing that heel strikes excite in what is carried.
+    """Return the ringing (N, 3) in H [m] that heel strikes excite in the device.
 
-    An oscillator with its resonance at 5 to 9 Hz, kicked once a step: harmonic n of the step
-    gets the oscillator's response at n times the step rate. `strength` [m/s^2] is about the
-    deviation of the vertical acceleration at effort 1.
+    The model is an oscillator with a resonance at 4.5 to 9 Hz, excited once per step: harmonic n of
+    the step gets the oscillator's response at n times the step rate. `strength` [m/s^2] is about
+    the standard deviation of the vertical acceleration at effort 1 and vigor 1.
     """
     rng = gait.rng
     resonance, damping = rng.uniform([4.5, 0.15], [9.0, 0.45])
@@ -109,9 +110,9 @@ def heel_strikes(gait: Gait, strength: float) -> FloatArray:
 
 
 def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMotion:
-    """Shared by what is held steady: trunk and strikes, wobble with the gait, tremor of the hand.
+    """Return the motion of a device held steady: trunk, heel strikes, gait wobble, hand tremor.
 
-    `tremor` [rad/s] is the rate of the turning tremor, `wobble` [rad] the turn with the gait.
+    `tremor` [rad/s] is the angular rate of the tremor, `wobble` [rad] the rotation with the gait.
     """
     rng, n = gait.rng, len(gait)
     offset = trunk(gait) + heel_strikes(gait, strength)
@@ -123,7 +124,7 @@ def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMot
     for k, order in enumerate((0.5, 1.0)):
         swing = np.cos(order * gait.phase[:, None] + shift[k]) * size[k]
         turn += wobble * gait.effort[:, None] * swing
-    # The hand shakes the device about its wrist as well: a tremor of a tenth of m/s^2.
+    # The tremor about the wrist also displaces the device: about 0.1 m/s^2.
     offset += 0.12 / (2.0 * np.pi * 8.0) ** 2 * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     return CarryMotion(offset, turn)
 
@@ -194,7 +195,7 @@ def _bag(gait: Gait) -> CarryMotion:
 
 
 def _trolley(gait: Gait) -> CarryMotion:
-    """No gait: wheels rumble on the floor, with the speed, at 10 to 30 Hz."""
+    """Return a trolley's motion: wheel rumble at 10 to 30 Hz, growing with speed, little gait."""
     rng, n = gait.rng, len(gait)
     rolling = np.clip(gait.speed / 0.8, 0.0, 2.0)[:, None]
     centre = min(rng.uniform(12.0, 22.0), 0.25 * gait.rate)
@@ -207,13 +208,13 @@ def _trolley(gait: Gait) -> CarryMotion:
     turn = 0.06 * rumble[:, 3:] / (2.0 * np.pi * centre)
     turn += 0.004 * drift(rng, n, gait.rate, 0.8, 3)
     place = np.array([0.6, 0.0, rng.uniform(0.4, 1.0)])
-    # The push pulses a little with the steps of whoever walks behind.
+    # The push pulses slightly with the steps of the person behind.
     offset[:, 0] += 0.003 * gait.effort * np.cos(gait.phase)
     return CarryMotion(offset + place, turn)
 
 
 def _rig(gait: Gait) -> CarryMotion:
-    """Looked around with: quick turns to random directions, arms waved by up to their length."""
+    """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
     motion = _held(gait, rng.uniform(0.2, 0.6), rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
@@ -233,11 +234,11 @@ CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
     "trolley": _trolley,
     "rig": _rig,
 }
-"""Every carrying mode, by name."""
+"""Function of every carrying mode, by name."""
 
 
 def _looks(gait: Gait, spread: FloatArray) -> FloatArray:
-    """Rotation vectors (N, 3) that rest at random directions and turn to the next ones."""
+    """Return rotation vectors (N, 3) [rad] that rest at random values and move between them."""
     rng, n = gait.rng, len(gait)
     pause = rng.uniform(0.5, 1.6)
     targets = rng.normal(0.0, 1.0, (int(n / gait.rate / 0.25) + 2, 3)) * spread
@@ -248,7 +249,7 @@ def _looks(gait: Gait, spread: FloatArray) -> FloatArray:
 
 
 def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> FloatArray:
-    """Angle (N,) [rad] of a limb that swings with the stride about a resting angle `forward`."""
+    """Return a limb's angle (N,) [rad]: it swings with the stride about a resting `forward`."""
     rng, n = gait.rng, len(gait)
     size = amplitude * np.minimum(gait.effort, 1.2) * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
     stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
@@ -258,7 +259,10 @@ def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> 
 
 
 def _slap(gait: Gait, rate_deviation: float) -> FloatArray:
-    """Turns (N, 3) [rad] of a loose device at a step's harmonics, of about so many rad/s."""
+    """Return rotations (N, 3) [rad] of a loose device at the step's harmonics.
+
+    `rate_deviation` [rad/s] is about their standard deviation as angular rate.
+    """
     turn = np.zeros((len(gait), 3))
     for k in range(2, 6):
         shift = gait.rng.uniform(-np.pi, np.pi, 3)
@@ -269,7 +273,7 @@ def _slap(gait: Gait, rate_deviation: float) -> FloatArray:
 
 
 def _about(axis: int, angle: FloatArray, lever: FloatArray) -> FloatArray:
-    """The vector `lever` (3,) turned by `angle` (N,) about an axis of H: (N, 3)."""
+    """Return the vector `lever` (3,) rotated by `angle` (N,) [rad] about an axis of H: (N, 3)."""
     e = np.eye(3)[axis]
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     return np.asarray(c * lever + s * np.cross(e, lever) + (1.0 - c) * e * np.dot(e, lever))

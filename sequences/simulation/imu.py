@@ -1,9 +1,9 @@
-"""An IMU along any trajectory: a spline through the poses, differentiated, with sensor errors.
+"""IMU simulation along any trajectory: differentiated splines through the poses, sensor errors.
 
 The position is a quintic spline, so that its second derivative is smooth. The attitude is a cubic
 spline s(t) through sign-continuous quaternions, normalised: q = s / |s| is as smooth as s and its
-body rate is exactly 2 Im(conj(s) s') / |s|^2, because the part of s' along s only changes the
-length. That is the derivative of the very attitude given as truth, at the cost of one spline
+body rate is exactly 2 Im(conj(s) s') / |s|^2, because the component of s' along s only changes the
+length. The rate thus matches the attitude given as truth exactly, at the cost of one spline
 (scipy's RotationSpline solves a nonlinear system for the same order of smoothness).
 """
 
@@ -31,24 +31,24 @@ from stario.sequences.settings import check_number
 from stario.sequences.simulation.magnetometer import MagneticField, simulate_magnetometer
 
 _MIN_POSES = 6
-"""A quintic spline passes through at least this many points."""
+"""Minimum number of points of a quintic spline."""
 
 
 @dataclass(frozen=True)
 class ImuErrors:
-    """What a sensor adds to the truth; every deviation is that of a zero-mean normal draw.
+    """Errors of simulated sensors; every deviation is that of a zero-mean normal draw.
 
-    A sample is `clip(T x + b + n)`: T holds a scale error per axis and a small rotation of the
-    sensor's axes (drawn for each sensor on its own), b the turn-on bias and its random walk,
+    A sample is `clip(T x + b + n)`: T contains a scale error per axis and a small rotation of the
+    sensor's axes (drawn separately for each sensor), b is the turn-on bias and its random walk,
     n the white noise.
 
     Attributes:
-        noise: continuous densities of white noise and bias walk.
+        noise: continuous-time densities of white noise and bias random walk.
         gyro_turn_on: deviation of the gyroscope's bias at the first sample [rad/s].
         accel_turn_on: deviation of the accelerometer's bias at the first sample [m/s^2].
         gyro_scale: deviation of the gyroscope's scale error, per axis [1].
         accel_scale: deviation of the accelerometer's scale error, per axis [1].
-        misalignment: deviation of a sensor's rotation against the body, per axis [rad].
+        misalignment: deviation of a sensor's rotation relative to the body, per axis [rad].
         gyro_range: absolute rate beyond which an axis saturates [rad/s].
         accel_range: absolute specific force beyond which an axis saturates [m/s^2].
 
@@ -70,11 +70,11 @@ class ImuErrors:
             if not item.name.endswith("_range"):
                 check_number(self, item.name)
             elif not getattr(self, item.name) > 0:
-                raise InputError(item.name, repr(getattr(self, item.name)), "above 0, inf for none")
+                raise InputError(item.name, repr(getattr(self, item.name)), "a number > 0, or inf")
 
 
 PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
-"""No error at all."""
+"""An IMU without errors."""
 
 PHONE_IMU = ImuErrors(
     noise=PHONE_NOISE,
@@ -86,7 +86,7 @@ PHONE_IMU = ImuErrors(
     gyro_range=math.radians(2000.0),
     accel_range=8.0 * STANDARD_GRAVITY,
 )
-"""A phone's IMU, factory-calibrated: biases and scales as they are left after that."""
+"""A factory-calibrated phone IMU, with the biases and scale errors that remain."""
 
 GOOD_IMU = ImuErrors(
     noise=ImuNoise(gyro_noise=5e-5, accel_noise=5e-4, gyro_walk=2e-6, accel_walk=5e-5),
@@ -113,18 +113,18 @@ def simulate_imu(
     """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
 
     Args:
-        trajectory: poses at any even rate that shows the motion, at least 6. Poses that are
-            missing or marked not valid are bridged by the spline.
-        rate: of the IMU [Hz].
-        errors: of the sensors.
-        seed: of every random draw; the same seed gives the same recording.
-        gravity: its magnitude [m/s^2].
-        name: of the sequence.
-        magnetic_field: that a magnetometer beside it meets; None for no magnetometer.
+        trajectory: at least 6 poses at any even rate that resolves the motion. The spline bridges
+            missing and invalid poses.
+        rate: sampling rate of the IMU [Hz].
+        errors: errors of the sensors.
+        seed: seed of every random draw; the same seed gives the same recording.
+        gravity: magnitude of gravity [m/s^2].
+        name: name of the sequence.
+        magnetic_field: field and errors of a magnetometer next to the IMU; None for none.
 
     Raises:
-        InputError: too few poses, a gap between valid ones longer than 0.1 s and than their usual
-            step, or a rate or gravity out of range.
+        InputError: too few poses, a gap between valid poses longer than 0.1 s and 1.8 median
+            steps, or a rate or gravity out of range.
     """
     _check(trajectory, rate, gravity)
     truth, gyro, acceleration_W = _sampled(trajectory, rate)
@@ -163,14 +163,14 @@ def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:
         raise InputError(
             "trajectory",
             f"no valid pose for {steps[k]:.3f} s after {trajectory.time[known[k]]:.3f} s",
-            "a track without gaps", "simulate its pieces one by one",
+            "a trajectory without gaps", "simulate its parts separately",
         )  # fmt: skip
 
 
 def _sampled(trajectory: Trajectory, rate: float) -> tuple[Trajectory, FloatArray, FloatArray]:
-    """Truth, body rate [rad/s] and acceleration_W [m/s^2] on the IMU's own time grid."""
+    """Return truth, body rate [rad/s] and acceleration in W [m/s^2] on the IMU's time grid."""
     t = trajectory.time[trajectory.valid]
-    # The last pose belongs to the recording even if rounding puts it a hair beyond the end.
+    # Include the last pose even if rounding places it slightly beyond the end.
     count = int(np.floor((t[-1] - t[0]) * rate + 1e-6)) + 1
     time = np.minimum(t[0] + np.arange(count) / rate, t[-1])
     position = _spline(t, trajectory.position_W[trajectory.valid], 5)
@@ -190,7 +190,7 @@ def _attitude_and_rate(
 
 
 def sign_continuous(quat_xyzw: FloatArray) -> FloatArray:
-    """The same rotations (N, 4) with signs such that neighbours lie on one half-sphere."""
+    """Return the same rotations (N, 4) with signs such that neighbours lie on one half-sphere."""
     dots = np.sum(quat_xyzw[1:] * quat_xyzw[:-1], axis=1)
     signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
     signed = quat_xyzw * np.concatenate([[1.0], signs])[:, None]
@@ -211,7 +211,7 @@ def _measured(
     misalignment: float,
     limit: float,
 ) -> FloatArray:
-    """What a sensor shows for `true` (N, 3)."""
+    """Return a sensor's measurements (N, 3) of the values `true` (N, 3)."""
     white, walk = densities
     axes = Rotation.from_rotvec(misalignment * rng.standard_normal(3)).as_matrix()
     scales = 1.0 + scale * rng.standard_normal(3)

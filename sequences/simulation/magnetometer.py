@@ -1,7 +1,7 @@
-"""A magnetometer along any trajectory: the earth's field, a building, magnets and the phone's own.
+"""Magnetometer simulation along any trajectory: earth, building, moving magnets, hard iron.
 
-The field of a building is the gradient of a smooth random potential, as a field without currents
-must be; it depends on the place alone, so that who comes back finds it again.
+A building's field is the gradient of a smooth random potential, as a field without currents must
+be. It depends on position only, so that a person who returns measures the same field again.
 """
 
 from __future__ import annotations
@@ -16,27 +16,29 @@ from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
 
 _WAVES = 128
 _STREAM = 0x6D6167
-"""Draws are the magnetometer's own: the same seed gives the same IMU with and without it."""
+"""Seed of the magnetometer's separate draws: they do not change the IMU of the same seed."""
 
 
 @dataclass(frozen=True)
 class MagneticField:
-    """What a magnetometer meets and adds.
+    """Magnetic field around a device, and the errors of its magnetometer.
 
     Attributes:
-        strength: of the earth's field [uT].
-        dip: of it below the horizontal [rad], negative south of the magnetic equator.
-        azimuth: of its horizontal part in W, counter-clockwise from x [rad].
-        disturbance: root mean square of a building's field [uT].
-        length: over which that changes [m].
-        hard_iron: constant offset that the device adds in B [uT].
-        noise: deviation of a sample, per axis [uT].
-        magnets: start [s], end [s] and size [uT] of fields that move with the device.
-        rate: of the samples [Hz].
-        lag: by which their stamps are late [s].
+        strength: magnitude of the earth's field [uT].
+        dip: angle of the earth's field below the horizontal [rad], negative south of the magnetic
+            equator.
+        azimuth: direction of its horizontal part in W, counter-clockwise from x [rad].
+        disturbance: root mean square of the building's field [uT].
+        length: length over which the building's field changes [m].
+        hard_iron: constant offset in B that the device adds [uT].
+        noise: standard deviation of a sample, per axis [uT].
+        magnets: start [s], end [s] and magnitude [uT] of fields that move with the device.
+        rate: sampling rate [Hz].
+        lag: delay of the timestamps [s].
 
     Raises:
-        InputError: a value is not finite, or a size, length or rate is not positive.
+        InputError: a value is not finite, a magnitude is negative, or length or rate is not
+            positive.
     """
 
     strength: float = 48.0
@@ -57,7 +59,7 @@ class MagneticField:
                 raise InputError(item.name, repr(value), "finite numbers")
             least = {"strength": 0.0, "disturbance": 0.0, "noise": 0.0}.get(item.name)
             if least is not None and value < least:
-                raise InputError(item.name, repr(value), "a size >= 0 uT")
+                raise InputError(item.name, repr(value), "a magnitude >= 0 uT")
             if item.name in ("length", "rate") and value <= 0.0:
                 raise InputError(item.name, repr(value), "a number > 0")
 
@@ -69,15 +71,15 @@ INDOOR_FIELD = MagneticField(disturbance=8.0, length=2.0, hard_iron=(3.0, -2.0, 
 def simulate_magnetometer(
     truth: Trajectory, magnetic_field: MagneticField, seed: int = 0
 ) -> Magnetometer:
-    """The samples of a magnetometer whose axes are the IMU's.
+    """Simulate a magnetometer whose axes are the IMU's.
 
     Args:
-        truth: poses without gaps at the IMU's rate or another that shows the turning.
-        magnetic_field: what it meets.
-        seed: of every random draw.
+        truth: poses without gaps at the IMU's rate or another that resolves the rotation.
+        magnetic_field: field and sensor errors.
+        seed: seed of every random draw.
 
     Raises:
-        InputError: the track is shorter than one sample.
+        InputError: there are fewer than two valid poses.
     """
     rng = np.random.default_rng([seed, _STREAM])
     count = int((truth.time[-1] - truth.time[0]) * magnetic_field.rate) + 1
@@ -94,7 +96,7 @@ def simulate_magnetometer(
 
 
 def _earth(magnetic_field: MagneticField) -> FloatArray:
-    """The earth's field (3,) in W [uT]."""
+    """Return the earth's field (3,) in W [uT]."""
     dip, azimuth = magnetic_field.dip, magnetic_field.azimuth
     level = [math.cos(dip) * math.cos(azimuth), math.cos(dip) * math.sin(azimuth), -math.sin(dip)]
     return magnetic_field.strength * np.array(level)
@@ -103,10 +105,10 @@ def _earth(magnetic_field: MagneticField) -> FloatArray:
 def _building(
     magnetic_field: MagneticField, position_W: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """The building's field (N, 3) in W [uT] at positions (N, 3)."""
+    """Return the building's field (N, 3) in W [uT] at positions (N, 3) [m]."""
     waves = rng.standard_normal((_WAVES, 3)) / magnetic_field.length
     phases = rng.uniform(0.0, 2.0 * math.pi, _WAVES)
-    # Of the potential sum cos(k p + phase); its gradient has this mean square.
+    # Root mean square of the gradient of the potential sum cos(k p + phase).
     size = math.sqrt(0.5 * float(np.square(waves).sum()))
     slopes = np.sin(position_W @ waves.T + phases)
     return np.asarray(magnetic_field.disturbance / size * slopes @ waves, dtype=np.float64)

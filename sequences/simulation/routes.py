@@ -1,9 +1,9 @@
-"""Where a generated person goes: speed, course, heading and height over time.
+"""Routes of simulated pedestrians: speed, course, heading and height over time.
 
-A route is a row of activities drawn at random (walk straight, along a curve, around a corner,
-turn on the spot, stand, step sideways or backward, climb stairs), each a constant command for a
-while. Smoothing the commands by a Gaussian gives a person's gentle changes, and makes the route
-differentiable as often as anyone may ask.
+A route is a sequence of random activities (walk straight, along a curve, around a corner, turn on
+the spot, stand, step sideways or backward, climb stairs), each a constant command for some time.
+Smoothing the commands with a Gaussian gives gradual changes like a person's and makes the route
+infinitely differentiable.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.fft import irfft, rfft, rfftfreq
 from stario.sequences.sequence import FloatArray
 
 RISER, _TREAD = 0.17, 0.29
-"""A stair's height and depth [m]."""
+"""Height and depth of a stair [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +24,11 @@ class Route:
     """Motion of the person's body at regular times, without the gait.
 
     Attributes:
-        position_W: (N, 3) of the point on the floor below the person [m].
-        heading: (N,) where the person faces [rad].
-        speed: (N,) over the floor [m/s].
-        turn_rate: (N,) of the heading [rad/s].
-        climb: (N,) vertical speed on stairs [m/s], negative going down.
+        position_W: (N, 3) point on the floor below the person [m].
+        heading: (N,) direction that the person faces [rad].
+        speed: (N,) speed over the floor [m/s].
+        turn_rate: (N,) rate of change of the heading [rad/s].
+        climb: (N,) vertical speed on stairs [m/s], negative when descending.
     """
 
     position_W: FloatArray
@@ -40,7 +40,7 @@ class Route:
 
 @dataclass(frozen=True)
 class _Command:
-    """One activity: how long [s], how fast [m/s], turning [rad/s], course off the heading [rad]."""
+    """Duration [s], speed [m/s], turn rate [rad/s], course from the heading [rad], climb [m/s]."""
 
     duration: float
     speed: float
@@ -55,11 +55,11 @@ def random_route(
     """Draw a route of `count` samples at `rate` [Hz].
 
     Args:
-        rng: source of every draw.
+        rng: random generator for all draws.
         count: number of samples.
-        rate: of the samples [Hz].
-        preferred_speed: of the person [m/s]; actual speeds are 0.3 to 2.2 m/s and standing still.
-        wheels: pushing something on wheels: no stairs, no steps sideways or backward.
+        rate: sampling rate [Hz].
+        preferred_speed: preferred speed [m/s]; actual speeds are 0.3 to 2.2 m/s, 0 when standing.
+        wheels: whether the person pushes a trolley: no stairs, no steps sideways or backward.
     """
     commands: list[_Command] = []
     lasted = 0.0
@@ -69,7 +69,7 @@ def random_route(
     tables = np.array([[c.speed, c.turn_rate, c.course, c.climb] for c in commands])
     repeats = np.diff(np.round(np.cumsum([0.0] + [c.duration for c in commands]) * rate))
     held = np.repeat(tables, repeats.astype(np.int64), axis=0)[:count]
-    # A course is only met at its speed: smooth velocity components, not the angle.
+    # A course means nothing without its speed: smooth velocity components, not the angle.
     velocity_H = held[:, :1] * np.stack([np.cos(held[:, 2]), np.sin(held[:, 2])], axis=1)
     sigma = rng.uniform(0.2, 0.35)
     velocity_H = smoothed(velocity_H, rate, sigma)
@@ -124,13 +124,13 @@ def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[
 
 
 def integral(values: FloatArray, rate: float) -> FloatArray:
-    """Trapezoidal integral along the first axis, starting at 0."""
+    """Return the trapezoidal integral along the first axis, starting at 0."""
     steps = 0.5 * (values[1:] + values[:-1]) / rate
     return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 def smoothed(values: FloatArray, rate: float, sigma: float) -> FloatArray:
-    """Convolve with a Gaussian of deviation `sigma` [s] along the first axis, ends held."""
+    """Convolve with a Gaussian of deviation `sigma` [s] along the first axis, holding the ends."""
     pad = int(np.ceil(5.0 * sigma * rate))
     padded = np.concatenate([np.repeat(values[:1], pad, 0), values, np.repeat(values[-1:], pad, 0)])
     gain = np.exp(-0.5 * (2.0 * np.pi * sigma * rfftfreq(len(padded), 1.0 / rate)) ** 2)
@@ -141,10 +141,10 @@ def smoothed(values: FloatArray, rate: float, sigma: float) -> FloatArray:
 def drift(
     rng: np.random.Generator, count: int, rate: float, sigma: float, columns: int = 0
 ) -> FloatArray:
-    """Smooth noise of unit deviation and a correlation time of about `sigma` [s].
+    """Draw smooth noise of unit deviation and a correlation time of about `sigma` [s].
 
     Returns:
-        (count,), or (count, columns) where columns are asked for.
+        (count,), or (count, columns) if `columns` is not 0.
     """
     pad = int(np.ceil(5.0 * sigma * rate))
     shape = (count + 2 * pad, columns) if columns else (count + 2 * pad,)
@@ -157,7 +157,7 @@ def drift(
 def band_noise(
     rng: np.random.Generator, count: int, rate: float, low: float, high: float, columns: int
 ) -> FloatArray:
-    """Noise (count, columns) of unit deviation between `low` and `high` [Hz], soft edges."""
+    """Draw noise (count, columns) of unit deviation between `low` and `high` [Hz], soft edges."""
     f = rfftfreq(count, 1.0 / rate)
     gain = np.exp(-0.5 * ((f - 0.5 * (low + high)) / (0.5 * (high - low))) ** 2)
     gain[0] = 0.0

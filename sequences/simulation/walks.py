@@ -1,9 +1,9 @@
-"""Generated walks of a person with a device, to drive the simulator; every walk from a seed.
+"""Generated walks of a person with a device, as input to the simulator; a seed defines each walk.
 
-A walk is a route (where the person goes), a gait tied to its speed, and a carrying mode (how the
-device moves against the person). Speed v, step length L and step rate f hang together as in
-people: L grows in proportion to f, so v = f L = k h f^2 with the height h, and one of them
-follows from another.
+A walk is a route (where the person goes), a gait that follows its speed, and a carrying mode (how
+the device moves relative to the person). Speed v, step length L and step rate f are related as in
+people: L grows in proportion to f, so v = f L = k h f^2 with the height h, and any one of them
+determines the others.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ CARRYING_MODES = tuple(CARRIES)
 """Names of the carrying modes."""
 
 _SLOWEST_STEP_RATE = 0.8
-"""Steps per second of a person who barely moves [Hz]."""
+"""Step rate of a person who barely moves [Hz]."""
 
 _BRISK = 1.4
 """Speed [m/s] at which the gait has its full strength."""
 
 _CHANGE = 0.6
-"""Deviation of the Gaussian step from one carrying mode to the next [s]."""
+"""Standard deviation of the Gaussian that smooths the change of carrying mode [s]."""
 
 
 @dataclass(frozen=True)
 class WalkStyle:
-    """Who walks, and how the device is carried.
+    """A person's gait, and how the person carries the device.
 
     Attributes:
-        carry: one of `CARRYING_MODES`.
-        next_carry: the carrying mode after a change within the walk; empty for none.
-        height: of the person [m].
-        step_constant: k of speed = k height step_rate^2 [s]: who takes long steps has a large k.
-        preferred_speed: [m/s].
-        vigor: strength of arm swing and heel strike, 1 is common.
-        mount_rotvec: rotation of the device against its neutral attitude [rad], any.
+        carry: carrying mode, one of `CARRYING_MODES`.
+        next_carry: carrying mode after a change within the walk; empty for no change.
+        height: height of the person [m].
+        step_constant: k in speed = k height step_rate^2 [s]; large for long steps.
+        preferred_speed: preferred speed [m/s].
+        vigor: strength of arm swing and heel strike, 1 is typical.
+        mount_rotvec: any rotation vector of the device from its neutral attitude [rad].
 
     Raises:
         InputError: a carrying mode is unknown or a value is out of range.
@@ -72,9 +72,9 @@ class WalkStyle:
 
     @staticmethod
     def random(rng: np.random.Generator) -> WalkStyle:
-        """Draw a person, a carrying mode (every third walk changes it) and a mount."""
+        """Draw a person, a carrying mode (about a third of walks change it) and a mount."""
         carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
-        # Nobody puts the device onto wheels, or off them, within a step or two.
+        # A device is not put onto a trolley, or taken off it, within a step or two.
         others = [way for way in CARRYING_MODES if way not in (carry, "trolley")]
         changes = carry != "trolley" and rng.random() < 1.0 / 3.0
         x, y, z = Rotation.random(rng=rng).as_rotvec()
@@ -97,7 +97,7 @@ _RANGES = (
 )
 
 _ODDS = (0.28, 0.09, 0.15, 0.14, 0.1, 0.1, 0.14)
-"""How often each carrying mode is drawn, in the order of `CARRYING_MODES`."""
+"""Probability of each carrying mode, in the order of `CARRYING_MODES`."""
 
 
 def generate_walk(
@@ -106,13 +106,13 @@ def generate_walk(
     """Generate the trajectory of a carried device.
 
     Args:
-        seed: of every draw; the same seed gives the same walk.
-        duration: [s], at least 1.
-        rate: of the poses [Hz], at least 50, so that heel strikes are drawn and not aliased.
-        style: of the person and the carry; None draws one.
+        seed: seed of every draw; the same seed gives the same walk.
+        duration: duration [s], minimum 1.
+        rate: rate of the poses [Hz], minimum 50, so that heel strikes are resolved and not aliased.
+        style: person and carrying mode; None draws them.
 
     Returns:
-        Poses of the device in a world whose origin is the start on the floor.
+        Poses of the device in a world frame whose origin is the start on the floor.
 
     Raises:
         InputError: duration or rate out of range.
@@ -138,13 +138,13 @@ def generate_walk(
 
 
 def step_rate(speed: FloatArray, style: WalkStyle) -> FloatArray:
-    """Step rate (N,) [Hz] at a speed (N,) [m/s]."""
+    """Return the step rate (N,) [Hz] at a speed (N,) [m/s]."""
     return np.sqrt(speed / (style.step_constant * style.height))
 
 
 def _gait(rng: np.random.Generator, rate: float, route: Route, style: WalkStyle) -> Gait:
     n = len(route.heading)
-    # Turning on the spot takes steps as well: a person's feet move on a circle of 0.3 m.
+    # Turning on the spot takes steps too: the feet move on a circle with a radius of 0.3 m.
     moving = np.hypot(route.speed, 0.3 * route.turn_rate)
     uneven = 1.0 + 0.025 * drift(rng, n, rate, 0.4)
     stairs = np.abs(route.climb) / RISER

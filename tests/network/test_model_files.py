@@ -98,13 +98,13 @@ def test_a_card_that_is_none_is_refused(model: Path, text: str) -> None:
 
 def test_truncated_weights_are_refused(model: Path) -> None:
     model.write_bytes(model.read_bytes()[:-100])
-    assert "cut short" in refused(model)
+    assert "truncated" in refused(model)
 
 
 @pytest.mark.parametrize("missing", ["weights", "card"])
 def test_a_missing_half_is_refused(model: Path, missing: str) -> None:
     (model if missing == "weights" else card_path(model)).unlink()
-    assert "side by side" in refused(model)
+    assert "in one folder" in refused(model)
 
 
 def with_state(path: Path, state: dict[str, torch.Tensor]) -> None:

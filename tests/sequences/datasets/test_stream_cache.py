@@ -117,7 +117,7 @@ def test_a_file_that_is_not_whole_is_built_anew(
     file.write_bytes(broken)
     assert_equal(one(recording, folder, read), expected)
     assert read.calls == 2
-    assert "not whole" in caplog.text
+    assert "incomplete" in caplog.text
     assert file.read_bytes() == whole
 
 

@@ -58,7 +58,7 @@ def test_plan_view_fits_the_truth_and_says_who_leaves(truth, tracks):
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0  # the inertial track runs to 1.8 km
     assert axes.get_aspect() == 1.0
     legend = labels(fig.legends[0])
-    assert legend[:2] == ["truth", "inertial (leaves the figure, by 1.8 km)"]
+    assert legend[:2] == ["truth", "inertial (leaves the figure by 1.8 km)"]
     assert legend[2:] == ["network", "EKF", "start", "end"]
     for track in (truth, tracks["network"], tracks["ekf"]):
         assert (track.position_W[:, 0] < axes.get_xlim()[1]).all()
@@ -197,5 +197,5 @@ def test_a_track_is_marked_where_it_goes_on_behind_a_gap(tracks):
     cases = (("ekf", whole, 0), ("ekf", broken, 1), ("pdr", broken, 0), ("network", waits, 0))
     for name, track, marks in cases:
         (axes,) = plan_view({name: track}, None, "").axes
-        found = [line for line in axes.lines if line.get_label() == "behind a gap"]
+        found = [line for line in axes.lines if line.get_label() == "after a gap"]
         assert len(found) == marks
