@@ -1,8 +1,8 @@
-"""Evaluate many recordings on a cluster: here two workers of this machine, a real one by address.
+"""Evaluate many recordings on a cluster: here two local workers; give an address for a real one.
 
-joblib hands the recordings to whatever `joblib.parallel_config` names: with Ray installed
-`backend="ray"` after `ray.util.joblib.register_ray()` does the same. The workers need to see the
-recordings' paths. Needs `pip install 'stario[cluster]'`.
+joblib distributes the recordings to the backend that `joblib.parallel_config` names: with Ray,
+`backend="ray"` after `ray.util.joblib.register_ray()` does the same. The workers must be able to
+read the recordings' paths. Needs `pip install 'stario[cluster]'`.
 
     python examples/cluster.py
 """
@@ -20,7 +20,7 @@ from stario.sequences import Skipped, generate_walk, simulate_imu, write_csv
 
 
 def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skipped]]:
-    """Figures of the recordings, in their order, and those that could not be used."""
+    """Return the recordings' figures, in their order, and the recordings that were skipped."""
     scores, skipped = [], []
     with joblib.parallel_config(backend="dask", client=client):
         for outcome in compare_recordings(paths, "default", NavigatorConfig(), truth_needed=True):
@@ -32,10 +32,10 @@ def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skip
 
 
 def main(folder: Path, seconds: float = 20.0) -> tuple[list[Scores], list[Skipped], set[str]]:
-    """Simulate four recordings, spoil one, evaluate them on two workers.
+    """Simulate four recordings, corrupt one, and evaluate them on two workers.
 
     Returns:
-        Figures, what was skipped, and the workers that computed something.
+        Figures, skipped recordings, and the workers that computed something.
     """
     paths = [folder / f"walk-{seed}.csv" for seed in range(4)]
     for seed, path in enumerate(paths):
@@ -43,7 +43,7 @@ def main(folder: Path, seconds: float = 20.0) -> tuple[list[Scores], list[Skippe
     paths[2].write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0\n")
     workers = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
     with workers as cluster, Client(cluster) as client:
-        client.get_task_stream()  # from here on the scheduler notes who computes what
+        client.get_task_stream()  # from here on the scheduler records which worker computes what
         scores, skipped = evaluate(paths, client)
         tasks = client.get_task_stream()
     return scores, skipped, {task["worker"] for task in tasks}

@@ -1,4 +1,4 @@
-"""Compare tracks of one recording: IMU alone, network alone, filter, against the truth.
+"""Compare tracks of one recording with the ground truth: IMU alone, network alone, filter.
 
 python examples/compare_tracks.py
 """

@@ -1,7 +1,7 @@
-"""Fine-tune the default weights on walks of your own that have waypoints and no other truth.
+"""Fine-tune the default weights on your own walks, with waypoints as the only ground truth.
 
-The command does the same: put `t,gx,gy,gz,ax,ay,az,px,py` into a CSV, the last two where you passed
-a known point (or had a satellite fix) and blank elsewhere, and run
+The command does the same: write `t,gx,gy,gz,ax,ay,az,px,py` to a CSV, with the last two where you
+passed a known point (or had a satellite fix) and blank elsewhere, and run
 
     stario train my_walks/ --start-from default --out runs/mine
 
@@ -28,7 +28,7 @@ from stario.sequences import (
 
 
 def walk_with_waypoints(seed: int) -> ImuSequence:
-    """A recording that knows its position every four seconds, and nothing of its attitude."""
+    """Simulate a recording with a known position every four seconds and no known attitude."""
     walk = generate_walk(seed, 40.0)
     time = np.arange(1.0, 39.0, 4.0)
     waypoints = PositionTrack(time, walk.at(time).position_W[:, :2], "waypoints")
@@ -36,7 +36,7 @@ def walk_with_waypoints(seed: int) -> ImuSequence:
 
 
 def main(folder: Path, epochs: int = 1) -> DisplacementModel:
-    """A few steps on three walks; simulated ones with full truth keep what was learned before."""
+    """Train a few steps on three walks; simulated ones with full truth limit forgetting."""
     legs = [stream for seed in range(3) for stream in leg_streams(walk_with_waypoints(seed))]
     full = [world_streams(simulate_imu(generate_walk(seed, 30.0), seed=seed)) for seed in (7, 8)]
     config = TrainingConfig(

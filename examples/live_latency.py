@@ -1,8 +1,8 @@
-"""How long after a sample its position is out of the live server, with several phones at once.
+"""Measure the live server's latency from sample to position, with several phones at once.
 
-A server of its own, and as many replays of the demonstration at 100 Hz and true speed as there are
-phones, pushed five times a second as Sensor Logger does. Told are the time from the newest sample
-that a position rests on to the event that a page draws it from, and what the server takes:
+Starts a server and, for each phone, a replay of the demonstration at 100 Hz and true speed, pushed
+five times a second as Sensor Logger does. Prints the time from the newest sample that a position
+depends on to the event from which a page draws it, and the server's processor and memory use:
 
     python examples/live_latency.py [--phones 4] [--seconds 10]
 """
@@ -32,12 +32,12 @@ from stario.sequences import ImuSequence
 
 @dataclass(frozen=True)
 class Measured:
-    """What came out.
+    """Latency and cost of the server.
 
     Attributes:
-        latencies: (n,) from a sample to the event with its position [s].
-        cpu_share: of one core.
-        memory_mb: resident at the end.
+        latencies: (n,) times from a sample to the event with its position [s].
+        cpu_share: processor time as a share of one core.
+        memory_mb: resident memory at the end [MB].
     """
 
     latencies: list[float]
@@ -46,7 +46,7 @@ class Measured:
 
 
 def main(phones: int = 4, seconds: float = 10.0) -> Measured:
-    """Replay on several phones against a server in a process of its own."""
+    """Replay on several phones against a server in a separate process."""
     recording = demonstration()
     half = slice(None, None, 2)
     thinned = (recording.time[half], recording.gyro[half], recording.accel[half])
@@ -84,17 +84,17 @@ def _measure(
 
 
 def _address(server: subprocess.Popen[str]) -> str:
-    """Where the server says that it listens."""
+    """Return the address that the server prints."""
     assert server.stderr is not None
     for line in server.stderr:
         found = re.search(r"http://127\.0\.0\.1:\d+", line)
         if found:
             return found[0]
-    raise RuntimeError("the server said no address")
+    raise RuntimeError("the server printed no address")
 
 
 def _listen(url: str, began: dict[str, float], latencies: list[float]) -> None:
-    """What a page hears: each device's new points, with seconds since its first sample."""
+    """Record the latency of each event, whose points carry seconds since the first sample."""
     with urllib.request.urlopen(f"{url}/events") as events:
         for line in events:
             if line.startswith(b"data:"):
@@ -115,13 +115,13 @@ def _memory_mb(pid: int) -> float:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Latency of the live server.")
+    parser = argparse.ArgumentParser(description="Measure the latency of the live server.")
     parser.add_argument("--phones", type=int, default=4)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of the walk")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the walk [s]")
     options = parser.parse_args()
     found = main(options.phones, options.seconds)
     print(
-        f"{options.phones} phones at 100 Hz: from sample to event {median(found.latencies):.2f} s "
-        f"in the median, {quantiles(found.latencies, n=20)[-1]:.2f} s at 95 %; "
+        f"{options.phones} phones at 100 Hz: sample to event {median(found.latencies):.2f} s "
+        f"(median), {quantiles(found.latencies, n=20)[-1]:.2f} s (95th percentile); "
         f"{found.cpu_share:.0%} of a core, {found.memory_mb:.0f} MB"
     )

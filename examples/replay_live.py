@@ -1,7 +1,7 @@
 """Replay a recording against the live server, as a phone with Sensor Logger would send it.
 
-By itself it starts a server, replays half a minute at five times the true speed, and says where the
-track ended. To watch, start the server first, open its page, and replay at true speed:
+Without --url it starts a server, replays half a minute at five times the true speed, and prints
+where the track ended. To watch, start the server first, open its page, and replay at true speed:
 
     stario live
     python examples/replay_live.py --url http://127.0.0.1:8000/data [RECORDING]
@@ -22,13 +22,13 @@ from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 
 PERIOD = 0.2
-"""Time between two pushes [s]; the app's settings offer the like."""
+"""Time between two pushes [s]; the app offers similar settings."""
 
 
 def replay(
     recording: ImuSequence, url: str, speed: float, seconds: float, device: str = "replay"
 ) -> int:
-    """Push a recording in batches; returns the samples that the server took."""
+    """Push a recording in batches; return the number of samples that the server accepted."""
     first_ns, began, taken = time.time_ns(), time.monotonic(), 0
     stop = min(recording.duration, seconds)
     sensors = [
@@ -62,10 +62,10 @@ def replay(
 
 
 def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], Path]:
-    """Replay the bundled demonstration against a server of its own.
+    """Start a server and replay the bundled demonstration against it.
 
     Returns:
-        Samples taken, the end's x, y, z [m] as drawn, and the recording that was written.
+        Number of samples accepted, final x, y, z [m] as drawn, and path of the recording written.
     """
     model = load_model("default")
     folder = Path(tempfile.mkdtemp(prefix="stario-live-"))
@@ -87,8 +87,8 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Replay a recording against the live server.")
     parser.add_argument("recording", nargs="?", type=Path, help="default: the demonstration")
-    parser.add_argument("--url", help="of a running server; default: one of its own")
-    parser.add_argument("--speed", type=float, default=1.0, help="times the true one")
+    parser.add_argument("--url", help="address of a running server; default: start one")
+    parser.add_argument("--speed", type=float, default=1.0, help="multiple of the true speed")
     parser.add_argument("--device", default="replay", help="name of the phone")
     options = parser.parse_args()
     if options.url is None:

@@ -1,18 +1,18 @@
 """A ROS 2 node around StarIO, a skeleton to start from: ROS is needed only to run as a node.
 
     subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
-                           mounting does, the device is levelled by gravity)
-                fix        geometry_msgs/PoseWithCovarianceStamped, a position in `map`, if there is
+                           mounting works, as the device is levelled by gravity)
+                fix        geometry_msgs/PoseWithCovarianceStamped, a position in `map`, optional
     publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
                 tf         map -> odom -> base_link (REP 105)
 
 `odom` is continuous (`Navigator.continuous`): it drifts, but neither updates nor fixes make it
-jump, so that controllers may use it; only behind a gap in the samples, of which nothing is known,
-it goes on elsewhere. What fixes correct goes into map -> odom. Metres, radians,
-quaternions x y z w (REP 103). `base_link` is the IMU's frame here; where it is not, publish its
-static transform and name the IMU's frame instead.
+jump, so that controllers may use it. It jumps only after a gap in the samples, during which the
+motion is unknown. Corrections by fixes go into map -> odom. Metres, radians, quaternions x y z w
+(REP 103). `base_link` is the IMU's frame here; if yours differs, publish the static transform
+between them and use the IMU's frame name instead.
 
-With ROS 2 sourced `python examples/ros2_node.py --node` spins the node. Without, the same code
+With ROS 2 sourced, `python examples/ros2_node.py --node` spins the node. Without ROS, the same code
 runs on a bag (`pip install 'stario[bags]'`) or, with no argument, on the bundled demonstration:
 
     python examples/ros2_node.py [BAG]
@@ -40,7 +40,7 @@ GYRO_NOISE = 0.01
 
 @dataclass(frozen=True)
 class Transform:
-    """Takes points of the child frame to the parent: x -> R x + p."""
+    """Transform of points from the child frame to the parent: x -> R x + p."""
 
     R: Rotation
     p: np.ndarray
@@ -49,21 +49,21 @@ class Transform:
         return Transform(self.R * other.R, self.R.apply(other.p) + self.p)
 
     def inverse(self) -> Transform:
-        """From parent to child."""
+        """Return the transform from parent to child."""
         return Transform(self.R.inv(), -self.R.inv().apply(self.p))
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """What is published at a time: the fields of nav_msgs/Odometry and of both transforms.
+    """Data published at one time: the fields of nav_msgs/Odometry and of both transforms.
 
     Attributes:
-        stamp_ns: of the state [ns].
+        stamp_ns: time of the state [ns].
         odom_base: pose of base_link in odom.
-        map_odom: of odom in map: what fixes and updates correct.
-        pose_covariance: (6, 6) of x, y, z and the rotations about odom's axes.
+        map_odom: pose of odom in map, which fixes and updates correct.
+        pose_covariance: (6, 6) covariance of x, y, z and the rotations about odom's axes.
         linear, angular: twist in base_link [m/s], [rad/s].
-        twist_covariance: (6, 6) of both.
+        twist_covariance: (6, 6) covariance of both.
     """
 
     stamp_ns: int
@@ -76,23 +76,23 @@ class Odometry:
 
 
 class OdometryBridge:
-    """From messages' numbers to odometry, without ROS.
+    """Conversion of the numbers in messages to odometry, without ROS.
 
     Args:
-        navigator: whose stream this is.
+        navigator: navigator that processes the stream.
     """
 
     def __init__(self, navigator: Navigator) -> None:
         self._navigator = navigator
-        self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom, moved with the map
+        self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom; follows the map
         self._first_ns: int | None = None
         self._last: ContinuousPose | None = None
 
     def imu(self, message: Any) -> Odometry | None:
-        """A sensor_msgs/Imu; odometry when it completed an update."""
+        """Process a sensor_msgs/Imu; return odometry if it completes a state."""
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if self._first_ns is None:
-            self._first_ns = stamp_ns  # nanoseconds since 1970 are more than a float holds
+            self._first_ns = stamp_ns  # nanoseconds since 1970 exceed the precision of a float
         rate, force = message.angular_velocity, message.linear_acceleration
         gyro = (rate.x, rate.y, rate.z)
         time = (stamp_ns - self._first_ns) / 1e9
@@ -100,7 +100,7 @@ class OdometryBridge:
         if state is None:
             return None
         if self._last is not None and self._last.map_frame != state.map_frame:
-            # A fix that waited for its time moved the map: base_link went on as it did.
+            # A fix that waited for its time moved the map: base_link kept moving as before.
             dt = state.time - self._last.time
             turned = _attitude(self._last) * Rotation.from_rotvec(dt * np.array(gyro))
             self._follow(Transform(turned, self._last.p_W + dt * self._last.v_W), state)
@@ -108,7 +108,7 @@ class OdometryBridge:
         return self._odometry(state, np.array(gyro))
 
     def fix(self, message: Any) -> None:
-        """A geometry_msgs/PoseWithCovarianceStamped in map, for its position."""
+        """Apply the position of a geometry_msgs/PoseWithCovarianceStamped in map."""
         before, steady = self._navigator.state, self._navigator.continuous
         if before is None or steady is None or self._first_ns is None:
             return
@@ -119,12 +119,12 @@ class OdometryBridge:
         self._navigator.update_position(time, [at.x, at.y, at.z], covariance)
         after = self._navigator.state
         if after.map_frame == before.map_frame:
-            return  # an ordinary correction, which is bled in
+            return  # an ordinary correction, which is applied gradually
         self._follow(Transform(_attitude(before), steady.p_W), after)
         self._last = self._navigator.continuous
 
     def _follow(self, before: Transform, after: NavState) -> None:
-        """The map was moved: base_link stays where it was in odom, which stays level (REP 105)."""
+        """Keep base_link where it was in odom after the map moved; odom stays level (REP 105)."""
         stays = (self._frame.inverse() @ before).p
         turn = about_z(float(yaw_of(_attitude(after) * before.R.inv())[0]))
         R = turn * self._frame.R
@@ -157,7 +157,7 @@ def _attitude(pose: NavState | ContinuousPose) -> Rotation:
 
 
 def bag_messages(path: Path) -> Iterator[Any]:
-    """The Imu messages of a ROS 1 or 2 bag, read without ROS."""
+    """Yield the Imu messages of a ROS 1 or 2 bag, read without ROS."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -168,7 +168,7 @@ def bag_messages(path: Path) -> Iterator[Any]:
 
 
 def demonstration_messages(seconds: float) -> Iterator[Any]:
-    """The bundled demonstration as Imu messages."""
+    """Yield the bundled demonstration as Imu messages."""
     recording = demonstration()
     for time, gyro, accel in zip(recording.time, recording.gyro, recording.accel, strict=True):
         if time > seconds:
@@ -184,7 +184,7 @@ def demonstration_messages(seconds: float) -> Iterator[Any]:
 
 
 def main(path: Path | None = None, seconds: float = 20.0) -> list[Odometry]:
-    """Odometry of a bag, or of the demonstration's first seconds."""
+    """Return the odometry of a bag, or of the demonstration's first seconds."""
     bridge = OdometryBridge(Navigator(load_model("default")))
     messages = demonstration_messages(seconds) if path is None else bag_messages(path)
     return [odometry for message in messages if (odometry := bridge.imu(message)) is not None]

@@ -1,4 +1,4 @@
-"""Run on a recording: a fused track from one's own CSV, with nothing but IMU columns needed.
+"""Compute a fused track of a recording: your own CSV needs nothing but IMU columns.
 
 python examples/run_recording.py [RECORDING]
 """
@@ -15,12 +15,12 @@ from stario.sequences import read_recording, write_csv
 
 
 def fused_track(path: Path) -> Track:
-    """Read a recording of any known format and fuse it."""
+    """Read a recording in any supported format and fuse it."""
     return Navigator(load_model("default")).run(read_recording(path))
 
 
 def main(path: Path | None = None) -> Track:
-    """Fuse the recording, or a simulated one that is written as a CSV first."""
+    """Fuse the recording, or a simulated one that is first written as a CSV."""
     if path is not None:
         return fused_track(path)
     with tempfile.TemporaryDirectory() as folder:

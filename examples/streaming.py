@@ -1,4 +1,4 @@
-"""Call StarIO from navigation code: push samples as they come, read the state when there is one.
+"""Call StarIO from navigation code: push samples as they arrive, read each state returned.
 
 python examples/streaming.py
 """

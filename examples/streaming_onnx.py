@@ -1,7 +1,7 @@
-"""Stream on ONNX Runtime alone, as a small computer would: PyTorch is never imported.
+"""Stream on ONNX Runtime alone, as on a small computer: PyTorch is never imported.
 
-The exported file is made once, on any computer: stario export --out model.onnx. Without one the
-example makes it by that command, in a process of its own. Needs `pip install 'stario[onnx]'`.
+Export the model once, on any computer: stario export --out model.onnx. Without a file, the example
+runs that command in a separate process. Needs `pip install 'stario[onnx]'`.
 
     python examples/streaming_onnx.py [MODEL.onnx]
 """
@@ -18,7 +18,7 @@ from typing import Any
 
 
 def stream(path: Path, seconds: float) -> tuple[list[Any], float]:
-    """Stream the demonstration; also how long importing and loading took [s]."""
+    """Stream the demonstration; return its states and the time to import and load [s]."""
     began = perf_counter()
     from stario.fusion import Navigator, demonstration
     from stario.network import load_model
@@ -37,7 +37,7 @@ def stream(path: Path, seconds: float) -> tuple[list[Any], float]:
 
 
 def exported(folder: Path) -> Path:
-    """The default weights as an ONNX file."""
+    """Export the default weights to an ONNX file."""
     path = folder / "default.onnx"
     code = "from stario.fusion.commands.cli import main; main()"
     subprocess.run([sys.executable, "-c", code, "export", "--out", str(path)], check=True)
@@ -45,7 +45,7 @@ def exported(folder: Path) -> Path:
 
 
 def main(path: Path | None = None, seconds: float = 20.0) -> dict[str, Any]:
-    """Stream on an exported model; returns the last state's position, and what it took."""
+    """Stream on an exported model; return the last position, and the time and memory needed."""
     with tempfile.TemporaryDirectory() as folder:
         states, loading = stream(path or exported(Path(folder)), seconds)
     return {

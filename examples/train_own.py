@@ -1,4 +1,4 @@
-"""Train on your own recordings: anything `read_recording` reads, as long as it has truth.
+"""Train on your own recordings: anything `read_recording` reads that has ground truth.
 
 A real run takes hours of recordings and many epochs; `stario train` does the same with a progress
 bar. This one is small enough to watch.
@@ -16,7 +16,7 @@ from stario.sequences import generate_walk, simulate_imu, world_streams
 
 
 def main(folder: Path, epochs: int = 2) -> DisplacementModel:
-    """Train on five simulated recordings, keep one for validation, load the result."""
+    """Train on five simulated recordings, validate on a sixth, and load the result."""
     recordings = [simulate_imu(generate_walk(seed, 30.0), 200.0, seed=seed) for seed in range(6)]
     streams = [stream for recording in recordings for stream in world_streams(recording)]
     config = TrainingConfig(epochs=epochs, epoch_windows=256, batch=64, seed=0)

@@ -1,1 +1,1 @@
-"""Tracks side by side, their errors in tables and figures, faults, consistency and speed."""
+"""Comparison of tracks: errors, tables, figures, and checks of faults, consistency and speed."""

@@ -1,4 +1,4 @@
-"""Tracks of one recording side by side, measured against its truth where there is one."""
+"""Comparison of the tracks of one recording, with their errors if it has ground truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 TRACKS = ("inertial", "pdr", "network", "network_true_attitude", "ekf", "graph")
 
 DEMONSTRATION_SEED = 2**31 + 2026
-"""Of the bundled demonstration; training draws its seeds below 2^31, so it never saw this walk."""
+"""Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk."""
 
 Metrics = dict[str, float | None]
 
@@ -48,48 +48,48 @@ METRICS = (
     "seconds_network",
     "seconds_filter",
 )
-"""Figures of a track, null where they are not known."""
+"""Figures of a track; null where unknown."""
 
 METRIC_WORDS = {
     **CONVENTIONS,
-    "ate_fit_m": "the same after a fit of yaw and position over all poses, which asks for the "
-    "track's shape and length alone [m]",
+    "ate_fit_m": "the same after a fit of yaw and position over all poses, which leaves errors "
+    "in the track's shape and length only [m]",
     "known_positions_m": "root mean square of the horizontal distance to positions or waypoints "
     "known without attitude, after a fit of yaw and position [m]",
-    "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 3)",
+    "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 2.4)",
     "nis": "mean NIS of the network's measurements (expected: 3)",
     "seconds_network": "computing time of the network [s]",
-    "seconds_filter": "computing time of everything but the network [s]",
+    "seconds_filter": "computing time of everything except the network [s]",
     "alignment": "yaw and position of the first common pose; tilt is never aligned",
 }
-"""What every figure in `metrics.json` means."""
+"""Meaning of each figure in `metrics.json`."""
 
-_FITTED = "yaw and position of least squared error over all poses, for fixes gave the frame"
+_FITTED = "least squares in yaw and position over all poses, because fixes define the frame"
 
 
 def alignment_with(fixes: Sequence[Fix]) -> Alignment:
-    """How a track is aligned with the truth.
+    """Return how a track is aligned with the truth.
 
-    Where fixes give the frame, the first pose's yaw is the one that is known least.
+    Where fixes define the frame, the first pose's yaw is the least certain one.
     """
     return "yaw" if fixes else "first"
 
 
 def metric_words(alignment: Alignment) -> dict[str, str]:
-    """What the figures of `measure` mean."""
+    """Return the meaning of the figures of `measure`."""
     return METRIC_WORDS | ({"alignment": _FITTED} if alignment == "yaw" else {})
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The tracks of one recording.
+    """Tracks of one recording and their metrics.
 
     Attributes:
         sequence: the recording.
-        tracks: by name, in the order of `TRACKS`; without truth there is no
-            "network_true_attitude".
-        metrics: by track name.
-        alignment: of the tracks with the truth, for metrics and figures.
+        tracks: tracks by name, see `TRACKS`; those that could not be computed are missing, such as
+            "network_true_attitude" without ground truth.
+        metrics: metrics by track name.
+        alignment: how tracks are aligned with the truth, for metrics and figures.
     """
 
     sequence: ImuSequence
@@ -99,9 +99,9 @@ class Comparison:
 
     @property
     def path_m(self) -> float | None:
-        """Length of the true path [m] that the filter's track is held against, None without truth.
+        """Length of the true path [m] that the filter's track is compared with; None without truth.
 
-        Horizontal and within the times compared, as the errors are.
+        Like the errors it is horizontal and within the times compared.
         """
         truth = self.sequence.truth
         if truth is None:
@@ -109,13 +109,13 @@ class Comparison:
         return evaluate_track(self.tracks["ekf"].trajectory, truth, alignment="none").path_m
 
     def as_dict(self) -> dict[str, object]:
-        """The recording's entry in `metrics.json`."""
+        """Return the recording's entry in `metrics.json`."""
         unknown: Metrics = dict.fromkeys(METRICS)
         tracks = {name: self.metrics.get(name, unknown) for name in TRACKS}
         return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
 
     def aligned(self) -> dict[str, Trajectory]:
-        """Trajectories for figures: aligned with the truth where there is one."""
+        """Return trajectories for figures, aligned with the truth if there is one."""
         truth = self.sequence.truth
         raw = {name: track.trajectory for name, track in self.tracks.items()}
         if truth is None:
@@ -130,7 +130,7 @@ def compare(
     progress: Progress = lambda share: None,
     fixes: Sequence[Fix] = (),
 ) -> Comparison:
-    """Every track of a recording; the network sees each window once, EKF and graph the fixes.
+    """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.
 
     Raises:
         InputError: the recording is too short, its units or rate are wrong, or no fix is within
@@ -160,12 +160,12 @@ def compare(
 
 
 def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:
-    """Figures of one track; null where there is no truth, or no covariance.
+    """Compute the figures of one track; null without truth, or without covariance.
 
     Args:
-        track: to measure.
+        track: track to measure.
         sequence: its recording.
-        alignment: of position errors and of the NEES, as of `align`.
+        alignment: alignment for position errors and NEES, as in `align`.
     """
     figures: Metrics = dict.fromkeys(METRICS)
     truth = sequence.truth
@@ -185,7 +185,7 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
 
 
 def demonstration() -> ImuSequence:
-    """The bundled demonstration: a simulated phone carried in the hand for two minutes."""
+    """Return the bundled demonstration: a simulated phone carried in the hand for two minutes."""
     style = WalkStyle(carry="handheld", preferred_speed=1.1, mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(DEMONSTRATION_SEED, duration=120.0, style=style)
     return simulate_imu(walk, 200.0, PHONE_IMU, DEMONSTRATION_SEED, name="demonstration")

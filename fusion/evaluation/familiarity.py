@@ -1,4 +1,4 @@
-"""Whether a recording moves as what a model's weights were trained on, and they walk its way."""
+"""Comparison of a recording with a model's training data and predicted direction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 
 _TURNED, _VAGUE = math.radians(45.0), math.radians(20.0)
-"""A turn that is told of, and a deviation beyond which none is."""
+"""Turn above which a warning is given, and sigma below which agreement is reported [rad]."""
 
 _WORDS = {
     "acceleration": ("acceleration", "m/s^2 rms"),
@@ -26,20 +26,19 @@ _WORDS = {
     "middle": ("share of power from 3 to 10 Hz", ""),
     "vertical": ("share of power along the vertical", ""),
     "step_rate": ("step rate", "Hz"),
-    "speed": ("speed by the network", "m/s"),
+    "speed": ("predicted speed", "m/s"),
 }
 
 
 @dataclass(frozen=True)
 class Familiarity:
-    """A recording against what weights know.
+    """Comparison of a recording with the motion that a model's weights were trained on.
 
     Attributes:
-        outside: share of its windows that lie outside; None where the card does not say what is
-            known.
-        medians: of each of the features, of step rate and speed.
-        ranges: 1st and 99th percentile of the training's.
-        direction: of the network's displacements against the accelerometer.
+        outside: share of its windows outside that motion; None if the card does not describe it.
+        medians: median of each feature, of the step rate and of the speed.
+        ranges: 1st and 99th percentile of the training windows.
+        direction: direction of the network's displacements relative to the accelerometer.
     """
 
     outside: float | None
@@ -53,7 +52,7 @@ class Familiarity:
         return self.outside is not None and self.outside > UNFAMILIAR_SHARE
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values."""
+        """Return the findings as plain values."""
         turn, sigma = (math.degrees(v) for v in (self.direction.turn, self.direction.sigma))
         return {
             "outside": self.outside,
@@ -63,7 +62,7 @@ class Familiarity:
         }
 
     def lines(self) -> list[str]:
-        """The findings for a person."""
+        """Return the findings as lines of text."""
         return self._motion_lines() + self._direction_lines()
 
     def _direction_lines(self) -> list[str]:
@@ -71,22 +70,22 @@ class Familiarity:
         known = f"{math.degrees(turn):.0f} (+-{math.degrees(sigma):.0f}) degrees"
         if abs(turn) > max(_TURNED, 3.0 * sigma):
             return [
-                f"! the network walks another way than the accelerometer says, by {known}: its "
-                "track is turned by as much, and fusing both suffers; take other weights"
+                f"! the network's direction differs from the accelerometer's by {known}: its "
+                "track is rotated by this angle, and fusion suffers; use other weights"
             ]
         if sigma < _VAGUE:
-            return [f"  the network walks where the accelerometer says: turned by {known}"]
+            return [f"  the network's direction matches the accelerometer's: off by {known}"]
         return []
 
     def _motion_lines(self) -> list[str]:
         if not self.medians:
-            return ["motion: too short an unbroken stretch to tell"]
+            return ["motion: no unbroken stretch is long enough to assess it"]
         told = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
                          self.medians.items())  # fmt: skip
         lines = [f"motion: {told}"]
         if self.outside is None:
-            return [*lines, "  the weights' card does not say what motion they know"]
-        share = f"{self.outside:.0%} of the windows lie outside what the weights know"
+            return [*lines, "  the weights' card does not describe the motion they were trained on"]
+        share = f"{self.outside:.0%} of the windows lie outside the weights' training data"
         if not self.strange:
             return [*lines, f"  {share}"]
         beyond = [
@@ -96,8 +95,8 @@ class Familiarity:
             for low, high in (self.ranges[name],)
             if not low <= value <= high
         ]
-        reason = ": " + ", ".join(beyond) if beyond else ", each within its range: the mix is new"
-        return [*lines, f"! {share}{reason}; the network's sigma is widened there"]
+        reason = ": " + ", ".join(beyond) if beyond else ", each within its range: a new mixture"
+        return [*lines, f"! {share}{reason}; the network's sigma is inflated there"]
 
 
 def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:

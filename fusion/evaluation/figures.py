@@ -1,6 +1,6 @@
 """Figures of networks side by side: cost against error, distributions, sample tracks.
 
-Drawn as those of `stario.sequences.drawing.plots`, without pyplot.
+Drawn without pyplot, like those of `stario.sequences.drawing.plots`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _AGAINST = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> list[Path]:
-    """Write `networks.csv`, `networks.json` and the figures into a folder that exists."""
+    """Write `networks.csv`, `networks.json` and the figures into an existing folder."""
     write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
     written = [folder / "networks.csv", folder / "networks.json"]
@@ -42,7 +42,7 @@ def write_table(folder: Path, table: NetworkTable) -> list[Path]:
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:
-    """Figures by file name."""
+    """Return the figures by file name."""
     drawn = {
         "ate_parameters.png": _ate_against_parameters(table),
         "distributions.png": _distributions(table),
@@ -71,7 +71,7 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     axes.set_xlim(0.7 * min(counts), 1.9 * max(counts))
     axes.margins(y=0.15)
     axes.set_ylim(bottom=0.0)
-    # Beside, not at the points: half of the networks have about as many parameters and errors.
+    # Next to the axes, not at the points: half of the networks have similar sizes and errors.
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     dress(axes)
     return fig
@@ -118,7 +118,7 @@ def _pde_boxes(table: NetworkTable) -> Figure:
 
 
 def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
-    """Tracks of StarIO's kind against R-ResNet's, or of the first four networks without it."""
+    """Draw tracks of StarIO networks and R-ResNet; without it, of the first four networks."""
     columns = min(2, len(samples))
     rows = math.ceil(len(samples) / columns)
     fig = new_figure(
@@ -155,7 +155,7 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
 
 
 def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners of the empirical distribution of some values (N,)."""
+    """Return the corners of the empirical distribution of values (N,)."""
     ordered = np.sort(values)
     share = np.arange(1, len(ordered) + 1) / max(len(ordered), 1)
     return np.concatenate([[0.0], ordered]), np.concatenate([[0.0], share])

@@ -1,4 +1,4 @@
-"""A track against positions known without attitude: waypoints, or a track of satellites."""
+"""Comparison of a track with positions known without attitude: waypoints or satellite fixes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
 LEAST = 2
-"""One position is met by a shift alone; of two the distance is compared."""
+"""Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
-    """Horizontal error at the known positions, after a fit of yaw and position.
+    """Return the horizontal error at the known positions, after a fit of yaw and position.
 
     Args:
-        track: of the same recording.
+        track: track of the same recording.
         known: positions or waypoints.
 
     Returns:
-        Root mean square [m], NaN where fewer than `LEAST` lie within the track; and how many do.
+        Root mean square [m], NaN if fewer than `LEAST` lie within the track; and their number.
     """
     shown = placed(track, known)
     if shown is None or len(shown) < LEAST:
@@ -31,17 +31,17 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
 
 
 def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
-    """Those of the known positions that lie within a track and in none of its gaps, from above.
+    """Return the horizontal known positions that lie within a track and in none of its gaps.
 
-    They are turned about the vertical and shifted to where they fit the track best, in its frame.
+    They are rotated about the vertical and shifted to fit the track best, in its frame.
 
     Args:
-        track: of the same recording.
+        track: track of the same recording.
         known: positions or waypoints.
 
     Returns:
-        The positions (n, 2) [m], of which a single one lies on the track; None where none does
-        in time.
+        The positions (n, 2) [m], a single one exactly on the track; None if there is none within
+        its time.
     """
     inside = known.valid & track.trajectory.covers(known.time)
     time, truth = known.time[inside], known.position_W[inside]
@@ -53,21 +53,21 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
 
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:
-    """The track from above (n, 2) [m]."""
+    """Return the horizontal track (n, 2) [m]."""
     return interpolated(time, track.time, track.trajectory.position_W[:, :2])
 
 
 def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None:
-    """What is drawn beside a track: known positions as `placed`, where there is no true track."""
+    """Return known positions to draw next to a track, as `placed`; None with a true track."""
     if sequence.truth is not None or sequence.positions is None:
         return None
     return placed(track, sequence.positions)
 
 
 def position_error_words(track: Track, known: PositionTrack) -> str:
-    """The same for a person."""
+    """Return the error at the known positions in words."""
     error, count = position_error(track, known)
     of = f"{count} of {int(known.valid.sum())} {known.kind} lie within the track"
     if np.isnan(error):
         return f"{of}: too few to compare with"
-    return f"{of}: {error:.2f} m rms off them, after a fit of yaw and position"
+    return f"{of}: {error:.2f} m rms from them, after a fit of yaw and position"

@@ -1,4 +1,4 @@
-"""The tracks of many recordings, compared in parallel and past those that cannot be used."""
+"""Comparison of many recordings in parallel, skipping those that cannot be used."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ def compare_recordings(
 ) -> Iterator[Comparison | Skipped]:
     """Compare the tracks of each recording, in the order of the paths.
 
-    Comparisons come one by one, so that they need not all be in memory, under names of their own:
-    a second `walk` is `walk-2`.
+    Comparisons are yielded one by one, so that they need not all be in memory, under distinct
+    names: a second `walk` is `walk-2`.
 
     Args:
-        paths: recordings.
-        model: the network, or the name of weights, which each process loads once: better than
-            handing over the network with every recording.
-        config: the navigator's settings.
-        read: how a path is read; can be pickled.
-        jobs: processes, as for `stario.sequences.datasets.batch.each`.
-        fixes: known to the EKF of every recording.
-        truth_needed: skip recordings without truth.
-        progress: called with the share of the work that is done; within a recording too where
-            one process works.
+        paths: paths of the recordings.
+        model: network, or name of weights, which each process loads once: faster than passing the
+            network with every recording.
+        config: configuration of the navigator.
+        read: function that reads a path; must be picklable.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+        fixes: fixes given to EKF and graph for every recording.
+        truth_needed: whether to skip recordings without ground truth.
+        progress: called with the share of the work done; with a single process also within a
+            recording.
     """
     done = 0
 
@@ -72,7 +72,7 @@ def compare_recordings(
 
 
 def distinct_name(name: str, taken: set[str]) -> str:
-    """The name, or the first of name-2, name-3, ... that is not taken; it is taken from now on."""
+    """Return the name, or the first of name-2, name-3, ... not in `taken`, and add it there."""
     names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
     found = next(name for name in names if name not in taken)
     taken.add(found)
@@ -103,4 +103,4 @@ def _loaded(name: str) -> DisplacementModel:
 
 
 def _unseen(share: float) -> None:
-    """Progress that another process makes."""
+    """Ignore progress made in another process."""

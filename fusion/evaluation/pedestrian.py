@@ -1,14 +1,14 @@
 """Pedestrian dead reckoning without a network: steps, their lengths, their directions.
 
-A classical baseline that says at a glance whether a network is worth its name on a recording:
+A classical baseline that shows whether a network is worth using on a recording:
 
 - steps are the peaks of the levelled vertical acceleration;
 - a step is K (a_max - a_min)^(1/4) long (Weinberg, Using the ADXL202 in Pedometer and Personal
-  Navigation Applications, Analog Devices AN-602, 2002), with one K for everybody;
-- it goes along the principal axis of the horizontal acceleration in the device's heading frame
+  Navigation Applications, Analog Devices AN-602, 2002), with one K for everyone;
+- its direction is the principal axis of the horizontal acceleration in the device's heading frame
   (Kunze et al., Which Way Am I Facing, ISWC 2009; compared with others by Combettes and Renaudin,
-  IPIN 2015), turned by the gyroscope's yaw. Of the axis' two ends the one counts against which the
-  acceleration lags a quarter of a step behind the vertical one, as walking has it.
+  IPIN 2015), rotated by the gyroscope's yaw. Of the axis's two ends, the backward one is that along
+  which the acceleration lags the vertical one by a quarter of a step, as it does in walking.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ WEINBERG_CONSTANT = 0.373
 NAME = "pdr"
 
 _STEP_BAND = (0.8, 3.0)
-"""Frequencies of steps [Hz]; strides and the sway from side to side are below, impacts above."""
+"""Frequency band of steps [Hz]; strides and sideways sway are below, impacts above."""
 
 _LEAST_PROMINENCE = 0.6
-"""Of a peak that counts as a step [m/s^2]."""
+"""Minimum prominence of a peak that counts as a step [m/s^2]."""
 
 _SHORTEST_STEP, _LONGEST_STEP = 0.25, 1.5
-"""Times between steps [s]; after longer ones somebody stood."""
+"""Minimum and maximum time between steps [s]; a longer one is a pause."""
 
 _AXIS_SECONDS = 5.0
-"""Stretch over which the walking direction against the device is averaged [s]."""
+"""Time over which the walking direction relative to the device is averaged [s]."""
 
 _SIGMA = 0.3
-"""Of a second's displacement [m]: what the method errs by where it works."""
+"""Standard deviation of a one-second displacement [m]: the method's error where it works."""
 
 Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of a stretch.
+    """Steps of a stretch.
 
     Attributes:
-        end: (S,) samples at which each ends; it begins where the one before ended.
-        begin: (S,) samples at which each begins.
+        begin: (S,) sample at which each begins: where the previous one ended, except after a pause.
+        end: (S,) sample at which each ends.
         spread: (S,) difference of the largest and smallest vertical acceleration [m/s^2].
         direction_N: (S,) unit direction x + iy in N.
     """
@@ -70,20 +70,20 @@ class Steps:
     direction_N: Complex
 
     def lengths(self, constant: float = WEINBERG_CONSTANT) -> FloatArray:
-        """Step lengths (S,) [m] by Weinberg's rule."""
+        """Return step lengths (S,) [m] by Weinberg's rule."""
         return np.asarray(constant * self.spread**0.25)
 
 
 class PedestrianDeadReckoning:
-    """Judged like a network: answers with the displacement over the second from each tick."""
+    """Baseline judged like a network: predicts the displacement over the second from each tick."""
 
     def answers(self, prepared: Prepared) -> list[Answers]:
-        """The answers on each piece of a recording, in N."""
+        """Return predictions for each piece of a recording, in N."""
         return [_answers(piece.stream) for piece in prepared.pieces]
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:
-    """The track of a recording, levelled from the IMU; it stands during gaps and keeps its heading.
+    """Compute a recording's track, levelled from the IMU; gaps keep its position and heading.
 
     Raises:
         InputError: there is no unbroken stretch of 2 s, or the rate is not accepted.
@@ -95,7 +95,7 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
     places, attitudes, end, facing = [], [], 0j, 0j
     for stream in streams:
         faces = stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1]
-        # Each begins at a yaw of its own: nobody saw what was turned in the gap, so nothing was.
+        # Each has its own initial yaw. The rotation during a gap is unknown and taken as zero.
         turn = float(np.angle(facing * np.conj(faces[0])))
         place = end + np.exp(1j * turn) * pedestrian_path(stream)
         places.append(place[::TICK_SAMPLES])
@@ -128,7 +128,7 @@ def steps_of(stream: LevelledStream) -> Steps:
 
 
 def pedestrian_path(stream: LevelledStream, constant: float = WEINBERG_CONSTANT) -> Complex:
-    """Horizontal position x + iy (N,) [m] in N at each sample, from 0 at the first."""
+    """Return the horizontal position x + iy (N,) [m] in N at each sample, 0 at the first."""
     steps = steps_of(stream)
     speed = np.zeros(len(stream), dtype=complex)
     moved = steps.lengths(constant) * steps.direction_N
@@ -138,10 +138,10 @@ def pedestrian_path(stream: LevelledStream, constant: float = WEINBERG_CONSTANT)
 
 
 def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> Complex:
-    """Walking direction (N,) in the device's heading frame: principal axis, end by the phase."""
+    """Return the walking direction (N,) in the heading frame: principal axis, sign by phase."""
     horizontal_H = horizontal_N * np.conj(heading)
     samples = round(_AXIS_SECONDS * WINDOW_RATE)
-    # The square doubles angles: both ends of an axis add up.
+    # The square doubles angles, so that both ends of an axis add up.
     axis = np.sqrt(_unit(_mean(horizontal_H**2, samples)))
     lagging = _mean(-horizontal_H * np.imag(hilbert(vertical)), samples)
     return np.asarray(np.where((np.conj(axis) * lagging).real < 0.0, -axis, axis))
@@ -149,7 +149,7 @@ def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> C
 
 def _answers(stream: LevelledStream) -> Answers:
     track = pedestrian_path(stream)
-    # The window that begins with the last tick ends one sample behind the stretch.
+    # The window that begins at the last tick ends one sample after the stretch.
     at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
     count = stream.window_count
     moved = at_tick[UPDATES : UPDATES + count] - at_tick[:count]

@@ -1,4 +1,4 @@
-"""The folder a run leaves behind: tracks, arrays, metrics, configuration, health and figures."""
+"""Output folder of a run: tracks, arrays, metrics, configuration, health and figures."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def write_run(
     backend: BackendName = "ekf",
     known: PositionTrack | None = None,
 ) -> list[Path]:
-    """Write one fused track; returns the files.
+    """Write one fused track and return the files written.
 
-    `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
-    `config.json`, `health.json`, and the figures; the graph's track is called `graph`. Known
-    positions in the track's frame (`known_positions.placed`) are drawn where there is no truth.
+    These are `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
+    `config.json`, `health.json` and the figures; the graph's track is called `graph`. Without
+    truth, known positions in the track's frame (`known_positions.placed`) are drawn.
 
     Raises:
-        InputError: the folder cannot be made.
+        InputError: the folder cannot be created.
     """
     make_folder(folder)
     written = _track_files(folder, backend, track)
@@ -61,7 +61,7 @@ def write_comparison(
     """Write `metrics.json`, `config.json` and a sub-folder of tracks and figures per recording.
 
     Raises:
-        InputError: a folder cannot be made.
+        InputError: a folder cannot be created.
     """
     written = write_summary(folder, [scores_of(c) for c in comparisons], config)
     for comparison in comparisons:
@@ -75,7 +75,7 @@ def write_summary(
     """Write `metrics.json` and `config.json` of several recordings.
 
     Raises:
-        InputError: the folder cannot be made.
+        InputError: the folder cannot be created.
     """
     make_folder(folder)
     write_json(folder / "metrics.json", scores_dict(recordings))
@@ -84,10 +84,10 @@ def write_summary(
 
 
 def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfig) -> list[Path]:
-    """Write tracks and figures of one recording into a sub-folder of its name.
+    """Write tracks and figures of one recording into a sub-folder named after it.
 
     Raises:
-        InputError: a folder cannot be made.
+        InputError: a folder cannot be created.
     """
     name = comparison.sequence.name
     inner = folder / name
@@ -106,29 +106,29 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
-    """The content of `metrics.json`."""
+    """Return the content of `metrics.json`."""
     return scores_dict([scores_of(comparison) for comparison in comparisons])
 
 
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
-    """The same from the figures alone."""
+    """Return the content of `metrics.json`, given the figures alone."""
     records = {scores.name: scores.record for scores in recordings}
-    # Fixes, which change how tracks are aligned, are those of one recording.
+    # Fixes change how tracks are aligned; they are given for a single recording only.
     words = next((scores.words for scores in recordings), METRIC_WORDS)
     return {"recordings": records, "conventions": words}
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it.
+    """Create a folder and its parents.
 
     Raises:
-        InputError: something else is in the way or it is not allowed.
+        InputError: the path is taken by something else, or permission is denied.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            str(folder), error.strerror or "an error", "a folder that can be made"
+            str(folder), error.strerror or "an error", "a folder that can be created"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Summary of many comparisons: one table of recordings by tracks, medians and means."""
+"""Summary of many comparisons: one table of recordings by tracks, with medians and means."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Scores:
-    """The figures of one recording: what stays when a comparison's arrays are let go.
+    """Figures of one recording, kept after a comparison's arrays are released.
 
     Attributes:
-        name: the recording's.
-        metrics: by track name.
-        record: the recording's entry in `metrics.json`.
-        words: what the figures mean.
+        name: name of the recording.
+        metrics: metrics by track name.
+        record: entry of the recording in `metrics.json`.
+        words: meaning of the figures.
     """
 
     name: str
@@ -42,13 +42,13 @@ class Scores:
 
 
 def scores_of(comparison: Comparison) -> Scores:
-    """The figures of a comparison."""
+    """Return the figures of a comparison."""
     words = metric_words(comparison.alignment)
     return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict(), words)
 
 
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
-    """Figures of every recording with medians and means over them, as plain values."""
+    """Return figures of every recording, with medians and means over them, as plain values."""
     records = {scores.name: scores.record for scores in recordings}
     metrics = ("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m", "nees", "nis")
     over = {
@@ -63,7 +63,7 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 
 
 def summary_table(recordings: Sequence[Scores]) -> str:
-    """The same for a person: horizontal ATE of each track, consistency of the EKF."""
+    """Return the summary as text: horizontal ATE of each track, consistency of the back ends."""
     rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
     known = [_known(recordings, track, metric) for track, metric, _ in _COLUMNS]
     for name, over in (("median", np.median), ("mean", np.mean)):
@@ -81,6 +81,6 @@ def _known(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
 
 
 def _value(scores: Scores, track: str, metric: str) -> float | None:
-    """A figure, None where it is not known."""
+    """Return a figure; None if unknown."""
     value = scores.metrics.get(track, {}).get(metric)
     return value if value is not None and math.isfinite(value) else None

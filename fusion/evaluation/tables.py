@@ -1,8 +1,8 @@
 """Networks side by side over many recordings: the paper's table.
 
-Each network is asked for three tracks of each recording: chained displacements with the true
-attitude (the papers' protocol), the same with the attitude levelled from the IMU, and the EKF's.
-Several weights of one network, trained with different seeds, say, are averaged, with their spread.
+Each network yields three tracks of each recording: chained displacements with the true attitude
+(the papers' protocol), the same with the attitude levelled from the IMU, and the EKF's. Several
+weights of one network, for example from different training seeds, are averaged, with their spread.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PROTOCOLS = {
     "network": "network, own attitude",
     "ekf": "EKF",
 }
-"""Tracks of the table and what a person calls them."""
+"""Tracks of the table and their titles."""
 
 METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}
 
@@ -42,13 +42,13 @@ class Entry:
     """Errors of one track; see `stario.sequences.accuracy.metrics.CONVENTIONS`.
 
     Attributes:
-        recording: its name.
-        network: the architecture.
-        weights: the file, or "default".
+        recording: name of the recording.
+        network: architecture.
+        weights: weights file, or "default".
         protocol: one of `PROTOCOLS`.
-        ate_m: [m].
-        rte_m: [m].
-        pde: [1].
+        ate_m: absolute trajectory error [m].
+        rte_m: relative trajectory error [m].
+        pde: position drift error [1].
     """
 
     recording: str
@@ -65,9 +65,9 @@ class Sample:
     """Tracks of one recording with the true attitude, aligned with the truth, for a figure.
 
     Attributes:
-        recording: its name.
-        truth: the true track.
-        tracks: by network.
+        recording: name of the recording.
+        truth: true track.
+        tracks: tracks by network.
         errors: ATE and RTE [m] of each track.
     """
 
@@ -79,13 +79,13 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class NetworkTable:
-    """What came out.
+    """Errors of several networks on several recordings.
 
     Attributes:
         convention: how position errors are averaged.
-        parameters: of each network in the table's order, by the paper's convention.
-        entries: of all tracks.
-        samples: some recordings' tracks.
+        parameters: parameter count by network, in the table's order, by the paper's convention.
+        entries: errors of all tracks.
+        samples: tracks of some recordings.
     """
 
     convention: Convention
@@ -94,7 +94,7 @@ class NetworkTable:
     samples: list[Sample] = field(default_factory=list)
 
     def values(self, network: str, protocol: str, metric: str, weights: str = "") -> FloatArray:
-        """A metric (N,) of a network's tracks, of one weights file or of all."""
+        """Return a metric (N,) of a network's tracks, for one weights file or for all."""
         return np.array(
             [
                 getattr(entry, metric)
@@ -107,7 +107,7 @@ class NetworkTable:
     def mean_and_spread(
         self, network: str, protocol: str, metric: str, recording: str = ""
     ) -> tuple[float, float | None]:
-        """Mean over recordings, or of one, and the deviation of that mean over the weights."""
+        """Return the mean over recordings, or of one, and its deviation over the weights."""
         chosen = [
             e
             for e in self.entries
@@ -122,7 +122,7 @@ class NetworkTable:
 
 
 Models = Sequence[tuple[str, DisplacementModel]]
-"""Weights, by the name they were asked for."""
+"""Models, each with the name by which its weights were requested."""
 
 
 def compare_networks(
@@ -135,20 +135,20 @@ def compare_networks(
     samples: int = 4,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[NetworkTable, list[Skipped]]:
-    """Ask every network for its tracks of every recording.
+    """Compute the tracks of every network on every recording.
 
     Args:
         paths: recordings with truth.
-        models: weights under distinct names.
-        config: of the filter.
-        read: how a path is read; can be pickled.
+        models: models under distinct names.
+        config: configuration of the filter.
+        read: function that reads a path; must be picklable.
         convention: how position errors are averaged.
-        jobs: processes, as for `stario.sequences.datasets.batch.each`.
-        samples: recordings whose tracks are kept for a figure.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+        samples: number of recordings whose tracks are kept for a figure.
         progress: called with the share of the work done.
 
     Returns:
-        The table, and what could not be used.
+        The table, and the recordings that could not be used.
     """
     parameters = {model.name: table_cost(model.name).parameters for _, model in models}
     table, skipped = NetworkTable(convention, parameters), []
@@ -168,7 +168,7 @@ def compare_networks(
 
 
 def table_text(table: NetworkTable) -> str:
-    """The table for a person: a block for each protocol and metric, recordings by networks."""
+    """Return the table as text: a block per protocol and metric, recordings by networks."""
     networks = list(table.parameters)
     recordings = list(dict.fromkeys(e.recording for e in table.entries))
     lines = []
@@ -184,7 +184,7 @@ def table_text(table: NetworkTable) -> str:
 
 
 def table_dict(table: NetworkTable) -> dict[str, object]:
-    """The table as plain values."""
+    """Return the table as plain values."""
     over = {
         network: {
             protocol: {
@@ -214,7 +214,7 @@ def _words(table: NetworkTable) -> dict[str, str]:
     return {
         **{key: CONVENTIONS[key] for key in keys},
         "here": f"horizontal errors, alignment first, convention {table.convention}",
-        "mean": "over recordings, each counting alike; +- deviation over weights of one network",
+        "mean": "over recordings, equally weighted; +- deviation over weights of one network",
     }
 
 

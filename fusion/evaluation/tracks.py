@@ -1,7 +1,7 @@
 """Tracks to compare with the filter's: the IMU alone, and the network alone.
 
 The network's displacements become a track by taking each window's mean velocity as the velocity
-at its middle and integrating: every overlapping window counts alike.
+at its middle and integrating: all overlapping windows have equal weight.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from stario.sequences.windows import (
 
 
 def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
-    """Strapdown integration alone, from the levelled start at rest, biases taken as zero."""
+    """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases."""
     began = perf_counter()
     start = preprocessed.front_end.start
-    assert start is not None  # observe() refuses recordings without one
+    assert start is not None  # observe() rejects recordings without one
     zero = np.zeros(3)
     R, v, p = start.R_WB, zero, zero
     rows = [(start.time, R, v, p)]
@@ -65,10 +65,10 @@ def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig)
 
 
 def network_track(preprocessed: PreprocessedRecording) -> Track:
-    """Displacements chained along the attitude that is levelled from the IMU, without truth."""
+    """Chain the network's displacements along the attitude levelled from the IMU, without truth."""
     began = perf_counter()
     start = preprocessed.front_end.start
-    assert start is not None  # observe() refuses recordings without one
+    assert start is not None  # observe() rejects recordings without one
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
     attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
     known = [
@@ -89,13 +89,13 @@ def network_track(preprocessed: PreprocessedRecording) -> Track:
 def network_track_true_attitude(
     model: Predictor, sequence: ImuSequence, config: NavigatorConfig
 ) -> Track:
-    """The papers' protocol: windows rotated by the true attitude, displacements chained.
+    """Chain displacements of windows rotated by the true attitude, the papers' protocol.
 
-    Where the truth has a gap its attitude is carried on by the gyroscope: a track that lacks the
-    displacements of seconds would tell of the gap and not of the network.
+    Across gaps of the truth the gyroscope propagates the attitude: a track without the
+    displacements of those seconds would measure the gap and not the network.
 
     Raises:
-        InputError: the recording has no truth, or no second of it with valid truth.
+        InputError: the recording has no truth, or no second with valid truth.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
@@ -123,7 +123,7 @@ def _along(
     heading: FloatArray,
     updates: int,
 ) -> FloatArray:
-    """Displacements (M, 3) of windows that start at `time` (M,), a memory ending at each gap."""
+    """Predict displacements (M, 3) of windows from `time` (M,) on; memory is reset at each gap."""
     network = StatefulInference(model, updates)
     if not network.remembers:
         return network.predict(windows, heading)[0]
@@ -136,11 +136,11 @@ def _along(
 
 
 def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
-    """Poses at the samples from the first to the last true one, without gaps in the attitude."""
+    """Return poses at the samples from the first to the last true one, attitude without gaps."""
     time, gyro, _ = clean_samples(sequence)
     known = np.flatnonzero(truth.covers(time))
     if len(known) == 0:
-        raise InputError(f"{sequence.name}: truth", "none that is valid", "at least a second of it")
+        raise InputError(f"{sequence.name}: truth", "no valid pose", "at least one second of them")
     inside = slice(known[0], known[-1] + 1)
     time, gyro = time[inside], gyro[inside]
     poses = truth.at(time)
@@ -155,7 +155,7 @@ def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajector
 def _true_windows(
     sequence: ImuSequence, truth: Trajectory, period: float
 ) -> tuple[FloatArray, NDArray[np.float32], FloatArray]:
-    """Start times (M,), windows (M, 6, 200) and headings (M,) where nothing has a gap."""
+    """Return start times (M,), windows (M, 6, 200) and headings (M,) where there is no gap."""
     world = imu_in_world(sequence, truth, "true")
     bad_before = np.concatenate([[0], np.cumsum(~world.usable)])
     stride = round(period * WINDOW_RATE)

@@ -1,1 +1,1 @@
-"""What `stario check` runs."""
+"""Checks that `stario check` runs."""

@@ -1,4 +1,4 @@
-"""Filter against graph: accuracy, speed and latency of each, on simulated walks or recordings."""
+"""Filter against graph: accuracy, speed and latency, on simulated walks or recordings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
 ESTIMATORS = ("ekf", "graph", "fixed_lag")
-"""The filter, the graph of the whole, and the newest states of the fixed-lag graph."""
+"""The filter, the graph of the whole recording, and the newest states of the fixed-lag graph."""
 
 DISPLACEMENT_NOISE = 0.03
 """White noise of the simulated displacements, per axis [m]."""
@@ -35,14 +35,14 @@ DISPLACEMENT_NOISE = 0.03
 
 @dataclass(frozen=True)
 class Score:
-    """How the estimators did on one recording.
+    """Results of the estimators on one recording.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         duration_s: its length [s].
         ate_m: absolute trajectory error [m] by estimator, as `compare` measures it.
-        nees: median position NEES (expected: 3) by estimator.
-        s_per_min: processor time [s] per minute of data by estimator, everything but the network.
+        nees: median position NEES (expected: 2.4) by estimator.
+        s_per_min: processor time [s] per minute of data by estimator, without the network.
         slowest_ms: processor time of the fixed-lag graph's slowest update [ms].
     """
 
@@ -55,10 +55,10 @@ class Score:
 
 
 def score_walk(seed: int, seconds: float) -> Score:
-    """A simulated walk, measured once a second by its displacements under white noise.
+    """Score a simulated walk, measured once a second by its displacements with white noise.
 
     The sensor has the white noise of `ImuNoise` and a phone's biases, no other errors; the
-    estimators know all of these deviations as they are. Person and carry are drawn.
+    estimators are given the exact standard deviations. Person and carry are drawn at random.
     """
     errors = ImuErrors(
         noise=ImuNoise(),
@@ -81,7 +81,7 @@ def score_walk(seed: int, seconds: float) -> Score:
 
 
 def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> Score:
-    """A recording, measured by a network.
+    """Score a recording, measured by a network.
 
     Raises:
         InputError: it has no truth, is too short, or its units or rate are wrong.
@@ -93,7 +93,7 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
 
 
 def summary(scores: Sequence[Score]) -> dict[str, object]:
-    """Medians over recordings, and the graphs' errors against the filter's, as plain values."""
+    """Return medians over recordings, and errors relative to the filter's, as plain values."""
     ate = _table(scores, lambda score: score.ate_m)
     medians = dict(zip(ESTIMATORS, np.median(ate, axis=0).tolist(), strict=True))
     ratios, errors = _mean_ratios(ate)
@@ -110,7 +110,7 @@ def summary(scores: Sequence[Score]) -> dict[str, object]:
 
 
 def score_table(scores: Sequence[Score]) -> str:
-    """The scores for a person."""
+    """Return the scores as text."""
     titles = {"ekf": "EKF", "graph": "graph", "fixed_lag": "fixed-lag"}
     head = [f"{titles[e]} {group}" for group in ("ATE [m]", "NEES", "s/min") for e in ESTIMATORS]
     tables = [
@@ -125,7 +125,7 @@ def score_table(scores: Sequence[Score]) -> str:
     return "\n".join(
         [
             *aligned([["", *head, "slowest [ms]"], *cells]),
-            f"median ATE against the EKF's: graph {ratio[1]:.2f}, fixed-lag {ratio[2]:.2f}; "
+            f"median ATE relative to the EKF's: graph {ratio[1]:.2f}, fixed-lag {ratio[2]:.2f}; "
             f"geometric mean over recordings: graph {each[1]:.2f} +- {error[1]:.2f}, "
             f"fixed-lag {each[2]:.2f} +- {error[2]:.2f}",
             f"fixed-lag {speed:.0f} times real time, slowest update {figures[:, -1].max():.1f} ms",
@@ -134,10 +134,10 @@ def score_table(scores: Sequence[Score]) -> str:
 
 
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of errors (N, 3) to the EKF's, recording by recording: the geometric mean (3,).
+    """Return the geometric mean (3,) over recordings of the ratio of errors (N, 3) to the EKF's.
 
-    With its standard error (3,), without which two estimators alike seem to differ: the ratio of
-    their medians changes by a tenth with other twenty walks.
+    Its standard error (3,) is returned as well; without it two similar estimators seem to differ:
+    the ratio of their medians changes by a tenth with another twenty walks.
     """
     logs = np.log(ate / ate[:, :1])
     mean = np.exp(logs.mean(axis=0))
@@ -172,9 +172,9 @@ def _scored(
 def _streamed(
     preprocessed: PreprocessedRecording, config: NavigatorConfig
 ) -> tuple[Track, FloatArray]:
-    """The newest states of the fixed-lag graph, and the processor time of each step [s]."""
+    """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
     start = preprocessed.front_end.start
-    assert start is not None  # observe() refuses recordings without one
+    assert start is not None  # observe() rejects recordings without one
     estimator = FixedLagEstimator(config, start)
     states, times = [estimator.nav_state()], []
     for interval, measurement in zip(

@@ -1,6 +1,6 @@
-"""What the filter costs, and what its structured algebra saves against filterpy's dense one.
+"""Cost of the filter, and what its structured algebra saves over filterpy's dense one.
 
-Timings are processor time, the least of several runs: whatever else the machine does only adds.
+Timings are processor time, the minimum of several runs: other load on the machine only adds to it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _DURATION, _IMU_RATE, _UPDATE_RATE, _WINDOW = 5.0, 200.0, 20.0, 1.0
-"""Of the data [s], [Hz], [Hz], [s]."""
+"""Duration of the data [s], IMU rate [Hz], update rate [Hz] and window length [s]."""
 
 _RUNS = 9
-"""Of each engine, in turn; the fastest counts."""
+"""Number of runs of each engine, alternating; the fastest counts."""
 
 
 class DenseEkf(StateCloningEkf):
-    """The same filter through filterpy's own `predict` and `update` on the full matrices."""
+    """The same filter using filterpy's own `predict` and `update` on the full matrices."""
 
     def _propagated(self, P: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
         self.F[:CORE, :CORE] = transition
@@ -53,12 +53,12 @@ class DenseEkf(StateCloningEkf):
 
 @dataclass(frozen=True)
 class FilterSpeed:
-    """Seconds of computing per minute of data, preintegration included, network excluded.
+    """Computing time [s] per minute of data, including preintegration but not the network.
 
     Attributes:
-        structured: `StateCloningEkf`.
-        dense: `DenseEkf`, filterpy's own algebra.
-        preintegration: the part of either that folds the raw samples.
+        structured: time of `StateCloningEkf`.
+        dense: time of `DenseEkf`, filterpy's own algebra.
+        preintegration: time that preintegrating the raw samples takes in either.
         states: size of the error state.
     """
 
@@ -74,7 +74,7 @@ class FilterSpeed:
 
 
 def filter_speed() -> FilterSpeed:
-    """Time the filter on a swaying device that is measured by displacements."""
+    """Time the filter on a swaying device measured by displacements."""
     data, slots = _SwayingDevice(), round(_UPDATE_RATE * _WINDOW) + 1
     engines = [StateCloningEkf(slots), DenseEkf(slots)]
     best = np.full(3, np.inf)
@@ -86,7 +86,7 @@ def filter_speed() -> FilterSpeed:
 
 
 class _SwayingDevice:
-    """IMU samples and displacements of a device that sways about one place."""
+    """IMU samples and displacements of a device that sways in place."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)

@@ -1,10 +1,10 @@
-"""Monte Carlo: does the filter know how wrong it is?
+"""Monte Carlo check that the filter's covariance matches its errors.
 
 Walks are analytic, so their IMU is exact; the sensor's noise, its biases, the displacements' noise
-and the first state's errors are drawn as large as a configuration says. What runs on them is the
-navigator's own filter with its rates, windows and gates. For an honest filter the NEES of n states
-averages to n, and its mean over N independent runs follows chi-square with n N degrees of freedom,
-divided by N.
+and the initial state's errors are drawn with a configuration's standard deviations. The navigator's
+own filter runs on them, with its rates, windows and gates. For a consistent filter the NEES of n
+states averages to n, and its mean over N independent runs follows chi-square with n N degrees of
+freedom, divided by N.
 """
 
 from __future__ import annotations
@@ -31,32 +31,33 @@ from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import WINDOW_SECONDS
 
 RATE = 200.0
-"""Samples per second of the simulated IMU [Hz]."""
+"""Sampling rate of the simulated IMU [Hz]."""
 
 YAW_SIGMA = math.radians(10.0)
-"""Of the first yaw [rad], unless another is asked for."""
+"""Default standard deviation of the initial yaw [rad]."""
 
 _POSITION_SIGMA = 0.01
 
 _DISPLACEMENT_SIGMA = 0.1
-"""Per axis [m], as of a good network. Far better ones show that an unknown first speed meets an
-unknown yaw beyond first order: with 0.03 m the NEES of the first minute is 19 instead of 16."""
+"""Standard deviation of the displacements per axis [m], as of a good network. Far smaller values
+reveal that an unknown initial speed and an unknown yaw interact beyond first order: with 0.03 m the
+NEES of the first minute is 19 instead of 16."""
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Averages over the runs, and the bounds an honest filter keeps in 95 of 100 trials.
+    """Averages over the runs, and the bounds a consistent filter keeps in 95 of 100 trials.
 
     Attributes:
-        runs: how many.
-        seconds: length of each [s].
-        nees: of the 15 states, over all times; expected 15.
-        nees_end: of the 15 states at the end.
-        nees_bounds: for `nees_end` (and, since times are alike, close to those of `nees`).
+        runs: number of runs.
+        seconds: length of each run [s].
+        nees: NEES of the 15 states over all times; expected 15.
+        nees_end: NEES of the 15 states at the end.
+        nees_bounds: bounds of `nees_end`, close to those of `nees` since times are correlated.
         yaw: NEES of yaw over all times; expected 1.
-        nis: of the measurements; expected 3.
-        yaw_sigma: that the filter reports at the end, root mean square [rad].
-        yaw_error: true one at the end, root mean square [rad].
+        nis: NIS of the measurements; expected 3.
+        yaw_sigma: yaw sigma that the filter reports at the end, root mean square [rad].
+        yaw_error: true yaw error at the end, root mean square [rad].
     """
 
     runs: int
@@ -70,13 +71,13 @@ class Consistency:
     yaw_error: float
 
     def lines(self) -> list[str]:
-        """The result for a person."""
+        """Return the result as lines of text."""
         low, high = self.nees_bounds
         return [
             f"{self.runs} runs of {self.seconds:g} s",
             f"NEES of 15 states {self.nees:.2f}, at the end {self.nees_end:.2f} "
             f"(expected 15; {low:.1f} to {high:.1f} in 95 of 100 trials)",
-            f"NEES of yaw {self.yaw:.2f} (expected 1); at the end error "
+            f"NEES of yaw {self.yaw:.2f} (expected 1); error at the end "
             f"{np.degrees(self.yaw_error):.2f} deg, reported {np.degrees(self.yaw_sigma):.2f} deg",
             f"NIS {self.nis:.2f} (expected 3)",
         ]
@@ -90,23 +91,23 @@ def consistency(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Consistency:
-    """Run the filter on simulated walks whose errors are as large as it is told.
+    """Run the filter on simulated walks with errors as large as its configuration states.
 
     Args:
-        config: of the filter; the simulated IMU is as noisy as it says.
-        yaw_sigma: of the first yaw [rad].
+        config: configuration of the filter and noise of the simulated IMU.
+        yaw_sigma: standard deviation of the initial yaw [rad].
         runs: number of walks.
-        seconds: length of each [s].
-        seed: of the first run; the others follow.
+        seconds: length of each walk [s].
+        seed: seed of the first run, increased by one for each further run.
         progress: called with the share of the work done.
 
     Raises:
-        InputError: no runs, or less than two seconds.
+        InputError: there are no runs, or they are shorter than two seconds.
     """
     if runs < 1 or not seconds >= 2.0:
         raise InputError("runs, seconds", f"{runs}, {seconds:g}", "at least 1 run of 2 s")
     tables, nis = [], []
-    # The errors drawn are those that it says: there is nothing to adapt to.
+    # The errors are drawn as configured: there is nothing to adapt to.
     config = replace(config, filter=replace(config.filter, adaptive=False))
     for k in range(runs):
         table, run_nis = _run(config, yaw_sigma, seconds, seed + k)
@@ -129,13 +130,13 @@ def consistency(
 
 @dataclass(frozen=True, eq=False)
 class AnalyticWalk:
-    """A walk along a bending path with the bounce and sway of steps, by its closed form.
+    """Closed-form walk along a bending path with the bounce and sway of steps.
 
     Attributes:
-        time: (N,) [s].
-        R_WB: (N, 3, 3).
-        velocity_W: (N, 3) [m/s].
-        position_W: (N, 3) [m].
+        time: (N,) times [s].
+        R_WB: (N, 3, 3) attitude.
+        velocity_W: (N, 3) velocity [m/s].
+        position_W: (N, 3) position [m].
         gyro: (N, 3) exact rate in B [rad/s].
         accel: (N, 3) exact specific force in B [m/s^2].
     """
@@ -148,7 +149,7 @@ class AnalyticWalk:
     accel: FloatArray
 
 
-# Axis, amplitude [m], frequency [Hz] of the sines a walk's position is the sum of.
+# Axis, amplitude [m] and frequency [Hz] of the sines that add up to a walk's position.
 _SINES = (
     (0, 6.0, 0.021),
     (1, 8.0, 0.017),
@@ -160,7 +161,7 @@ _SINES = (
 
 
 def analytic_walk(seconds: float, rng: np.random.Generator, gravity: float) -> AnalyticWalk:
-    """Draw a walk: a sum of sines with random phases, differentiated by hand."""
+    """Draw a walk: a sum of sines with random phases, with its analytic derivatives."""
     t = np.arange(round(seconds * RATE) + 1) / RATE
     phase = rng.uniform(0.0, 2.0 * np.pi, 8)
     p, v, a = np.zeros((3, len(t), 3))
@@ -193,7 +194,7 @@ _VERTICAL = np.array([0.0, 0.0, 1.0])
 def _run(
     config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int
 ) -> tuple[FloatArray, float]:
-    """NEES of the states, squared yaw error and yaw variance at every second (M, 3); mean NIS."""
+    """Return NEES, squared yaw error and yaw variance (M, 3) at every second, and the mean NIS."""
     rng = np.random.default_rng(seed)
     walk = analytic_walk(seconds, rng, config.gravity)
     prior, b_g, b_a = _first_errors(walk, config, yaw_sigma, rng)
@@ -219,7 +220,7 @@ def _run(
 def _first_errors(
     walk: AnalyticWalk, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
-    """The prior of the first pose, and the true biases (N, 3)."""
+    """Draw the prior of the first pose, and return it with the true biases (N, 3)."""
     f = config.filter
     tilt, yaw, velocity, position = f.tilt_sigma, yaw_sigma, f.velocity_sigma, _POSITION_SIGMA
     theta = np.array([tilt, tilt, yaw]) * rng.normal(size=3)
@@ -241,7 +242,7 @@ def _first_errors(
 def _seen(
     walk: AnalyticWalk, interval: ImuInterval, config: NavigatorConfig, rng: np.random.Generator
 ) -> Displacement | None:
-    """The displacement of a window in its levelled frame, as wrong as its covariance says."""
+    """Draw a window's displacement in its levelled frame, with the noise the filter assumes."""
     if interval.R_NB_window is None:
         return None
     stop = round(interval.stop * RATE)
@@ -249,7 +250,7 @@ def _seen(
     d_N = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T).T @ (
         walk.position_W[stop] - walk.position_W[start]
     )
-    # The filter takes overlapping windows for less certain than each one is.
+    # The filter treats overlapping windows as less certain than each one is.
     sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
     return d_N + sigma * rng.normal(size=3), _DISPLACEMENT_SIGMA**2 * np.eye(3)
 

@@ -1,8 +1,8 @@
-"""What faults in a recording cost: the same recording run with and without each.
+"""Cost of faults in a recording: the same recording run with and without each.
 
-What a fault costs the fusion shows best
-where the displacements are the true ones under white noise of a known size; a network's own errors,
-which differ from window to window, hide it. So that is what measures unless a network is given.
+A fault's effect on the fusion shows best with true displacements under white noise of a known size;
+a network's own errors, which differ from window to window, hide it. Such displacements are used
+unless a network is given.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS
 
 WHITE_NOISE = 0.05
-"""Of the true displacements where no network measures, per axis [m]."""
+"""White noise of the true displacements used without a network, per axis [m]."""
 
 
 @dataclass(frozen=True)
 class FaultResult:
-    """What a fault cost.
+    """Cost of a fault.
 
     Attributes:
-        fault: its name.
+        fault: name of the fault.
         backend: "ekf" or "graph".
-        error_without: absolute trajectory error of the untouched recording [m].
-        error_with: of the spoilt one [m].
+        error_without: absolute trajectory error without the fault [m].
+        error_with: absolute trajectory error with it [m].
         end_error: distance from the truth at the end [m].
-        end_sigma: what the track says of it, root of the covariance's trace [m].
+        end_sigma: the track's own estimate of it, root of the covariance's trace [m].
         finite: whether every state, covariance included, is finite.
-        reported: what the health report says of it.
+        reported: what the health report states about it.
     """
 
     fault: str
@@ -62,7 +62,7 @@ class FaultResult:
 
 
 def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
-    """A simulated walk and a configuration that knows its sensor's errors as they are."""
+    """Simulate a walk, and return it with a configuration that matches its sensor's errors."""
     noise = ImuNoise()
     errors = ImuErrors(noise=noise, gyro_turn_on=5e-4, accel_turn_on=0.02)
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
@@ -89,11 +89,11 @@ def run_faults(
 
     Args:
         sequence: a recording with truth.
-        config: of the navigator.
-        model: the network; None for the true displacements under white noise.
-        seed: of the faults' draws.
-        backends: which to run.
-        only: the faults; None for all of them.
+        config: configuration of the navigator.
+        model: network; None for the true displacements under white noise.
+        seed: seed of the random faults.
+        backends: back ends to run.
+        only: faults to run; None for all of them.
 
     Raises:
         InputError: the recording has no truth, or is too short.
@@ -110,7 +110,7 @@ def run_faults(
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """The results for a person."""
+    """Return the results as text."""
     rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
@@ -121,7 +121,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
 
 
 def reported(health: Health) -> str:
-    """What a health report says of faults, in a few words."""
+    """Summarise the faults in a health report in a few words."""
     words = [f"{name} {n}" for name, n in health.samples.items() if n and name != "used"]
     words += [f"{name} {n}" for name, n in health.flagged.items() if n]
     words += [f"refused {reason} {n}" for reason, n in health.refused.items()]
@@ -150,10 +150,10 @@ def _run(
 
 
 class Silent:
-    """Stands where a network would."""
+    """Placeholder for a network."""
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Nothing, surely."""
+        """Return zero displacements with unit covariances."""
         n = len(np.asarray(windows))
         return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
 
@@ -165,17 +165,17 @@ def with_true_displacements(
     seed: int,
     noise: float = WHITE_NOISE,
 ) -> PreprocessedRecording:
-    """A prepared recording measured by its true displacements under white noise.
+    """Replace a prepared recording's measurements by its true displacements under white noise.
 
-    Like a network's they are given in each window's frame, off by the yaw of the attitude the
-    window was prepared with, and with the covariance that the filter then takes at its word.
+    Like a network's, they are given in each window's frame, rotated by the yaw of the attitude the
+    window was prepared with. Their covariance is the true one after the filter's scaling.
 
     Args:
         preprocessed: the prepared recording.
-        truth: of its poses.
-        config: of the navigator.
-        seed: of the noise; a window draws the same one whatever happened before it.
-        noise: per axis [m].
+        truth: its true poses.
+        config: configuration of the navigator.
+        seed: seed of the noise; a window's noise does not depend on what happened before it.
+        noise: standard deviation per axis [m].
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
     known = [k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None]
@@ -197,7 +197,7 @@ def with_true_displacements(
 def _corrupted(
     preprocessed: PreprocessedRecording, corrupt: Corrupt, rng: np.random.Generator
 ) -> PreprocessedRecording:
-    """What the fault makes of the measurements, all of them at once."""
+    """Apply a fault to all measurements at once."""
     known = [
         k for k, measurement in enumerate(preprocessed.measurements) if measurement is not None
     ]
@@ -230,8 +230,5 @@ def _result(
 
 
 def _error(track: Track, sequence: ImuSequence) -> float:
-    assert sequence.truth is not None  # checked at the edge
+    assert sequence.truth is not None  # checked by run_faults()
     return evaluate_track(track.trajectory, sequence.truth).ate_m
-
-
-# --- what the faults do ------------------------------------------------------------------------

@@ -1,7 +1,7 @@
-"""How honest a track is that fixes tell where it is: its error, and what it says of it.
+"""Consistency of a track with fixes: its error against its reported uncertainty.
 
-Fixes are the true positions at equal intervals with white errors. Counted is the second half of
-each track: by then several fixes have told the direction.
+Fixes are the true positions at equal intervals with white errors. Only the second half of each
+track counts: by then several fixes have determined the direction.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 
 _FEWEST = 4
-"""Fixes that a track is judged with, at least."""
+"""Minimum number of fixes for a track to be evaluated."""
 
 
 @dataclass(frozen=True)
 class FixedTrack:
-    """One recording with fixes.
+    """Errors of one recording with fixes.
 
     Attributes:
-        recording: its name.
-        group: that it is counted in.
-        applied: share of the fixes that were taken in.
-        position_rms: horizontal [m].
-        position_nees: median; 2.4 is expected of three axes.
-        yaw_rms: [rad].
-        yaw_nees: mean; 1 is expected.
-        yaw_covered: share of the poses whose yaw is within three deviations.
+        recording: name of the recording.
+        group: group that it is counted in.
+        applied: share of the fixes that were applied.
+        position_rms: horizontal position error, root mean square [m].
+        position_nees: median NEES of position; 2.4 is expected for three axes.
+        yaw_rms: yaw error, root mean square [rad].
+        yaw_nees: mean NEES of yaw; 1 is expected.
+        yaw_covered: share of the poses whose yaw error is within three standard deviations.
     """
 
     recording: str
@@ -54,7 +54,7 @@ class FixedTrack:
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
-    """Positions of the truth, `every` seconds one, with errors of `sigma` [m] per axis."""
+    """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
     at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
     noise = np.random.default_rng(seed).normal(0.0, sigma, (len(at.time), 3))
     covariance = sigma**2 * np.eye(3)
@@ -75,10 +75,10 @@ def fixed_track(
     backend: BackendName = "ekf",
     seed: int = 0,
 ) -> FixedTrack:
-    """Run a recording with fixes.
+    """Run a recording with fixes and evaluate its track.
 
     Raises:
-        InputError: it has no poses as truth, too few fixes fit in, or it cannot be run.
+        InputError: it has no true poses, is too short for enough fixes, or cannot be run.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses")
@@ -106,8 +106,8 @@ def fixed_track(
 
 
 def fixed_table(found: Sequence[FixedTrack]) -> str:
-    """A row for each group: medians of its recordings, and how often the yaw is covered."""
-    head = ["group", "n", "fixes taken", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
+    """Return a row for each group: medians of its recordings, and how often yaw is covered."""
+    head = ["group", "n", "fixes applied", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
     rows = [head]
     for group, part in by_group(found):
         rows.append(
@@ -120,5 +120,5 @@ def fixed_table(found: Sequence[FixedTrack]) -> str:
                 f"{np.mean([one.yaw_covered for one in part]):.1%}",
             ]
         )
-    words = "second half of each track; NEES of position: median, 2.4 expected; of yaw: mean, 1"
+    words = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
     return "\n".join([*aligned(rows), words])

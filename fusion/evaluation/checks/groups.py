@@ -1,4 +1,4 @@
-"""Results of recordings by the groups they are counted in."""
+"""Grouping of the results of recordings."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ class Grouped(Protocol):
 
     @property
     def group(self) -> str:
-        """Its name."""
+        """Name of the group."""
 
 
 Result = TypeVar("Result", bound=Grouped)
 
 
 def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:
-    """Each group with its results, in order of their names; more than one also all together."""
+    """Return each group with its results, sorted by name; several are followed by all together."""
     groups = sorted({one.group for one in found})
     parts = [(group, [one for one in found if one.group == group]) for group in groups]
     return [*parts, ("all", list(found))] if len(groups) > 1 else parts

@@ -1,7 +1,7 @@
-"""How far a track's end moves where samples are missing: what is given out must not hang on a hair.
+"""How far a track's end moves if samples are missing: results must not depend on a few samples.
 
-A recording is run as it is, with a short gap at each of several instants, and with samples dropped
-at random; both tracks begin in the same pose, so their ends are compared as they stand.
+A recording is run unmodified, with a short gap at each of several instants, and with samples
+dropped at random; all tracks begin in the same pose, so their ends are compared without alignment.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ GAP_SECONDS, DROPPED = 0.1, 0.05
 """Length of a gap [s], and the share of samples that is dropped."""
 
 INSTANTS = 6
-"""At which a gap is put, one after the other."""
+"""Number of instants for a gap, one gap per run."""
 
 MOST_METRES, MOST_DEGREES = 0.01, 3.0
-"""By which the end should move at most: of a metre per metre of the path, and in yaw."""
+"""Maximum acceptable shift of the end: in metres per metre of the path, and in yaw."""
 
 _SHORTEST_PATH = 1.0
-"""A track that goes nowhere has no path to count by [m]."""
+"""Minimum path [m]: shifts are relative to the path."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """The end of a track with samples missing against that without.
+    """Shift of a track's end caused by missing samples.
 
     Attributes:
-        recording: its name.
-        group: that it is counted in.
+        recording: name of the recording.
+        group: group that it is counted in.
         fault: what was missing.
-        metres: horizontal distance of the ends over the length of the track.
-        degrees: difference of their yaws.
+        metres: horizontal distance between the ends over the length of the track.
+        degrees: difference of their yaws [deg].
     """
 
     recording: str
@@ -64,7 +64,7 @@ def moved_ends(
     backend: BackendName = "ekf",
     seed: int = 0,
 ) -> list[Moved]:
-    """Of a recording with each of the faults.
+    """Run a recording with each of the faults and return the shifts of its end.
 
     Raises:
         InputError: the recording cannot be run, or its track is shorter than a metre.
@@ -77,7 +77,7 @@ def moved_ends(
     steps = np.diff(whole.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())
     if path < _SHORTEST_PATH:
-        raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "one of a metre and more")
+        raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
     faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
@@ -96,7 +96,7 @@ def _between(whole: Track, other: Track, path: float) -> tuple[float, float]:
 
 
 def moved_table(found: Sequence[Moved]) -> str:
-    """A row for each group: how many ends stay, and how far the others go."""
+    """Return a row for each group: how many ends stay within limits, and how far ends move."""
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
     for group, part in by_group(found):

@@ -1,4 +1,4 @@
-"""Speed of the whole: filter, network and run, medians and ratios from one run of the benchmark."""
+"""Speed of filter, network and whole run: medians and ratios from one run of the benchmark."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RUNS = 5
 
 
 def speed_report(model: DisplacementModel) -> dict[str, Any]:
-    """Seconds per minute of data and milliseconds per window; medians of interleaved runs."""
+    """Measure s per minute of data and ms per window, as medians of interleaved runs."""
     engine = filter_speed()
     sequence = demonstration()
     minutes = sequence.duration / 60.0
@@ -56,7 +56,7 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
 
 
 def windows_speed(seconds: float = 600.0) -> dict[str, float]:
-    """Seconds per hour of data to read windows for training from a CSV, and from the cache."""
+    """Time reading training windows from a CSV and from the cache, in s per hour of data."""
     sequence = simulate_imu(generate_walk(DEMONSTRATION_SEED, seconds), 200.0, PHONE_IMU)
     hours = sequence.duration / 3600.0
     with tempfile.TemporaryDirectory() as name:
@@ -73,7 +73,7 @@ def windows_speed(seconds: float = 600.0) -> dict[str, float]:
 
 
 def push_speed(model: DisplacementModel) -> dict[str, float]:
-    """Microseconds of one `push` in a stream: without a state (median), with a network update."""
+    """Time one `push` [us]: without a state (median), with a network update (99th percentile)."""
     sequence = demonstration()
     navigator = Navigator(model, NavigatorConfig())
     plain, with_update = [], []
@@ -95,12 +95,12 @@ def push_speed(model: DisplacementModel) -> dict[str, float]:
 
 
 def speed_table(report: dict[str, Any]) -> str:
-    """The report for a person."""
+    """Return the report as text."""
     lines = [
         f"filter, 20 updates/s, preintegration included: "
         f"{report['filter_s_per_min_20_hz']:.3f} s/min",
         f"its engine alone: {report['filter_engine_s_per_min_20_hz']:.3f} s/min",
-        f"the same through filterpy's dense algebra: "
+        f"the same with filterpy's dense algebra: "
         f"{report['filter_engine_dense_s_per_min_20_hz']:.3f} s/min "
         f"({report['filter_engine_ratio']:.1f} times slower)",
         f"whole run at {report['update_rate_hz']} updates/s: {report['run_s_per_min']:.3f} s/min, "
@@ -111,7 +111,7 @@ def speed_table(report: dict[str, Any]) -> str:
         f"{report['windows_cached_s_per_hour']:.3f} s from the cache, one process"
     )
     lines.append(
-        f"push: {report['push_us_median']:.1f} us in the median, "
+        f"push: {report['push_us_median']:.1f} us (median), "
         f"{report['push_us_with_update_p99'] / 1e3:.1f} ms with a network update (99th percentile)"
     )
     lines += [

@@ -1,4 +1,4 @@
-"""Faults to put into a recording: each changes the samples, or what is measured of them."""
+"""Faults to put into a recording: each changes its samples or its measured displacements."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 
 Spoil = Callable[[ImuSequence, np.random.Generator], ImuSequence]
 Corrupt = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
-"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place, given the share (M,) of
-the windows that are over at each one's end."""
+"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place; the first argument is
+the share (M,) of all windows that are complete at each one's end."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """A fault.
 
     Attributes:
-        name: in the table.
-        spoil: what it does to the recording.
-        corrupt: what it does to the network's answers.
+        name: name in the table.
+        spoil: change to the recording.
+        corrupt: change to the network's predictions.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Fault:
 
 
 def faults(duration: float) -> list[Fault]:
-    """Every fault of the table, for a recording that long [s]."""
+    """Return every fault of the table, for a recording of this duration [s]."""
     half = 0.5 * duration
     return [
         Fault("none"),
@@ -96,7 +96,7 @@ def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
 
 
 def gap(start: float, seconds: float) -> Spoil:
-    """No sample for so long, from an instant after the first sample [s]."""
+    """Remove `seconds` of samples, from `start` seconds after the first sample on."""
 
     def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         since = sequence.time - sequence.time[0] - start
@@ -106,7 +106,7 @@ def gap(start: float, seconds: float) -> Spoil:
 
 
 def drops(share: float) -> Spoil:
-    """A share of the samples missing, at random."""
+    """Remove a share of the samples at random."""
     return lambda sequence, rng: _kept(sequence, rng.random(len(sequence)) >= share)
 
 

@@ -1,7 +1,7 @@
-"""What the fusion is worth: the filter's and the graph's error against the network's, by group.
+"""Benefit of the fusion: the filter's and the graph's error relative to the network's, by group.
 
-The network alone is chained along the attitude levelled from the IMU. Errors are horizontal,
-root mean square after a fit of yaw and position: over all poses, or at the waypoints.
+The network's displacements are chained along the attitude levelled from the IMU. Errors are
+horizontal, root mean square after a fit of yaw and position: over all poses, or at the waypoints.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 LEAST_SIGMA = 3.0
-"""Deviations that an honest yaw error stays within."""
+"""Number of standard deviations that the yaw error of a consistent track stays within."""
 
 GOOD_YAW = math.radians(10.0)
-"""What the yaw at the end should be within [rad]."""
+"""Maximum acceptable yaw error at the end [rad]."""
 
 
 @dataclass(frozen=True)
 class Worth:
-    """One recording.
+    """Errors of one recording with and without the fusion.
 
     Attributes:
-        recording: its name.
-        group: that it is counted in.
+        recording: name of the recording.
+        group: group that it is counted in.
         network_m: error of the network alone [m].
-        fused_m: by back end [m].
-        nis: the filter's mean; 3 is expected.
-        position_nees: the first back end's median; 2.4 is expected of three axes, nan without true
-            attitude.
-        yaw_error: the filter's, at the end against the start [rad]; nan without true attitude.
-        yaw_sigma: what it says of it [rad].
+        fused_m: error by back end [m].
+        nis: mean NIS of the first back end; 3 is expected.
+        position_nees: median NEES of the first back end's position; 2.4 is expected for three axes,
+            nan without true attitude.
+        yaw_error: its yaw error at the end relative to the start [rad]; nan without true attitude.
+        yaw_sigma: reported standard deviation of this yaw [rad].
     """
 
     recording: str
@@ -70,7 +70,7 @@ def worth_of(
     """Run a recording through the network alone and the back ends.
 
     Raises:
-        InputError: nothing or too little is known of where it led, or it cannot be run.
+        InputError: it has no ground truth or too few known positions, or cannot be run.
     """
     known: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
     if known is None:
@@ -99,7 +99,7 @@ def worth_of(
 
 
 def worth_table(found: Sequence[Worth]) -> str:
-    """A row for each group: ratios to the network, NIS, and the yaw at the end."""
+    """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
     names = list(found[0].fused_m) if found else []
     head = ["group", "n", "network"]
     for name in names:
@@ -110,7 +110,7 @@ def worth_table(found: Sequence[Worth]) -> str:
     words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
     more = (
         "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
-        "against that at the start"
+        "relative to the start"
     )
     return "\n".join([*aligned(rows), words, more])
 
@@ -133,7 +133,7 @@ def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
 
 
 def _error(track: Track, known: Trajectory | PositionTrack) -> float:
-    """Horizontal, after a fit of yaw and position [m]."""
+    """Return the horizontal error after a fit of yaw and position [m]."""
     if isinstance(known, Trajectory):
         return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
     return position_error(track, known)[0]

@@ -1,1 +1,1 @@
-"""Networks alone judged by groups of recordings."""
+"""Judging: evaluation of networks alone, by groups of recordings."""

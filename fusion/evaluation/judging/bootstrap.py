@@ -1,8 +1,9 @@
-"""Confidence of a paired ratio of errors: groups, recordings and blocks drawn with replacement.
+"""Confidence interval of a paired ratio of errors, by a hierarchical bootstrap.
 
-Errors within a recording, a person or a place are alike, so that counting windows would make any
-difference look certain. The hierarchical bootstrap (Davison, Hinkley: Bootstrap Methods and their
-Application, 1997, section 3.8) draws groups, then recordings in each, then blocks of 30 s in each.
+Errors within a recording, a person or a place are correlated: treating windows as independent would
+make any difference look certain. The hierarchical bootstrap (Davison, Hinkley: Bootstrap Methods
+and their Application, 1997, section 3.8) draws groups, then recordings in each group, then blocks
+of 30 s in each recording, all with replacement.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ REPLICATES = 1000
 CONFIDENCE = 0.95
 
 Blocks = tuple[FloatArray, FloatArray]
-"""Sums of squared errors of one recording's blocks (B,): ours, theirs."""
+"""Sums of squared errors of one recording's blocks: ours (B,), and theirs, the baseline's (B,)."""
 
 Groups = Mapping[str, Sequence[Blocks]]
-"""The recordings of each group."""
+"""Recordings of each group."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class Interval:
 
 
 def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None:
-    """Ratio of errors over groups that count alike, within strata that count alike.
+    """Return the mean ratio of errors over equally weighted strata of equally weighted groups.
 
     Args:
-        strata: by name (a data set, say), the groups in each; the strata are not drawn.
-        seed: of the drawing.
+        strata: groups by stratum name (a data set, for example); strata are not resampled.
+        seed: seed of the resampling.
 
     Returns:
-        None where there is no recording.
+        The ratio and its interval; None if there is no recording.
     """
     rng = np.random.default_rng(seed)
     known = [drawn for groups in strata.values() if (drawn := _stratum(groups, rng)) is not None]
@@ -55,7 +56,7 @@ def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None
 
 
 def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray] | None:
-    """Mean log ratio over groups, and that of every replicate (R,)."""
+    """Return the mean log ratio over groups, and its replicates (R,)."""
     known = [_group(recordings, rng) for recordings in groups.values() if recordings]
     if not known:
         return None
@@ -70,12 +71,12 @@ def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[floa
 
 
 def _recording(ours: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Log ratio (R,) of a recording whose blocks are drawn with replacement."""
+    """Return log ratios (R,) of a recording, its blocks drawn with replacement."""
     rows = rng.integers(len(ours), size=(REPLICATES, len(ours)))
     return np.asarray(0.5 * np.log(ours[rows].sum(axis=1) / theirs[rows].sum(axis=1)))
 
 
 def _means_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """For each replicate, the mean of as many members (n, R) drawn with replacement."""
+    """Return for each replicate the mean of n members drawn from values (n, R) with replacement."""
     rows = rng.integers(len(values), size=values.shape)
     return np.asarray(np.take_along_axis(values, rows, axis=0).mean(axis=0))

@@ -1,12 +1,13 @@
-"""Whether a network walks where the accelerometer says that the device moves.
+"""Check of the direction of a network's displacements against the accelerometer.
 
-Truth without attitude cannot tell: a track that is fitted in yaw looks the same walked backwards.
-The mean velocities of two seconds in a row differ by a_k, the integral of w(t) a(t), w rising from
-0 to 1 and falling again, a the specific force without gravity; the network's displacements d must
-differ alike. The angle of sum conj(d_k+2 - d_k) (a_k + a_k+1), horizontal vectors as complex
-numbers, is what the network is turned by. Over two seconds, because from one to the next a walk
-sways with its steps: a network that tells the sway rightly and walks backwards passes there.
-Bias and tilt hardly change within 20 s and are taken out by the mean.
+Ground truth without attitude cannot reveal a wrong direction: after a fit in yaw, a track walked
+backwards looks the same. The mean velocities of two consecutive seconds differ by a_k, the integral
+of w(t) a(t), where w rises from 0 to 1 and falls again and a is the specific force without gravity;
+the network's displacements d must differ by the same. With horizontal vectors as complex numbers,
+the angle of sum conj(d_k+2 - d_k) (a_k + a_k+1) is the yaw from the network's direction to the
+accelerometer's. Differences span two seconds because a walk sways with its steps from one second to
+the next: a network that predicts the sway correctly but walks backwards passes a check over one
+second. Bias and tilt errors hardly change within 20 s and are removed with the mean.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ Complex = np.ndarray[Any, np.dtype[np.complex128]]
 
 @dataclass(frozen=True)
 class Direction:
-    """Sums over changes of velocity; those of several stretches add up.
+    """Sums over changes of velocity; the sums of several stretches can be added.
 
     Attributes:
-        product: of the network's, conjugate, and the accelerometer's [m^2/s^2].
-        network: squares of the network's [m^2/s^2].
-        accelerometer: squares of the accelerometer's [m^2/s^2].
-        count: changes that do not overlap.
+        product: sum of the network's conjugate changes times the accelerometer's [m^2/s^2].
+        network: sum of squares of the network's changes [m^2/s^2].
+        accelerometer: sum of squares of the accelerometer's changes [m^2/s^2].
+        count: number of changes that do not overlap.
     """
 
     product: complex = 0.0
@@ -53,12 +54,12 @@ class Direction:
 
     @property
     def turn(self) -> float:
-        """Yaw from the network to the accelerometer [rad]; nan where nothing moves."""
+        """Yaw from the network's direction to the accelerometer's [rad]; nan without motion."""
         return math.atan2(self.product.imag, self.product.real) if self.product else math.nan
 
     @property
     def sigma(self) -> float:
-        """Deviation of the turn [rad], as of a slope by its coherence; at most pi."""
+        """Standard deviation of `turn` [rad], as of a slope given its coherence; maximum pi."""
         both = self.network * self.accelerometer
         coherence = abs(self.product) ** 2 / both if both else 0.0
         if coherence == 0.0 or self.count < 1.0:
@@ -67,11 +68,11 @@ class Direction:
 
 
 def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
-    """Of a network's answers along a stretch.
+    """Compare the direction of a network's displacements along a stretch with the accelerometer's.
 
     Args:
-        stream: the IMU in N.
-        displacement_N: (M, 3) over the second from each tick [m].
+        stream: IMU in N.
+        displacement_N: (M, 3) displacements over the second from each tick [m].
     """
     accel_N = stream.windows()[:, 3:5].astype(np.float64)
     if len(accel_N) <= 3 * _SECOND:
@@ -80,12 +81,12 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
     told = told[:-_SECOND] + told[_SECOND:]
     moved = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
     a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
-    apart = len(d) / (3.0 * _SECOND)  # a change takes three seconds
+    apart = len(d) / (3.0 * _SECOND)  # a change spans three seconds
     return Direction(complex(np.vdot(d, a)), _square(d), _square(a), apart)
 
 
 def _without_slow(changes: Any) -> Complex:
-    """Less their mean over each 20 s."""
+    """Subtract the mean of each 20 s."""
     parts = np.array_split(changes, max(1, len(changes) // _STRETCH))
     return np.concatenate([part - part.mean() for part in parts])
 

@@ -1,14 +1,14 @@
-"""Errors of a network alone on one recording, whatever kind of truth it has.
+"""Errors of a network alone on one recording, for any kind of ground truth.
 
-All positions are horizontal and written x + iy. The track lives in N, whose yaw against the world
-is unknown; what is done about it depends on the truth:
+All positions are horizontal and written x + iy. The track lives in N, whose yaw relative to the
+world is unknown; how it is resolved depends on the truth:
 
-- poses: displacements over a horizon are turned by the true yaw at the horizon's start; the track
-  as a whole is fitted in yaw and position, or set on the first pose.
-- positions: the yaw is fitted over the stretch of 20 s (or the horizon, if longer) from the start.
+- poses: displacements over a horizon are rotated by the true yaw at the horizon's start; the track
+  as a whole is fitted in yaw and position, or aligned with the first pose.
+- positions: the yaw is fitted over 20 s (or the horizon, if longer) from the displacement's start.
 - waypoints: the track is fitted to all waypoints in yaw and position.
 
-A displacement is compared where the truth has neither gap nor jump between its ends.
+A displacement is compared only if the truth has neither gap nor jump between its ends.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
 
 BLOCK_SECONDS = 30.0
-"""Errors are summed by blocks of this length, for the bootstrap."""
+"""Length of the blocks over which errors are summed for the bootstrap."""
 
 STRETCH_SECONDS = 20
-"""Length of the stretches of which `stretch_percent` is the error."""
+"""Length of the stretches over which `stretch_percent` is computed."""
 
 _LEAST_PAIRS = 20
-"""Displacements of which a recording's error over a horizon is told."""
+"""Minimum number of displacements for a piece to count in the error over a horizon."""
 
 _LEG = round(2.0 / TICK_SECONDS)
 
@@ -42,24 +42,24 @@ Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 
 FIGURES = {
     "ate_fit_m": "root mean square of the horizontal position error after a fit in yaw and position"
-    " [m]; of waypoints, at the waypoints",
-    "ate_fit_percent": "the same in % of the true path",
-    "ate_first_m": "the same with yaw and position of the first pose [m]",
+    " [m]; for waypoints, the error at the waypoints",
+    "ate_fit_percent": "the same in % of the true path length",
+    "ate_first_m": "the same after alignment by yaw and position of the first pose [m]",
     "length_ratio": "length of the track over that of the truth, along legs of 2 s or between "
     "waypoints",
-    "rms_1s_m": "root mean square of the displacement's error over 1 s [m]",
-    "rms_10s_m": "over 10 s [m]",
-    "rms_30s_m": "over 30 s [m]",
-    "stretch_percent": "position error within stretches of 20 s, each fitted in yaw and position, "
-    "root mean square, in % of the path",
-    "direction_deg": "yaw between the displacements and what the accelerometer says of them, its "
-    "size [deg]: no other figure shows whether waypoints are walked backwards; on a walk of a "
-    "minute of constant speed it is only known to some 30 degrees",
+    "rms_1s_m": "root mean square error of displacements over 1 s [m]",
+    "rms_10s_m": "the same over 10 s [m]",
+    "rms_30s_m": "the same over 30 s [m]",
+    "stretch_percent": "root mean square position error within stretches of 20 s, each fitted in "
+    "yaw and position, in % of the stretch's path",
+    "direction_deg": "absolute yaw between the directions of the displacements and of the "
+    "accelerometer [deg]: the only figure that shows whether waypoints are walked backwards; on a "
+    "one-minute walk at constant speed it is accurate to only about 30 degrees",
     "nis": "mean of error^T covariance^-1 error of single windows, scaled to three axes "
     "(expected: 3)",
-    "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), where it was asked for",
+    "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), if requested",
 }
-"""Figures of a recording; nan where its kind of truth does not give one."""
+"""Figures of a recording and their meaning; nan if its kind of truth does not provide one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +67,12 @@ class RecordingErrors:
     """Errors of one network on one recording.
 
     Attributes:
-        name: the recording's.
-        kind: of its truth.
+        name: name of the recording.
+        kind: kind of its ground truth.
         path_m: length of the true path that was compared [m].
-        figures: as `FIGURES`.
-        blocks: by horizon ("1", "10", "30" s), (B, 2): sum of squared errors [m^2] and how many
-            they are, for each block of 30 s. Of waypoints the residuals stand in for 10 s.
+        figures: figures by name, see `FIGURES`.
+        blocks: (B, 2) arrays by horizon ("1", "10", "30" s): sum of squared errors [m^2] and number
+            of errors in each block of 30 s. For waypoints, their residuals are listed under "10".
     """
 
     name: str
@@ -84,7 +84,7 @@ class RecordingErrors:
 
 @dataclass(eq=False)
 class _Sums:
-    """What the pieces of a recording add up to."""
+    """Sums over the pieces of a recording."""
 
     squares: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     path: float = 0.0
@@ -100,7 +100,7 @@ class _Sums:
         return float(np.sqrt(total / count)) if count else float("nan")
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
-        """Errors (K,) by start tick, nan where not known."""
+        """Add errors (K,) by start tick, nan where unknown."""
         if np.isfinite(errors).sum() < _LEAST_PAIRS:
             return
         self.add(measure, errors)
@@ -113,11 +113,11 @@ class _Sums:
 
 
 def recording_errors(prepared: Prepared, found: Sequence[Answers]) -> RecordingErrors:
-    """Errors of a network's answers on a recording.
+    """Compute the errors of a network's predictions on a recording.
 
     Args:
         prepared: the recording.
-        found: answers on each of its pieces.
+        found: predictions on each of its pieces.
     """
     sums = _Sums()
     judge = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
@@ -201,14 +201,14 @@ def _waypoints(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
 
 
 def _at_ticks(piece: PreparedPiece, answer: Answers) -> tuple[Complex, Complex, np.ndarray]:
-    """Track, truth and its breaks at the ticks that all of them have."""
+    """Return track, truth and its breaks at the ticks common to all."""
     track = answer.track()
     count = min(len(track), len(piece.position_W))
     return track[:count], piece.position_W[:count], piece.breaks[:count]
 
 
 def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
-    """A track (n,) moved onto the truth (n,) by the yaw and position of least squared error."""
+    """Fit a track (n,) to the truth (n,) by least squares in yaw and position."""
     centre, target = track.mean(), truth.mean()
     turn = np.vdot(track - centre, truth - target)
     return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
@@ -217,7 +217,7 @@ def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
 def _displacements(
     track: Complex, truth: Complex, breaks: np.ndarray, seconds: int
 ) -> tuple[Complex, Complex, np.ndarray]:
-    """Displacements of track and truth over a span, and the ticks (n,) that they start at."""
+    """Return displacements of track and truth over a span, and the ticks (n,) they start at."""
     span = round(seconds / TICK_SECONDS)
     if span >= len(track):
         none = np.empty(0, dtype=complex)
@@ -227,7 +227,7 @@ def _displacements(
 
 
 def _unbroken(truth: Complex, breaks: np.ndarray, span: int) -> BoolArray:
-    """Which ticks (n - span,) see neither gap nor jump over the next `span` ticks."""
+    """Return at which ticks (n - span,) the next `span` ticks contain neither gap nor jump."""
     ends = np.isfinite(truth[:-span]) & np.isfinite(truth[span:])
     return np.asarray(ends & (breaks[:-span] == breaks[span:]))
 
@@ -240,7 +240,7 @@ def _lengths(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) ->
 
 
 def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, seconds: int) -> Complex:
-    """exp(i yaw) that fits the legs of the stretch from each tick best (n,); nan where broken."""
+    """Return exp(i yaw) (n,) that best fits the legs from each tick on; nan if broken."""
     span = round(seconds / TICK_SECONDS)
     turn = np.full(len(track), complex(np.nan, np.nan))
     if span >= len(track):
@@ -253,7 +253,7 @@ def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, secon
 
 
 def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
-    """Share of the path [1] that stretches are off after a fit of each; half overlapping."""
+    """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
     if span >= len(track):
         return
@@ -263,14 +263,14 @@ def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) 
             continue
         part = slice(start, start + span + 1)
         path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
-        if path < 5.0:  # stands: there is no path to be a share of
+        if path < 5.0:  # stationary: there is no path to relate errors to
             continue
         errors = np.abs(fit_yaw_and_position(track[part], truth[part]) - truth[part])
         sums.add("stretch", errors / path)
 
 
 def _nis(answer: Answers, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
-    """Horizontal error against the covariance, scaled from two axes to three."""
+    """Add the NIS of the horizontal error, scaled from two axes to three."""
     error = _windows_xy(answer)[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
     covariance = answer.covariance_N[start, :2, :2]

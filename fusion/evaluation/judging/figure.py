@@ -1,4 +1,4 @@
-"""Error by group, before and after, and how sure the difference is."""
+"""Figure of the errors by group, before and after, with the interval of their ratio."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PANELS = (
 
 
 def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
-    """A line for each group: medians of both weights, and the paired ratio with its interval."""
+    """Draw a line for each group: medians of both weights, paired ratio with its interval."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,7 +1,7 @@
-"""Networks alone judged by groups of recordings: sets, people, devices, places.
+"""Evaluation of networks alone by groups of recordings: sets, people, devices, places.
 
-Each recording is prepared once and shown to every network. `displacement_error`
-says what is measured, `bootstrap` how sure it is.
+Each recording is prepared once and run through every network. `displacement_error` defines the
+errors, `bootstrap` the confidence intervals.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from stario.sequences.sequence import ImuSequence
 By = Literal["set", "group", "person", "device", "place", "carry"]
 
 POOLED = "all"
-"""Name of the row over all sets, each counting alike; a group may be called so, too."""
+"""Name of the row over all sets, equally weighted; a group may have this name, too."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """One recording under every set of weights.
+    """Errors of one recording for every set of weights.
 
     Attributes:
-        path: of the recording.
-        labels: set, group, person, device, place, carry.
-        errors: by the name of the weights.
+        path: path of the recording.
+        labels: its set, group, person, device, place and carry.
+        errors: errors by name of the weights.
     """
 
     path: Path
@@ -55,13 +55,13 @@ class Row:
     """A group of recordings.
 
     Attributes:
-        name: of the group, or `POOLED`.
-        recordings: how many could be compared: fewer than three waypoints tell nothing.
-        path_km: their true paths together.
-        medians: over recordings by the name of the weights and by figure.
-        ratios: of errors over 1, 10 and 30 s, ours over theirs, by figure; without weights to
-            compare with empty. Of waypoints the residuals stand in for 10 s.
-        pooled: whether it is over all groups.
+        name: name of the group, or `POOLED`.
+        recordings: number of recordings compared; those with fewer than three waypoints are not.
+        path_km: total length of their true paths.
+        medians: medians over recordings, by name of the weights and by figure.
+        ratios: ratios of errors over 1, 10 and 30 s, ours over theirs, by figure; empty without
+            weights to compare with. For waypoints, the residuals replace the 10 s errors.
+        pooled: whether the row covers all groups.
     """
 
     name: str
@@ -73,10 +73,10 @@ class Row:
 
 
 def check_by(name: str) -> By:
-    """A word as what to group by.
+    """Check that a name is a known grouping, and return it.
 
     Raises:
-        InputError: there is no such grouping.
+        InputError: the name is not one of `By`.
     """
     if name in get_args(By):
         return cast(By, name)
@@ -90,14 +90,14 @@ def judge(
     read: Callable[[Path], ImuSequence] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[Judged], list[Skipped]]:
-    """Show every recording to every network.
+    """Run every recording through every network.
 
     Args:
-        recordings: prepared, or why not.
-        models: by the name of the weights, the network for a group: another for each group where
-            each was left out of training in turn.
-        groups: of each recording's path; the set's name where none is known.
-        read: how a path is read, for the EKF, whose mean NIS is then told as well; slow.
+        recordings: prepared recordings, and those skipped.
+        models: by name of the weights, a function that returns the network for a group: networks
+            differ between groups if each group was held out of training in turn.
+        groups: group of each recording, by path; the name of the set where missing.
+        read: function that reads a path; if given, the EKF is run for its mean NIS, which is slow.
         progress: called with the number of recordings done.
     """
     judged: list[Judged] = []
@@ -130,13 +130,13 @@ def _errors(
 
 
 def rows_of(judged: Sequence[Judged], by: By, ours: str, theirs: str | None) -> list[Row]:
-    """A row for each group, sorted, and one over all.
+    """Return a row for each group, sorted, and one over all if there are several.
 
     Args:
         judged: the recordings.
-        by: what they are grouped by.
-        ours: weights that are judged.
-        theirs: weights that they are compared with, if any.
+        by: label to group them by.
+        ours: name of the weights under evaluation.
+        theirs: name of the weights to compare them with, if any.
     """
     names = sorted({one.labels[by] for one in judged})
     parts = [(name, [one for one in judged if one.labels[by] == name]) for name in names]
@@ -176,14 +176,15 @@ def _strata(
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
-    """What a recording is grouped by; its set is its archive's name, or that of its folder.
+    """Return the labels that a recording can be grouped by.
 
-    OxIOD keeps each form of a recording in a folder of that name, `syn`.
+    Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
+    folders by the form of their data: `syn` counts as `oxiod`.
 
     Args:
-        path: of the recording.
-        attributes: of the recording.
-        group: from a list; empty where none is named.
+        path: path of the recording.
+        attributes: attributes of the recording.
+        group: group from a list; empty if none is given.
     """
     file, member = split_name(path)
     folder = "oxiod" if file.parent.name == "syn" else file.parent.name

@@ -1,7 +1,7 @@
 """The network alone: displacements along the IMU's own levelled attitude, and their track.
 
 Windows overlap by half: each contributes the mean velocity over its second, and the velocity
-between two ticks is the mean of the windows that cover it.
+between two ticks is the mean over the windows that cover them.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
-"""Windows that begin within the length of one."""
+"""Number of windows that begin within the length of one."""
 
 _BATCH = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What a network says on the M windows of a piece.
+    """Predictions of a network for the M windows of a piece.
 
     Attributes:
-        displacement_N: (M, 3) [m] over the second from tick m.
-        covariance_N: (M, 3, 3) [m^2].
+        displacement_N: (M, 3) displacement over the second from tick m [m].
+        covariance_N: (M, 3, 3) covariance [m^2].
     """
 
     displacement_N: FloatArray
     covariance_N: FloatArray
 
     def track(self) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
-        """Horizontal position x + iy (M + 2,) [m] at the ticks from 0 at the first."""
+        """Return the horizontal position x + iy (M + 2,) [m] at the ticks, 0 at the first."""
         steps = (self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1]) / UPDATES
         cells = len(steps) + UPDATES - 1
         total, count = np.zeros(cells, dtype=complex), np.zeros(cells)
@@ -48,18 +48,18 @@ class Answers:
 
 @runtime_checkable
 class Answering(Protocol):
-    """What answers on a whole recording by itself, without a network."""
+    """Predictor of a whole recording that needs no network."""
 
     def answers(self, prepared: Prepared) -> list[Answers]:
-        """Answers on every piece, in the frame N."""
+        """Return predictions for every piece, in frame N."""
         ...
 
 
 def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
-    """A network's answers on every piece of a recording, in the frame N.
+    """Return a network's predictions for every piece of a recording, in frame N.
 
     Args:
-        model: may remember; its memory begins anew at every piece.
+        model: network, its memory reset at every piece; or another predictor.
         prepared: the recording.
     """
     if isinstance(model, Answering):
@@ -68,7 +68,7 @@ def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
 
 
 def along(model: Predictor, stream: LevelledStream) -> Answers:
-    """A network's answers on an unbroken stretch, in the frame N."""
+    """Return a network's predictions along an unbroken stretch, in frame N."""
     network = StatefulInference(model, UPDATES)
     windows, heading = stream.windows(), stream.headings
     parts = [

@@ -1,4 +1,4 @@
-"""Recordings prepared for judging networks: windows and truth at ticks, made once and kept on disk.
+"""Recordings prepared for judging networks: windows and ground truth at ticks, cached on disk.
 
 Everything here depends on the recording alone, so several sets of weights share it, and a second
 call finds it in the cache.
@@ -56,16 +56,16 @@ _ARRAYS = (
 
 @dataclass(frozen=True, eq=False)
 class PreparedPiece:
-    """An unbroken stretch of a recording with what is known of its truth at the stream's K ticks.
+    """An unbroken stretch of a recording with its known truth at the stream's K ticks.
 
     Attributes:
-        stream: the IMU, levelled by itself.
+        stream: IMU, levelled without the truth.
         position_W: (K,) horizontal position x + iy [m]; nan where unknown, and for waypoints.
-        breaks: (K,) gaps and jumps of the truth before each tick: a displacement between two
-            ticks is known where they have seen as many.
-        yaw_WN: (K,) yaw [rad] that turns N to the true world; nan where no attitude is known.
-        waypoint_time: (W,) [s].
-        waypoint_W: (W,) position x + iy [m] at those times.
+        breaks: (K,) number of gaps and jumps of the truth before each tick: a displacement between
+            two ticks is known if both have the same number.
+        yaw_WN: (K,) yaw [rad] that rotates N to the true world; nan where the attitude is unknown.
+        waypoint_time: (W,) times of the waypoints [s].
+        waypoint_W: (W,) positions x + iy of the waypoints [m].
     """
 
     stream: LevelledStream
@@ -78,13 +78,13 @@ class PreparedPiece:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A recording ready to judge networks by.
+    """A recording prepared for judging networks.
 
     Attributes:
-        path: as it was named.
-        name: the recording's.
-        kind: of its truth.
-        attributes: person, device, place and the like, where known.
+        path: path as given.
+        name: name of the recording.
+        kind: kind of its ground truth.
+        attributes: person, device, place and similar, where known.
         pieces: its unbroken stretches.
     """
 
@@ -96,10 +96,10 @@ class Prepared:
 
 
 def prepare(sequence: ImuSequence, path: Path) -> Prepared:
-    """Level a recording and bring its truth to the ticks.
+    """Level a recording and resample its truth at the ticks.
 
     Raises:
-        InputError: there is no truth of any kind, no stretch of 2 s, or the units are wrong.
+        InputError: there is no truth of any kind, no unbroken stretch of 2 s, or a wrong unit.
     """
     check_units(sequence)
     streams = levelled_streams(sequence)
@@ -128,14 +128,14 @@ def prepared_recordings(
     folder: Path,
     jobs: int | None = 1,
 ) -> Iterator[Prepared | Skipped]:
-    """Each recording prepared, from the cache or read, in the order of the paths.
+    """Yield each recording prepared, from the cache or newly read, in the order of the paths.
 
     Args:
-        paths: recordings.
-        read: how a path is read; can be pickled.
-        options: what `read` depends on besides the path, as plain values.
-        folder: the cache's.
-        jobs: processes, as for `stario.sequences.datasets.batch.each`.
+        paths: paths of the recordings.
+        read: function that reads a path; must be picklable.
+        options: plain values that the result of `read` depends on besides the path.
+        folder: folder of the cache.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
     """
     work = partial(_kept, read=read, options=options, folder=folder)
     yield from each(work, paths, jobs)
@@ -172,7 +172,7 @@ def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPie
 def _with_known(
     stream: LevelledStream, time: FloatArray, position_W: FloatArray, bad: BoolArray
 ) -> PreparedPiece:
-    """Positions (n, 2 or 3) interpolated to the ticks but for the steps (n - 1,) that are bad."""
+    """Interpolate positions (n, 2 or 3) to the ticks, except across bad steps (n - 1,)."""
     ticks = stream.ticks
     before = np.searchsorted(time, ticks, side="right") - 1
     inside = (before >= 0) & (before < len(bad))
@@ -200,7 +200,7 @@ def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPie
 
 @cache
 def _code() -> str:
-    """Digest of this module: what other code has prepared is not found again."""
+    """Return a digest of this module, so that files of other versions of it are not reused."""
     return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 
@@ -221,7 +221,7 @@ def _store(file: Path, prepared: Prepared) -> None:
         with atomic_write(file, "wb") as target:
             target.write(content)
     except (OSError, InputError) as error:
-        log.warning("%s: prepared recordings are not kept: %s", file.parent, error)
+        log.warning("%s: prepared recordings cannot be cached: %s", file.parent, error)
 
 
 def _load(file: Path, path: Path) -> Prepared | None:
@@ -235,7 +235,7 @@ def _load(file: Path, path: Path) -> Prepared | None:
                 for k in range(told["pieces"])
             ]
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
-        log.warning("%s: not whole, made anew: %s", file, error)
+        log.warning("%s: unreadable, prepared again: %s", file, error)
         return None
     return Prepared(path, told["name"], told["kind"], told["attributes"], pieces)
 

@@ -1,4 +1,4 @@
-"""The judged groups as text, CSV, JSON and one figure."""
+"""Results of judging by groups as text, CSV, JSON and a figure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COLUMNS = {
     "rms_1s_m": ("1 s [m]", ".3f"),
     "rms_10s_m": ("10 s [m]", ".2f"),
     "rms_30s_m": ("30 s [m]", ".2f"),
-    "direction_deg": ("turned [deg]", ".0f"),
+    "direction_deg": ("direction [deg]", ".0f"),
     "nis": ("NIS", ".2f"),
     "nis_ekf": ("EKF NIS", ".2f"),
 }
@@ -34,22 +34,22 @@ _WORST = 1.1
 WORDS = {
     **FIGURES,
     "medians": "over the recordings of a group",
-    "ratio": "root mean square errors, ours over theirs: geometric mean over groups, of all sets "
-    f"that of the sets; [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
-    "groups, recordings and blocks of 30 s; of waypoints the residuals stand in for 10 s",
+    "ratio": "root mean square errors, ours over theirs: geometric mean over groups (for all sets, "
+    f"over sets); [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
+    "groups, recordings and blocks of 30 s; for waypoints, their residuals replace the 10 s errors",
 }
-"""What each figure means."""
+"""Meaning of each figure."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What was judged.
+    """Result of judging a set of weights.
 
     Attributes:
         ours: name of the weights.
-        theirs: of those compared with, or None.
-        rows: the groups.
-        judged: the recordings.
+        theirs: name of the weights compared with, or None.
+        rows: results of the groups.
+        judged: results of the recordings.
     """
 
     ours: str
@@ -59,7 +59,7 @@ class Judgement:
 
 
 def judgement_text(found: Judgement) -> str:
-    """The table for a person: theirs, ours and the ratio below each other for every group."""
+    """Return the table as text: theirs, ours and the ratio below each other for every group."""
     known = {"theirs": found.theirs, "ours": found.ours}
     labels = {label: name for label, name in known.items() if name is not None}
     table = [["", "", "n", "km", *(title for title, _ in _COLUMNS.values())]]
@@ -81,13 +81,13 @@ def judgement_text(found: Judgement) -> str:
 
 
 _LEAST_GROUPS = 3
-"""Of fewer the intervals, which draw groups, say nothing of others."""
+"""Minimum number of groups for a verdict: intervals from fewer do not generalise to others."""
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Whether ours should replace theirs; empty without a comparison over several groups.
+    """Return whether ours should replace theirs; empty without a comparison over several groups.
 
-    Taken is what is surely better over all and nowhere worse by more than a tenth.
+    Ours are accepted if the pooled interval is below 1 and no group is worse by more than a tenth.
     """
     told = [row for row in rows if _DECIDES in row.ratios]
     ratios = {row.name: row.ratios[_DECIDES] for row in told if not row.pooled}
@@ -98,14 +98,14 @@ def verdict(rows: Sequence[Row]) -> str:
     taken = pooled.high < 1.0 and ratios[worst].ratio <= _WORST
     if len(ratios) < _LEAST_GROUPS:
         return (
-            f"not decided, {len(ratios)} groups are too few: over all {_interval(pooled)} in 10 s"
+            f"not decided, {len(ratios)} groups are too few: pooled {_interval(pooled)} over 10 s"
         )
-    words = f"over all {_interval(pooled)} in 10 s, worst {worst} {_interval(ratios[worst])}"
-    return f"{'taken' if taken else 'not taken'}: {words}"
+    words = f"pooled {_interval(pooled)} over 10 s, worst {worst} {_interval(ratios[worst])}"
+    return f"{'accepted' if taken else 'not accepted'}: {words}"
 
 
 def judgement_dict(found: Judgement) -> dict[str, object]:
-    """The same as plain values, recordings included."""
+    """Return the result as plain values, including the recordings."""
     return {
         "ours": found.ours,
         "theirs": found.theirs,

@@ -165,7 +165,7 @@ def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
         done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
         assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
-    assert "least squared" in words["alignment"]
+    assert "least squares" in words["alignment"]
     done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
     compared = json.loads(done.out)
     assert compared["conventions"] == words

@@ -71,8 +71,8 @@ def test_weights_that_walk_backwards_are_told(model: DisplacementModel) -> None:
     walk = simulated(60.0)
     right = familiarity(model, walk)
     wrong = familiarity(Backwards(model._engine, model.card), walk)
-    assert not [line for line in right.lines() if "another way" in line]
-    [line] = [line for line in wrong.lines() if "another way" in line]
+    assert not [line for line in right.lines() if "direction differs" in line]
+    [line] = [line for line in wrong.lines() if "direction differs" in line]
     assert line.startswith("!")
     turned = abs(wrong.direction.turn - right.direction.turn)
     assert turned == pytest.approx(np.pi)

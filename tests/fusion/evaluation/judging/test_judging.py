@@ -277,7 +277,7 @@ def test_two_groups_decide_nothing() -> None:
     rows = [Row(name, 5, 1.0, {}, {"rms_10s_m": better}) for name in ("a", "b")]
     rows.append(Row(POOLED, 5, 1.0, {}, {"rms_10s_m": better}, pooled=True))
     assert verdict(rows).startswith("not decided")
-    assert verdict([*rows, Row("c", 5, 1.0, {}, {"rms_10s_m": better})]).startswith("taken")
+    assert verdict([*rows, Row("c", 5, 1.0, {}, {"rms_10s_m": better})]).startswith("accepted")
 
 
 def test_a_group_may_be_called_all(walk: ImuSequence) -> None:
