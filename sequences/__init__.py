@@ -1,4 +1,4 @@
-"""What was recorded: sequences, readers, simulation, windows, metrics and figures."""
+"""Recordings: sequences, readers, simulation, windows, metrics and figures."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Arrays as every sequence holds them, checked at the edge."""
+"""Array types of sequences, and validation of arrays that users pass in."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ BoolArray = NDArray[np.bool_]
 
 
 def correlation(x: FloatArray, y: FloatArray) -> float:
-    """Pearson's correlation of two arrays of one shape; 0 where one is constant or too short."""
+    """Return Pearson's correlation of arrays of equal shape; 0 if one is constant or too short."""
     if x.size < 3 or min(np.ptp(x), np.ptp(y)) == 0.0:
         return 0.0
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
 
 
 def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
-    """Columns of values (N, k) at other times (M,), linearly; held beyond the ends."""
+    """Interpolate columns of values (N, k) linearly at times (M,), clamped at the ends."""
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
 
 
 def checked_time(name: str, value: FloatArray) -> FloatArray:
-    """Times (N,) [s] that are finite and strictly increase.
+    """Return times (N,) [s], checked to be finite and strictly increasing.
 
     Raises:
         InputError: they are not.
@@ -46,7 +46,7 @@ def checked_time(name: str, value: FloatArray) -> FloatArray:
 def checked_array(
     name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
 ) -> FloatArray:
-    """An array of a shape whose rows are finite where they must be.
+    """Return `value` as an array, checked for its shape and for finite rows at `where`.
 
     Raises:
         InputError: it is not.

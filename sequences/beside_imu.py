@@ -1,4 +1,4 @@
-"""What may be recorded beside an IMU: positions, the magnetic field, the device's own attitude."""
+"""Data recorded alongside an IMU: positions, the magnetic field, the device's own attitude."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class PositionTrack:
         return len(self.time)
 
     def slice(self, start: float, stop: float) -> PositionTrack | None:
-        """The positions with start <= time <= stop [s], or None where there are none."""
+        """Return the positions with start <= time <= stop [s], or None if there are none."""
         keep = (self.time >= start) & (self.time <= stop)
         if not keep.any():
             return None
@@ -56,7 +56,7 @@ class PositionTrack:
 
 @dataclass(frozen=True, eq=False)
 class Magnetometer:
-    """The magnetic field as measured beside the IMU, at its own times.
+    """Magnetic field measured alongside the IMU, at its own times.
 
     Attributes:
         time: (M,) [s], on the IMU's clock, strictly increasing.
@@ -85,14 +85,14 @@ class Magnetometer:
         return float(1.0 / np.median(np.diff(self.time))) if len(self) > 1 else 0.0
 
     def slice(self, start: float, stop: float) -> Magnetometer | None:
-        """The samples with start <= time <= stop [s], or None where there are none."""
+        """Return the samples with start <= time <= stop [s], or None if there are none."""
         keep = (self.time >= start) & (self.time <= stop)
         return Magnetometer(self.time[keep], self.field[keep]) if keep.any() else None
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceAttitude:
-    """The attitude that the device's own fusion gave, in a world of its own with z up.
+    """Attitude estimated by the device's own sensor fusion, in its own world frame with z up.
 
     Attributes:
         time: (M,) [s], on the IMU's clock, strictly increasing.
@@ -116,6 +116,6 @@ class DeviceAttitude:
         return len(self.time)
 
     def slice(self, start: float, stop: float) -> DeviceAttitude | None:
-        """The attitudes with start <= time <= stop [s], or None where there are none."""
+        """Return the attitudes with start <= time <= stop [s], or None if there are none."""
         keep = (self.time >= start) & (self.time <= stop)
         return DeviceAttitude(self.time[keep], self.attitude_WB[keep]) if keep.any() else None

@@ -1,4 +1,4 @@
-"""What a file's numbers mean, told by its owner: units, axes, and whether gravity is in them."""
+"""Conventions of a file's numbers, stated by the user: units, axes, with or without gravity."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from stario.sequences.units import with_units
 log = logging.getLogger(__name__)
 
 GRAVITY = ("included", "removed")
-"""Whether the accelerometer's numbers hold gravity; without it they are linear acceleration."""
+"""Whether the accelerometer's values include gravity; without it they are linear acceleration."""
 
 ACCEL_SIGNS = ("up", "apple")
-"""Where the accelerometer points at rest: up, as specific force does, or down, as Apple's."""
+"""Direction of the accelerometer's values at rest: up (specific force) or down (Apple)."""
 
 SAME_AXES = "x,y,z"
 
@@ -38,19 +38,19 @@ def with_conventions(
     gravity: str = "included",
     accel_sign: str = "up",
 ) -> ImuSequence:
-    """The recording in rad/s, m/s^2 of specific force and the axes of its truth.
+    """Convert a recording to rad/s, specific force in m/s^2 and the axes of its ground truth.
 
     Args:
-        sequence: a recording whose numbers are as the other arguments say.
+        sequence: recording whose numbers follow the conventions in the other arguments.
         gyro_unit: as for `with_units`.
         accel_unit: as for `with_units`.
         axes: as for `with_axes`.
-        gravity: one of `GRAVITY`; "removed" is put back by `with_gravity`.
-        accel_sign: one of `ACCEL_SIGNS`; "apple" turns all three axes over.
+        gravity: one of `GRAVITY`; if "removed", `with_gravity` restores it.
+        accel_sign: one of `ACCEL_SIGNS`; "apple" negates all three axes.
 
     Raises:
-        InputError: an argument is unknown, a unit is given for numbers that were converted from
-            the one their file names, or gravity cannot be put back.
+        InputError: an argument's value is unknown, a unit is given for numbers already converted
+            from the one named in their file, or gravity cannot be restored.
     """
     if gravity not in GRAVITY:
         raise InputError("gravity", repr(gravity), f"one of {', '.join(GRAVITY)}")
@@ -64,17 +64,17 @@ def with_conventions(
 
 
 def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
-    """The recording with gyroscope, accelerometer and magnetometer turned to other axes.
+    """Rotate gyroscope, accelerometer, magnetometer and device attitude to other axes.
 
-    The truth stays as it is: this mends an IMU whose axes are not those whose attitude the truth
-    gives. Where there is no truth, any right-handed axes do.
+    The ground truth is unchanged: this fixes an IMU whose axes are not those whose attitude the
+    truth describes. Without a truth, any right-handed axes are fine.
 
     Args:
         sequence: the recording.
-        axes: what the new x, y and z are in the file's axes: `y,-x,z` takes y for x, -x for y.
+        axes: the new x, y and z in the file's axes: `y,-x,z` makes y the new x and -x the new y.
 
     Raises:
-        InputError: not a permutation of x, y, z with signs, or a left-handed one.
+        InputError: `axes` is not a signed permutation of x, y, z, or is left-handed.
     """
     if axes == SAME_AXES:
         return sequence
@@ -93,13 +93,13 @@ def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
 
 
 def axes_matrix(axes: str) -> FloatArray:
-    """The rotation (3, 3) from the file's axes to those that `axes` names.
+    """Return the rotation (3, 3) from the file's axes to those described by `axes`.
 
     Raises:
         InputError: as for `with_axes`.
     """
     words = [word.strip().lower().removeprefix("+") for word in axes.split(",")]
-    expected = "x, y and z once each, with signs, such as y,-x,z"
+    expected = "x, y and z once each, optionally with a minus, such as y,-x,z"
     if sorted(word.removeprefix("-") for word in words) != ["x", "y", "z"]:
         raise InputError("axes", repr(axes), expected)
     R = np.zeros((3, 3))
@@ -107,31 +107,31 @@ def axes_matrix(axes: str) -> FloatArray:
         R[row, "xyz".index(word[-1])] = -1.0 if word[0] == "-" else 1.0
     if np.linalg.det(R) < 0.0:
         raise InputError(
-            "axes", f"{axes!r}, left-handed", "right-handed axes", "turn one sign over"
+            "axes", f"{axes!r}, left-handed", "right-handed axes", "change the sign of one axis"
         )
     return R
 
 
 def axes_named(R: FloatArray) -> str:
-    """The text that `axes_matrix` turns into the right-handed axes nearest to a rotation (3, 3)."""
+    """Return the `axes` text of the right-handed axes nearest to a rotation (3, 3)."""
     group = Rotation.create_group("O").as_matrix()
     best = group[int(np.argmax((group * R).sum(axis=(1, 2))))]
     return ",".join(("-" if row.min() < -0.5 else "") + "xyz"[np.abs(row).argmax()] for row in best)
 
 
 def with_gravity(sequence: ImuSequence) -> ImuSequence:
-    """Specific force from linear acceleration: gravity put back by the recording's attitude.
+    """Restore specific force from linear acceleration with the recorded attitude.
 
-    f_B = a_B + R_WB^T (0, 0, g). Samples whose attitude is not known are dropped and their number
-    is logged. The attitude is the truth's or, without one, the device's own: the track of a
-    recording mended so rests on it.
+    f_B = a_B + R_WB^T (0, 0, g). Samples without a known attitude are dropped and their number is
+    logged. The attitude is the ground truth's or, without one, the device's own; a track estimated
+    from the result depends on it.
 
     Raises:
-        InputError: there is no truth, or it gives no sample's attitude.
+        InputError: there is no attitude, or none at the time of any sample.
     """
     found = "removed"
-    fix = "record the raw accelerometer, or give the attitude: truth with px,py,pz,qx,qy,qz,qw"
-    expected = "an attitude that says where gravity was"
+    fix = "record the raw accelerometer, or add the attitude: truth with px,py,pz,qx,qy,qz,qw"
+    expected = "an attitude to restore gravity with"
     truth = _attitude_of(sequence)
     if truth is None or truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: gravity", f"{found} and no truth", expected, fix)
@@ -143,11 +143,11 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
     kept = known[index]
     if not kept.any():
         raise InputError(
-            f"{sequence.name}: gravity", f"{found} and no attitude at any sample", expected, fix
+            f"{sequence.name}: gravity", f"{found} and no sample with an attitude", expected, fix
         )
     if not kept.all():
         log.warning(
-            "%s: %d of %d samples dropped: no attitude puts gravity back there",
+            "%s: %d of %d samples dropped: gravity cannot be restored without an attitude",
             sequence.name, len(kept) - kept.sum(), len(kept),
         )  # fmt: skip
     R_WB = pose.attitude_WB[index[kept]]
@@ -161,7 +161,7 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
 
 
 def _attitude_of(sequence: ImuSequence) -> Trajectory | None:
-    """The true poses, or the device's own attitude as a track that stands still."""
+    """Return the true poses, or else the device's own attitude as a stationary trajectory."""
     own = sequence.device_attitude
     if sequence.truth is not None or own is None:
         return sequence.truth

@@ -1,4 +1,4 @@
-"""The `StarioError` family: what the library raises on input it cannot use."""
+"""The `StarioError` family: exceptions for input that the library cannot use."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Any
 
 
 class StarioError(Exception):
-    """Base of every error the library raises on purpose; its text is one line for a user."""
+    """Base class of all errors raised on purpose; the text is one line for a user."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # An exception is unpickled by calling its class with its text: not what these take.
+        # By default, unpickling calls the class with the text, which is not what these take.
         return _with_text, (type(self), *self.args), vars(self)
 
 
 def _with_text(kind: type[StarioError], *args: object) -> StarioError:
-    """An error as pickle begins it; the fields are put back by pickle itself."""
+    """Create an error without calling `__init__`; pickle then restores the fields."""
     return kind.__new__(kind, *args)
 
 
 class InputError(StarioError, ValueError):
-    """A value given to a public function does not fit.
+    """Invalid value passed to a public function.
 
     Args:
         field: name of the argument, column or option that is wrong.
-        found: what was there.
-        expected: what belongs there.
-        fix: what the caller can do about it; empty where `expected` says it all.
+        found: the actual value.
+        expected: what a valid value is.
+        fix: what the caller can do about it; empty if `expected` is enough.
     """
 
     def __init__(self, field: str, found: str, expected: str, fix: str = "") -> None:
@@ -36,7 +36,7 @@ class InputError(StarioError, ValueError):
 
 
 class ReadError(InputError):
-    """A file cannot be read: names the file beside field, found and expected."""
+    """Unreadable or invalid file; names the file in addition to field, found and expected."""
 
     def __init__(
         self, path: Path | str, field: str, found: str, expected: str, fix: str = ""
@@ -46,8 +46,8 @@ class ReadError(InputError):
 
 
 class ConfigError(InputError):
-    """A configuration file or value does not fit."""
+    """Invalid configuration file or value."""
 
 
 class WeightsError(ReadError):
-    """A weights file and its card do not match each other, the model or the checksum."""
+    """Weights file or card that does not match the other, the model or the checksum."""

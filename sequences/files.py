@@ -1,4 +1,4 @@
-"""Writing results so that they appear whole or not at all, and tracks in TUM format."""
+"""Atomic writing of results (complete or not at all), and tracks in TUM format."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 @contextmanager
 def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
-    """Open a file that takes its name only when it is complete.
+    """Open a file that appears under its name only when it is complete.
 
-    The content goes to a temporary file in the same folder, which replaces `path` on leaving the
-    block; an exception inside leaves `path` as it was and no temporary file.
+    The content goes to a temporary file in the same folder, which replaces `path` at the end of the
+    block; an exception in the block leaves `path` unchanged and no temporary file behind.
 
     Args:
         path: the file to write or replace; its folder must exist.
         mode: "w" for text (UTF-8, Unix line ends), "wb" for bytes.
 
     Raises:
-        InputError: another mode, the folder does not exist, `path` is a folder, or the system
-            refuses to write there.
+        InputError: the mode is invalid, the folder does not exist, `path` is a folder, or the
+            system refuses to write there.
     """
     if mode not in ("w", "wb"):
         raise InputError("mode", repr(mode), "'w' or 'wb'")
@@ -54,7 +54,7 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A temporary file's path for a library that opens files itself, else as `atomic_write`.
+    """Yield a temporary path for libraries that open files themselves; else as `atomic_write`.
 
     Raises:
         InputError: the folder does not exist, `path` is a folder, or the system refuses to write
@@ -77,17 +77,17 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path | str) -> Iterator[Path]:
-    """A folder that takes its name only when everything is in it.
+    """Create a folder that appears under its name only when it is complete.
 
-    The block fills a temporary folder beside `path`, which becomes `path` on leaving it; an
-    exception inside leaves nothing.
+    The block fills a temporary folder next to `path`, which is renamed to `path` at the end; an
+    exception in the block leaves nothing behind.
 
     Args:
-        path: the folder to make; nothing but an empty folder may be there.
+        path: the folder to create; it may exist already if it is empty.
 
     Raises:
-        InputError: something is there already, the folder above does not exist, or the system
-            refuses to write there.
+        InputError: `path` exists and is not an empty folder, its parent does not exist, or the
+            system refuses to write there.
     """
     path = Path(path)
     with _refusals_told(path):
@@ -114,13 +114,13 @@ def _beside(path: Path) -> Path:
 
 @contextmanager
 def _refusals_told(path: Path) -> Iterator[None]:
-    """What the system refuses about a path, as an error that says what to do."""
+    """Turn an `OSError` about a path into an `InputError` with a remedy."""
     try:
         yield
     except OSError as error:
         found = f"{path}: {error.strerror or error}"
-        fix = "choose another place, mend its permissions or make room"
-        raise InputError("path", found, "a place that can be written to", fix) from error
+        fix = "choose another folder, fix its permissions or free disk space"
+        raise InputError("path", found, "a writable location", fix) from error
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -140,11 +140,11 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: Path | str) -> Trajectory:
-    """Read a TUM track; lines that start with `#` and empty lines are skipped.
+    """Read a TUM track; lines starting with `#` and empty lines are skipped.
 
     Raises:
         ReadError: the file cannot be read, or a line does not hold eight finite numbers with
-            increasing time and a unit quaternion; it names the line and the field.
+            increasing time and a unit quaternion; the error names line and field.
     """
     path = Path(path)
     try:
@@ -166,28 +166,28 @@ def read_tum(path: Path | str) -> Trajectory:
 
 
 def write_json(path: Path | str, obj: object) -> None:
-    """Write JSON, indented by 2, keys in their order; nan and infinity become null.
+    """Write JSON, indented by 2, keys in their order; NaN and infinity become null.
 
     NumPy numbers and arrays, dataclasses and paths are written as their plain counterparts.
 
     Raises:
-        InputError: the object holds something else, or the folder does not exist.
+        InputError: the object holds another type, or the folder does not exist.
     """
     with atomic_write(path) as file:
         file.write(json_text(obj))
 
 
 def json_text(obj: object) -> str:
-    """The text that `write_json` writes.
+    """Return the text that `write_json` writes.
 
     Raises:
-        InputError: the object holds something that has no plain counterpart.
+        InputError: the object holds a value without a plain counterpart.
     """
     return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def write_rows(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write a CSV of rows by column; a row may lack some."""
+    """Write rows, as mappings from column to value, to a CSV; missing cells stay empty."""
     names = dict.fromkeys(key for row in rows for key in row)
     with atomic_write(path) as file:
         writer = csv.DictWriter(file, list(names), lineterminator="\n")
@@ -196,10 +196,10 @@ def write_rows(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
 
 
 def write_npz(path: Path | str, **arrays: ArrayLike) -> None:
-    """Write arrays to a compressed npz, exactly at `path`; it holds nothing pickled.
+    """Write arrays to a compressed npz, exactly at `path`, without pickling.
 
     Raises:
-        InputError: an array of objects, or the folder does not exist.
+        InputError: an array holds objects, or the folder does not exist.
     """
     plain = {name: np.asarray(value) for name, value in arrays.items()}
     for name, value in plain.items():
@@ -247,7 +247,7 @@ def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:
 
 
 def _plain(obj: object) -> object:
-    """`obj` in JSON's own types."""
+    """Convert `obj` to JSON's own types."""
     if is_dataclass(obj) and not isinstance(obj, type):
         return _plain(asdict(obj))
     if isinstance(obj, dict):

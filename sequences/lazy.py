@@ -1,6 +1,6 @@
-"""Public names that are imported when they are first used.
+"""Lazy imports: public names that are imported on first use.
 
-SciPy, torch and gtsam take up to seconds to import; `stario --help` and a caller who wants one
+SciPy, torch and gtsam take up to seconds to import; `stario --help` and callers that need a single
 reader should not wait for them.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """A module's `__getattr__` (PEP 562) that looks names up in the package's modules."""
+    """Return a module's `__getattr__` (PEP 562) that imports names from the given modules."""
 
     def attribute(name: str) -> Any:
         if name not in modules:

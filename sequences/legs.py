@@ -1,8 +1,8 @@
-"""Legs between known positions: what is true of a recording without attitude.
+"""Legs between known positions: ground truth for recordings without a true attitude.
 
-Between two waypoints, or two instants of a position track, the displacement on the map is known but
-for a yaw that the levelled IMU does not have. Stretches of levelled IMU with their legs are what a
-network learns from such recordings (`stario.network.training.weak_truth`).
+The displacement between two waypoints, or two instants of a position track, is known in the map
+frame, but its yaw relative to the levelled IMU is not. From such recordings a network learns on
+stretches of levelled IMU samples with their legs (`stario.network.training.weak_truth`).
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Positi
 from stario.sequences.windows import WINDOW_RATE
 
 _TRACK_STEP = 2.0
-"""Between the positions of a track that end its legs [s]."""
+"""Time between the positions of a track that delimit its legs [s]."""
 
 _SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
-"""Legs that are shorter [s] or faster [m/s] are a tap by mistake, or a ride."""
+"""Shorter legs [s] and faster legs [m/s] are rejected: mistaken taps, and rides."""
 
 _FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
-"""A track that moves faster between two samples [m/s] has jumped; a longer step [s] is a gap."""
+"""A faster step between two samples [m/s] is a jump of the track; a longer step [s] is a gap."""
 
 _SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
-"""Of a slow track, as satellites give, a gap is longer than so many usual steps, or than so long
-[s]: a walker has turned by then."""
+"""In a low-rate track, such as from GNSS, a gap is longer than this many median steps or than this
+many seconds, whichever is less: a pedestrian has turned by then."""
 
 _TRACK_SIGMA = 0.15
-"""Of a track's positions [m]: what carries the truth is not what carries the IMU."""
+"""Sigma of a track's positions [m]: the reference device is not rigidly fixed to the IMU."""
 
 _TAP_SIGMA, _TAP_TIME = 0.4, 0.3
-"""Of a waypoint's position [m], and of the time at which it is tapped [s]."""
+"""Sigma of a waypoint's position [m], and of the time at which it is tapped [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class LegStream:
-    """An unbroken stretch of levelled IMU with legs between known positions.
+    """Unbroken stretch of levelled IMU samples with legs between known positions.
 
     Attributes:
-        name: the recording's.
-        kind: of the positions, "waypoints" or "positions".
+        name: name of the recording.
+        kind: kind of the positions, "waypoints" or "positions".
         imu_N: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] in N.
-        facing_N: (N, 2) float32, which way the device faces.
-        start: (M,) of the legs, from the stretch's beginning [s].
-        stop: (M,) of them [s].
-        displacement: (M, 3) of the legs on the map [m]; of waypoints on a level floor.
-        sigma: deviation of each leg's ends (M, 2) [m].
+        facing_N: (N, 2) float32, facing direction of the device.
+        start: (M,) start times of the legs [s], from the beginning of the stretch.
+        stop: (M,) end times of the legs [s], likewise.
+        displacement: (M, 3) displacements in the map frame [m]; z is 0 if positions are 2-D.
+        sigma: (M, 2) standard deviations of the two ends of each leg [m].
     """
 
     name: str
@@ -65,7 +65,7 @@ class LegStream:
         return len(self.imu_N)
 
     def part(self, start: int, stop: int) -> LegStream:
-        """Samples from start to before stop, with the legs that lie within."""
+        """Return samples [start, stop) and the legs that lie within them."""
         begin, end = start / WINDOW_RATE, max(stop, start) / WINDOW_RATE
         inside = (self.start >= begin) & (self.stop <= end)
         part = slice(start, max(stop, start))
@@ -82,14 +82,14 @@ class LegStream:
 
 
 def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStream]:
-    """Cut a recording with known positions into unbroken stretches with two legs at least.
+    """Cut a recording with known positions into unbroken stretches with at least two legs.
 
     Args:
-        sequence: with positions or waypoints.
-        min_seconds: shorter stretches are left out [s].
+        sequence: recording with positions or waypoints.
+        min_seconds: minimum length of a stretch [s].
 
     Raises:
-        InputError: it has no known positions, or its rate is not accepted.
+        InputError: the recording has no known positions, or its rate is not accepted.
     """
     if sequence.positions is None:
         raise InputError(f"{sequence.name}: positions", "none", "positions or waypoints")
@@ -116,7 +116,7 @@ def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStr
 
 
 def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
-    """Which steps (N - 1,) of a position track are gaps, or jumps of what gave the positions.
+    """Return which steps (N - 1,) of a position track are gaps, or jumps of the position source.
 
     Args:
         time: (N,) [s].
@@ -128,14 +128,14 @@ def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
 
 
 def _longest_step(step: FloatArray) -> float:
-    """Of a track with these steps (n,) the longest that is no gap [s]."""
+    """Return the longest step [s] that is not a gap, from a track's steps (n,) [s]."""
     if not len(step):
         return _LONGEST_STEP
     return max(_LONGEST_STEP, min(_SLOW_STEP * float(np.median(step)), _SLOWEST_STEP))
 
 
 def _ticks(time: FloatArray) -> NDArray[np.int64]:
-    """Which of the times (n,) [s] make steps of `_TRACK_STEP`, or of more across a gap."""
+    """Return the index of the first of times (n,) [s] in each interval of `_TRACK_STEP`."""
     if not len(time):
         return np.zeros(0, dtype=np.int64)
     whole = np.floor((time - time[0]) / _TRACK_STEP)
@@ -143,7 +143,7 @@ def _ticks(time: FloatArray) -> NDArray[np.int64]:
 
 
 def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Start and stop (M,) [s], displacement (M, 3) [m] and the ends' deviations (M, 2) [m]."""
+    """Return start, stop (M,) [s], displacement (M, 3) [m] and sigma of the ends (M, 2) [m]."""
     time, position = known.time[known.valid], known.position_W[known.valid]
     if position.shape[1] == 2:
         position = np.column_stack([position, np.zeros(len(position))])

@@ -1,8 +1,8 @@
-"""A recording as a network sees it in use: 200 Hz in the frame N that the IMU levels by itself.
+"""Input of a network at inference: a recording at 200 Hz in frame N, levelled by the IMU alone.
 
-N is gravity-aligned, its yaw zero at the start and drifting with the gyroscope
-(`stario.sequences.attitude.levelling`). No truth is needed, so this serves recordings with poses,
-positions or waypoints alike.
+N is gravity-aligned; its yaw is zero at the start and drifts with the gyroscope
+(`stario.sequences.attitude.levelling`). No ground truth is needed, so recordings with poses,
+positions or waypoints are treated in the same way.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from stario.sequences.windows import (
 )
 
 TICK_SAMPLES = 100
-"""Samples of a stream from one tick to the next: windows start at ticks."""
+"""Samples from one tick of a stream to the next; windows start at ticks."""
 
 TICK_SECONDS = TICK_SAMPLES / WINDOW_RATE
 """Time from one tick to the next [s]."""
@@ -33,13 +33,13 @@ TICK_SECONDS = TICK_SAMPLES / WINDOW_RATE
 
 @dataclass(frozen=True, eq=False)
 class LevelledStream:
-    """An unbroken stretch of a recording at 200 Hz in N, ready to cut windows from.
+    """Unbroken stretch of a recording at 200 Hz in N, ready to be cut into windows.
 
     Attributes:
         start: time of the first sample [s].
         imu_N: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] in N.
-        facing_N: (N, 2) float32, which way the device faces (`stario.sequences.windows.facing`).
-        R_NB: (K, 3, 3) attitude at the ticks, one every `TICK_SECONDS` from `start`.
+        facing_N: (N, 2) float32, facing direction of the device, from `stario.sequences.windows`.
+        R_NB: (K, 3, 3) attitudes at the ticks, one every `TICK_SECONDS` from `start`.
     """
 
     start: float
@@ -57,12 +57,12 @@ class LevelledStream:
 
     @property
     def window_count(self) -> int:
-        """Windows of a second that begin at a tick and are whole."""
+        """Number of complete one-second windows that start at a tick."""
         return max(0, (len(self) - WINDOW_SAMPLES) // TICK_SAMPLES + 1)
 
     @property
     def headings(self) -> FloatArray:
-        """Heading (M,) [rad] of the device in N in each window."""
+        """Heading (M,) [rad] of the device in N, for each window."""
         return headings_at(self.facing_N, self._starts)
 
     @property
@@ -70,17 +70,17 @@ class LevelledStream:
         return TICK_SAMPLES * np.arange(self.window_count)
 
     def windows(self) -> NDArray[np.float32]:
-        """Windows (M, 6, 200) in N that begin at the first M ticks."""
+        """Return windows (M, 6, 200) in N that start at the first M ticks."""
         rows = self._starts[:, None] + np.arange(WINDOW_SAMPLES)
         return np.ascontiguousarray(self.imu_N[rows].transpose(0, 2, 1))
 
 
 def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[LevelledStream]:
-    """The unbroken stretches of a recording, each levelled from its own start.
+    """Return the unbroken stretches of a recording, each levelled from its own start.
 
     Args:
-        sequence: the recording; its truth is not looked at.
-        min_seconds: shorter stretches are left out [s].
+        sequence: the recording; its ground truth is not used.
+        min_seconds: minimum length of a stretch [s].
 
     Raises:
         InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.

@@ -1,4 +1,4 @@
-"""Noise densities of an inertial sensor, one meaning for simulation, filter and graph."""
+"""Noise densities of an inertial sensor, with one definition for simulation, filter and graph."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stario.sequences.settings import check_number
 class ImuNoise:
     """Continuous noise densities, independent of the sensor's rate.
 
-    A sample at rate f carries white noise of deviation density * sqrt(f).
+    A sample at rate f has white noise of standard deviation density * sqrt(f).
 
     Attributes:
         gyro_noise: white noise of the gyroscope [rad/s/sqrt(Hz)].
@@ -31,4 +31,4 @@ class ImuNoise:
 
 
 PHONE_NOISE = ImuNoise(gyro_noise=2e-4, accel_noise=2e-3, gyro_walk=2e-5, accel_walk=2e-4)
-"""Of a phone's own sensors; what a filter assumes is larger, for errors of scale count as noise."""
+"""Noise of a phone's sensors; a filter assumes more, since it treats scale errors as noise."""

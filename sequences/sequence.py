@@ -1,4 +1,4 @@
-"""What was recorded: an IMU sequence and, where known, the true trajectory.
+"""Recorded data: an IMU sequence and, where known, the true trajectory.
 
 Frames: B is the body (the IMU's axes), W the world (z up, gravity along -z, yaw arbitrary).
 `R_WB` takes vectors from B to W; quaternions are `quat_xyzw`; time is float64 seconds.
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     from typing import Any
 
 STANDARD_GRAVITY = 9.80665
-"""Magnitude of gravity [m/s^2] used unless another is given."""
+"""Default magnitude of gravity [m/s^2]."""
 
 MAX_TRUTH_GAP = 0.1
-"""Longest distance [s] between two valid truth samples that is interpolated across."""
+"""Longest step [s] between two valid ground-truth samples that is interpolated across."""
 
 ABSURD = 1e5
-"""No sensor reads this much in any unit used here; also catches infinities."""
+"""Larger than any sensor's values in any unit used here; also catches infinities."""
 
 MAX_IMU_GAP = 0.1
-"""Longest distance [s] between IMU samples that is bridged by interpolation."""
+"""Longest step [s] between IMU samples that is bridged by interpolation."""
 
 GAP_STEPS = 1.8
-"""A step of more usual ones than this has lost a sample."""
+"""A step longer than this many median steps has lost a sample."""
 
 _ROUNDING_S = 1e-6
-"""What rounding may add to a step [s]: 0.3 - 0.2 > 0.1, and more for seconds since 1970."""
+"""Rounding error allowed in a step [s]: 0.3 - 0.2 > 0.1, and more for seconds since 1970."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +92,14 @@ class Trajectory:
         return np.asarray(self.attitude_WB.as_quat(), dtype=np.float64)
 
     def at(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> Trajectory:
-        """Interpolate to other times: linear in position, slerp in attitude.
+        """Interpolate at other times: linear in position, slerp in attitude.
 
-        Never interpolates across a gap: times outside the track, or between valid samples that
-        lie more than `max_gap` apart, come back with `valid` False.
+        Never interpolates across a gap: times outside the track, or between valid samples more
+        than `max_gap` apart, are returned with `valid` False.
 
         Args:
             time: (M,) [s], strictly increasing.
-            max_gap: longest distance between valid neighbours [s].
+            max_gap: longest step between valid neighbours [s].
 
         Raises:
             InputError: fewer than two valid samples to interpolate between.
@@ -125,7 +125,7 @@ class Trajectory:
         )
 
     def covers(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> BoolArray:
-        """Whether the pose is known at each time (M,): what `at` returns as `valid`, but sooner.
+        """Return whether the pose is known at each time (M,): `valid` of `at`, but faster.
 
         Raises:
             InputError: as for `at`.
@@ -142,7 +142,7 @@ class Trajectory:
         return np.asarray(inside & (bracketed | exact))
 
     def slice(self, start: float, stop: float) -> Trajectory:
-        """The samples with start <= time <= stop [s]."""
+        """Return the samples with start <= time <= stop [s]."""
         keep = (self.time >= start) & (self.time <= stop)
         return Trajectory(
             time=self.time[keep],
@@ -156,7 +156,7 @@ class Trajectory:
         )
 
     def path_length(self) -> float:
-        """Length of the path [m] along 1 s chords, so that sensor noise does not add to it."""
+        """Return the length of the path [m] along 1 s chords, so that sensor noise adds nothing."""
         known = np.flatnonzero(self.valid)
         if len(known) < 2:
             return 0.0
@@ -175,24 +175,24 @@ _TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class ImuSequence:
-    """One recording of an inertial measurement unit, in body axes B.
+    """Recording of an inertial measurement unit, in body axes B.
 
-    Samples are kept as they were recorded: not-a-number, repeated and out-of-order samples are
-    allowed here, because dropping and counting them is the navigator's work (its health report).
+    Samples are kept as they were recorded. NaN, repeated and out-of-order samples are allowed here,
+    because the navigator drops them and counts them in its health report.
 
     Attributes:
-        name: what the recording is called in tables and file names.
+        name: name of the recording in tables and file names.
         time: (N,) [s].
-        gyro: (N, 3) angular rate of B against the inertial frame, in B [rad/s].
-        accel: (N, 3) specific force in B [m/s^2]; at rest it points up with about 9.81.
-        truth: the true trajectory, or None.
-        converted: which of "gyro" and "accel" the reader has converted from a unit that the file
-            names, so that nobody converts them once more.
-        magnetometer: the field measured beside the IMU, or None.
-        positions: known positions where there is no pose (`truth`): a track or waypoints, or None.
-        attributes: what else is known of the recording (person, device, place, carry, ...).
-        device_attitude: what the device's own fusion said of its attitude, or None.
-        source: the format or app that it was read from, for a person.
+        gyro: (N, 3) angular rate of B relative to the inertial frame, in B [rad/s].
+        accel: (N, 3) specific force in B [m/s^2]; at rest about 9.81, pointing up.
+        truth: ground truth (the true trajectory), or None.
+        converted: which of "gyro" and "accel" the reader has converted from a unit named in the
+            file, so that they are not converted again.
+        magnetometer: magnetic field measured alongside the IMU, or None.
+        positions: known positions if there are no poses (`truth`): a track or waypoints, or None.
+        attributes: other metadata of the recording (person, device, place, carry, ...).
+        device_attitude: attitude estimated by the device's own sensor fusion, or None.
+        source: format or app of the recording, for display.
 
     Raises:
         InputError: the arrays' shapes do not agree or there is no sample.
@@ -239,7 +239,7 @@ class ImuSequence:
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
     def summary(self) -> str:
-        """What the recording is, in one line for a person."""
+        """Return a description of the recording in one line."""
         field, own = self.magnetometer, self.device_attitude
         told = [self.source] if self.source else []
         told.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
@@ -248,7 +248,7 @@ class ImuSequence:
         return f"{self.name}: {', '.join(told)}, truth: {self.truth_words()}"
 
     def truth_words(self) -> str:
-        """What is known of the true track, for a person."""
+        """Return a description of the ground truth in a few words."""
         if self.truth is not None:
             return f"{int(self.truth.valid.sum())} poses"
         if self.positions is None:
@@ -265,11 +265,11 @@ class ImuSequence:
         return truth.slice(start, stop)
 
     def without_truth(self) -> ImuSequence:
-        """The same recording with its truth removed."""
+        """Return the recording without its ground truth."""
         return replace(self, truth=None, positions=None)
 
     def slice(self, start: float, stop: float) -> ImuSequence:
-        """The samples with start <= time <= stop [s], truth cut likewise."""
+        """Return the samples with start <= time <= stop [s], and all other data likewise."""
         keep = (self.time >= start) & (self.time <= stop)
         field, positions, own = self.magnetometer, self.positions, self.device_attitude
         return replace(
@@ -285,22 +285,22 @@ class ImuSequence:
 
 
 def is_gap(steps: FloatArray, longest: float = MAX_TRUTH_GAP) -> BoolArray:
-    """Whether steps (N,) between neighbours are longer than `longest` [s], rounding aside."""
+    """Return whether steps (N,) between neighbours exceed `longest` [s], allowing for rounding."""
     return np.asarray(steps > longest + _ROUNDING_S)
 
 
 def too_slow(truth: Trajectory) -> str:
-    """What is to be said where most of a truth's steps count as gaps; empty where they do not."""
+    """Return a message if the ground truth's median step counts as a gap, else an empty text."""
     step = float(np.median(np.diff(truth.time[truth.valid]))) if truth.valid.sum() > 1 else 0.0
     if not is_gap(np.array(step)):
         return ""
-    return f"the truth is at {1.0 / step:.3g} Hz, at least {1.0 / MAX_TRUTH_GAP:.0f} Hz are needed"
+    return f"the truth is at {1.0 / step:.3g} Hz; at least {1.0 / MAX_TRUTH_GAP:.0f} Hz are needed"
 
 
 def second_ticks(time: FloatArray) -> FloatArray:
-    """Every second (M,) from the first of increasing times (N,) to before the last [s].
+    """Return each second (M,) [s] from the first of increasing times (N,) until before the last.
 
-    Those within a gap are left out: the path between is straight, and a clock that jumps by decades
+    Seconds within a gap are skipped: the path there is straight, and a clock that jumps by decades
     must not cost memory.
     """
     seconds = np.floor(time - time[0])

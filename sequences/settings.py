@@ -1,4 +1,4 @@
-"""Settings from a file: groups of fields with defaults, checked field by field."""
+"""Settings from a file: groups of fields with defaults, validated field by field."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ Group = TypeVar("Group")
 
 
 def check_number(settings: object, name: str, low: float = 0.0, high: float = math.inf) -> None:
-    """Refuse a field that is no finite number within bounds.
+    """Check that a field is a finite number within bounds.
 
     Raises:
-        ConfigError: naming it, and the bounds.
+        ConfigError: it is not; the error names the field and the bounds.
     """
-    value: Any = getattr(settings, name)  # NumPy's own numbers are Real, too
+    value: Any = getattr(settings, name)  # NumPy scalars are Real, too
     if not (isinstance(value, Real) and math.isfinite(value) and low <= float(value) <= high):
         bounds = f"of at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
         raise ConfigError(name, repr(value), f"a finite number {bounds}")
 
 
 def with_settings(default: Group, values: object, name: str = "") -> Group:
-    """A frozen dataclass with some of its values replaced, groups within it likewise.
+    """Return a frozen dataclass with some of its values replaced, also within nested groups.
 
     Args:
-        default: of which every value not given is kept; its own checks see the result.
+        default: provides every value not given; its own checks validate the result.
         values: a parsed TOML table or JSON object.
-        name: of the group, for messages.
+        name: name of the group, for messages.
 
     Raises:
-        ConfigError: it is no table, a key is unknown, or a value does not fit.
+        ConfigError: `values` is no table, a key is unknown, or a value is invalid.
     """
     if not isinstance(values, dict):
         raise ConfigError(name, repr(values), "a table of values")
@@ -55,7 +55,7 @@ def _fitting(name: str, value: Any, default: Any) -> Any:
     if isinstance(default, tuple) and isinstance(value, list):
         return tuple(value)
     wanted = (float, int) if isinstance(default, float) else (type(default),)
-    # What defaults to nothing may be anything: the group's own checks decide.
+    # A field that defaults to None may have any type: the group's own checks decide.
     if default is not None and type(value) not in wanted:
         raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
     return value

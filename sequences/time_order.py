@@ -1,7 +1,7 @@
-"""Which samples count where times repeat, run backward or jump ahead.
+"""Selection of samples where times repeat, run backward or jump ahead.
 
-The front end of streams (`fusion.imu.front_end`) decides by the same rules and numbers as samples
-come in; here all of a recording is there to look at.
+The front end of streams (`fusion.imu.front_end`) applies the same rules and thresholds as samples
+arrive; here the whole recording is available.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import numpy as np
 from stario.sequences.sequence import MAX_IMU_GAP, BoolArray, FloatArray
 
 LONG_GAP = 10.0
-"""A jump ahead by more than this [s] is far, and needs more samples to be believed."""
+"""A jump ahead by more than this [s] is far, and needs more samples to be confirmed."""
 
 CONFIRMED, CONFIRMED_FAR = 2, 20
-"""Samples that confirm a jump ahead in time, and a far one or one with no sample before."""
+"""Samples that confirm a jump ahead in time, and a far jump or one without earlier samples."""
 
 
 def advancing(time: FloatArray) -> BoolArray:
-    """Which of the times (N,) [s], all finite, move on: what counts is strictly increasing.
+    """Return which of the finite times (N,) [s] to keep, so that kept times strictly increase.
 
-    Those not later than all that count before are left out; so are the few that jump ahead of the
-    ones behind them, or a single wild time would make all that follow look late.
+    A time that is not later than all kept ones before it is dropped. So are a few that jump ahead
+    of those after them: otherwise a single wild time would make all that follow look late.
     """
     steps = np.diff(time)
     breaks = np.flatnonzero((steps < 0.0) | (steps > MAX_IMU_GAP)) + 1
-    parts: list[tuple[int, int]] = []  # [start, stop) of what counts so far
+    parts: list[tuple[int, int]] = []  # [start, stop) of the runs kept so far
     for start, stop in pairwise([0, *breaks.tolist(), len(time)]):
         if start == stop:
             continue
@@ -44,7 +44,7 @@ def advancing(time: FloatArray) -> BoolArray:
 
 
 def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], behind: FloatArray) -> int:
-    """The first part that the times behind it, none decreasing, show to be from the future."""
+    """Return the first part that later, non-decreasing times `behind` show to be too far ahead."""
     first, samples = len(parts), 0
     for k in reversed(range(len(parts))):
         start, stop = parts[k]

@@ -1,4 +1,4 @@
-"""Units that recordings come in, and how they turn into s, rad/s and m/s^2."""
+"""Units of recordings, and their conversion to s, rad/s and m/s^2."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
 TIME_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-"""How many make a second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
+"""Units per second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
 
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180.0}
 
@@ -19,7 +19,7 @@ ACCEL_UNITS = {
     "-m/s^2": -1.0,
     "-g": -STANDARD_GRAVITY,
 }
-"""The minus is for devices that report gravity where others report specific force: Apple's."""
+"""The minus is for devices that report gravity instead of specific force: Apple's."""
 
 MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mG": 0.1}
 
@@ -67,9 +67,9 @@ _SPELLINGS = {
 
 
 def unit_named(text: str) -> str:
-    """The tables' spelling of a unit: case, blanks and `^` do not matter (`rad s^-1`: `rad/s`).
+    """Return a unit in the tables' spelling, ignoring case, blanks and `^` (`rad s^-1`: `rad/s`).
 
-    Signs that another program read in the wrong encoding (`m/sÂ²`, `\ufffdT`) are known as well.
+    Characters garbled by a wrong encoding (`m/sÂ²`, `\ufffdT`) are recognised as well.
     """
     plain = text.lower().replace(" ", "").replace("^", "").replace("â", "")
     return _SPELLINGS.get(plain, plain)
@@ -78,16 +78,16 @@ def unit_named(text: str) -> str:
 def with_units(
     sequence: ImuSequence, gyro_unit: str = "rad/s", accel_unit: str = "m/s^2"
 ) -> ImuSequence:
-    """The recording in rad/s and m/s^2, given what its numbers are in.
+    """Convert a recording to rad/s and m/s^2 from the units of its numbers.
 
     Args:
-        sequence: a recording whose numbers are in the units named.
+        sequence: recording whose numbers are in the given units.
         gyro_unit: one of `GYRO_UNITS`.
         accel_unit: one of `ACCEL_UNITS`; a leading minus turns gravity into specific force.
 
     Raises:
-        InputError: a unit is unknown, or given for numbers that were converted from the unit that
-            their file names.
+        InputError: a unit is unknown, or given for numbers already converted from the unit named
+            in their file.
     """
     return replace(
         sequence,
@@ -102,6 +102,6 @@ def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, floa
         raise InputError(field, repr(unit), f"one of {', '.join(known)}")
     if known[name] != 1.0 and sensor in sequence.converted:
         found = f"{unit!r} for {sequence.name}, whose file names its unit"
-        expected = f"{next(iter(known))}, to which it is converted already"
-        raise InputError(field, found, expected, "leave the option out or mend the file's header")
+        expected = f"{next(iter(known))}, to which it was converted on reading"
+        raise InputError(field, found, expected, "omit the option or fix the file's header")
     return known[name]

@@ -3,12 +3,13 @@
 A window that starts at t_i holds the 200 samples at t_i + k / 200 s, gyroscope then accelerometer,
 each rotated from the body into a gravity-aligned frame; its target is the displacement from t_i to
 t_j = t_i + 1 s in that frame (TLIO, Liu et al. 2020, section IV). For training the attitude is
-levelled by the IMU as in use, with the heading of the truth; or true, the papers' protocol.
+levelled by the IMU as at inference, with the heading of the ground truth; or it is the true one, as
+in the papers.
 
-The networks see a window in frame H, in which the device's heading is zero: the same motion of the
-same device then looks the same whichever way it points. The heading is that of the twist about the
-vertical, averaged over the window (`mean_heading`); it has no singularity but for a device that
-lies upside down all the while, where any heading is as good as another.
+The networks receive windows in frame H, in which the device's heading is zero: a given motion of a
+device then gives the same window whatever its heading. The heading is that of the twist about the
+vertical, averaged over the window (`mean_heading`); it is singular only for a device that is upside
+down throughout, where any heading will do.
 """
 
 from __future__ import annotations
@@ -34,30 +35,30 @@ from stario.sequences.time_order import advancing
 log = logging.getLogger(__name__)
 
 WINDOW_RATE = 200.0
-"""Samples per second of a window [Hz]."""
+"""Sampling rate of a window [Hz]."""
 
 WINDOW_SAMPLES = 200
-"""Samples of a window."""
+"""Number of samples in a window."""
 
 WINDOW_SECONDS = WINDOW_SAMPLES / WINDOW_RATE
 """Length of a window [s]."""
 
 Attitude = Literal["levelled", "true"]
-"""By which training windows are turned into the world; see `world_streams`."""
+"""Attitude that rotates training windows into the world frame; see `world_streams`."""
 
 MIN_RATE, MAX_RATE = 40.0, 1200.0
-"""Sampling rates [Hz] that are accepted (50 Hz to 1 kHz, with some slack for jitter)."""
+"""Limits of accepted sampling rates [Hz] (50 Hz to 1 kHz, with a margin for jitter)."""
 
 
 @dataclass(frozen=True, eq=False)
 class WorldStream:
-    """An unbroken stretch of a recording at 200 Hz in the world frame, ready to cut windows from.
+    """Unbroken stretch of a recording at 200 Hz in the world frame, ready to be cut into windows.
 
     Attributes:
-        name: the recording's.
+        name: name of the recording.
         imu_W: (N, 6) float32, gyroscope [rad/s] and specific force [m/s^2] rotated into W.
         position_W: (N, 3) float32 [m], relative to the stretch's start.
-        facing_W: (N, 2) float32, which way the device faces, as `facing` gives it.
+        facing_W: (N, 2) float32, facing direction of the device, from `facing`.
     """
 
     name: str
@@ -69,21 +70,21 @@ class WorldStream:
         return len(self.imu_W)
 
     def part(self, start: int, stop: int) -> WorldStream:
-        """Samples from start to before stop, none where there are none."""
+        """Return samples [start, stop); empty if there are none."""
         part = slice(start, max(stop, start))
         return WorldStream(self.name, self.imu_W[part], self.position_W[part], self.facing_W[part])
 
 
 @dataclass(frozen=True, eq=False)
 class LevelledImu:
-    """An IMU at 200 Hz in a gravity-aligned frame.
+    """IMU samples at 200 Hz in a gravity-aligned frame.
 
     Attributes:
-        time: (M,) [s]; even but for long gaps, of which whole seconds are left out: a clock that
+        time: (M,) [s]; even except at long gaps, of which whole seconds are omitted: a clock that
             jumps by decades must not cost memory.
         imu: (M, 6) float32, gyroscope [rad/s] and specific force [m/s^2].
-        facing: (M, 2) float32, which way the device faces, as `facing` gives it.
-        usable: (M,) where neither the IMU nor, if it was asked for, the truth has a gap.
+        facing: (M, 2) float32, facing direction of the device, from `facing`.
+        usable: (M,) bool, whether neither the IMU nor, if it is used, the ground truth has a gap.
     """
 
     time: FloatArray
@@ -93,10 +94,10 @@ class LevelledImu:
 
 
 def facing(R_NB: FloatArray) -> FloatArray:
-    """Which way a device faces (..., 2), from attitudes (..., 3, 3): not normalised.
+    """Return the facing direction of a device (..., 2), not normalised, from attitudes (..., 3, 3).
 
     Its angle is the attitude's twist about the vertical. Its length is 1 for a level device and
-    falls to 0 for one upside down, whose heading is not defined.
+    falls to 0 for one upside down, whose heading is undefined.
     """
     return 0.5 * np.stack(
         [R_NB[..., 0, 0] + R_NB[..., 1, 1], R_NB[..., 1, 0] - R_NB[..., 0, 1]], axis=-1
@@ -104,21 +105,21 @@ def facing(R_NB: FloatArray) -> FloatArray:
 
 
 HEADING_STEP = 20
-"""Samples between the attitudes that a window's heading is the mean of."""
+"""Samples between the attitudes over which a window's heading is averaged."""
 
 VELOCITY_WEIGHTS = (np.arange(WINDOW_SAMPLES) + 0.5) / (WINDOW_SAMPLES * WINDOW_RATE)
-"""Of the accelerations in a window [s]: with those in the next, weighted in reverse, they add up to
-how the mean velocity changes from the one second to the other."""
+"""Weights of the accelerations in a window [s]. The weighted sum, plus that over the next window
+with reversed weights, is the change of mean velocity from one second to the next."""
 
 
 def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
-    """Heading (B,) [rad] of windows from which way the device faces at ten instants (B, 10, 2)."""
+    """Return headings (B,) [rad] of windows from facing directions at ten instants (B, 10, 2)."""
     total = np.asarray(facing_N, dtype=np.float64).sum(axis=-2)
     return np.asarray(np.arctan2(total[..., 1], total[..., 0]))
 
 
 def turned_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np.float32]:
-    """Windows (B, 6, 200) turned about the vertical by `yaw` (B,) [rad]."""
+    """Rotate windows (B, 6, 200) about the vertical by `yaw` (B,) [rad]."""
     R = about_z(yaw).as_matrix().astype(np.float32)
     vectors = windows.reshape(len(windows), 2, 3, WINDOW_SAMPLES)
     turned: NDArray[np.float32] = (R[:, None] @ vectors).reshape(windows.shape)
@@ -126,7 +127,7 @@ def turned_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np.
 
 
 def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
-    """Values (N, K) at `time` brought to the even `grid` (M,) at 200 Hz.
+    """Resample values (N, K) at `time` to the even `grid` (M,) at 200 Hz.
 
     Faster sensors are averaged over each grid step, so that noise and vibration above 100 Hz do
     not alias; slower ones are interpolated linearly.
@@ -150,22 +151,22 @@ def world_streams(
     sequence: ImuSequence,
     attitude: Attitude = "levelled",
 ) -> list[WorldStream]:
-    """Cut a recording with truth into unbroken 200 Hz stretches in the world frame.
+    """Cut a recording with ground truth into unbroken 200 Hz stretches in the world frame.
 
-    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); those
-    shorter than two windows are left out.
+    No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); stretches
+    shorter than two windows are skipped.
 
     Args:
         sequence: the recording.
-        attitude: "levelled" by the IMU with the true heading, or "true". A device that was mounted
-            askew, or a truth that is, shows in the mean specific force under the true attitude:
-            a network learns from it which way the device faces, and misses that in use.
+        attitude: "levelled" (by the IMU, with the true heading) or "true". If the device or the
+            truth is misaligned, the mean specific force under the true attitude reveals it: a
+            network learns the facing direction from that, and lacks the cue at inference.
 
     Raises:
         InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.
     """
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to learn from")
+        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for training")
     world = imu_in_world(sequence, sequence.truth, attitude)
     known = sequence.truth.valid
     truth = sequence.truth
@@ -183,7 +184,7 @@ def world_streams(
 
 
 def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -> LevelledImu:
-    """The IMU at 200 Hz turned into the world, by an attitude as for `world_streams`.
+    """Return the IMU at 200 Hz in the world frame, with `attitude` as for `world_streams`.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -199,7 +200,7 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
 def _even(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
 ) -> LevelledImu:
-    """Samples turned by their attitudes and brought to an even 200 Hz."""
+    """Rotate samples by their attitudes and resample them to an even 200 Hz."""
     left_out = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
     even_time = time - left_out
     even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
@@ -212,9 +213,10 @@ def _even(
 def _levelled(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, true_WB: Rotation, known: BoolArray
 ) -> Rotation:
-    """Attitudes levelled by the IMU, turned about the vertical to the true ones.
+    """Return attitudes levelled by the IMU and rotated about the vertical to the true heading.
 
-    Within a window the heading is the gyroscope's, as in use: the turn is averaged over a second.
+    Within a window the heading follows the gyroscope, as at inference: the rotation is averaged
+    over a second.
     """
     parts = unbroken(time)
     levelled_NB = Rotation.from_matrix(_levelled_NB(time, gyro, accel))
@@ -229,7 +231,7 @@ def _levelled(
 
 
 def _levelled_NB(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-    """Attitudes (n, 3, 3) levelled by the IMU, each unbroken stretch for itself."""
+    """Return attitudes (n, 3, 3) levelled by the IMU, separately in each unbroken stretch."""
     R_NB = np.empty((len(time), 3, 3))
     for start, stop in unbroken(time):
         part = slice(start, stop)
@@ -238,12 +240,12 @@ def _levelled_NB(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> Float
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Time, gyroscope and accelerometer with bad, repeated and out-of-order samples dropped.
+    """Return time, gyroscope and accelerometer without bad, repeated and out-of-order samples.
 
-    The few that jump ahead of those behind them are dropped as well, and their number is logged.
+    A few samples that jump ahead of later ones are dropped as well, and their number is logged.
 
     Raises:
-        InputError: what is left has fewer than two samples or a rate that is not accepted.
+        InputError: fewer than two samples are left, or their rate is not accepted.
     """
     finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < ABSURD).all(axis=1)
     finite &= (np.abs(sequence.accel) < ABSURD).all(axis=1)
@@ -251,7 +253,7 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     counts = advancing(sequence.time[index])
     ahead = _ahead(sequence.time[index], counts)
     if ahead:
-        log.warning("%s: samples ahead of their time left out: %d", sequence.name, ahead)
+        log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
     index = index[counts]
     if len(index) < 2:
         raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
@@ -268,28 +270,28 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _ahead(time: FloatArray, counts: BoolArray) -> int:
-    """How many of the samples that do not count are later than all before that do."""
+    """Return the number of dropped samples that are later than all kept ones before them."""
     newest = np.maximum.accumulate(np.where(counts, time, -np.inf))
     return int((time > newest).sum())
 
 
 def unbroken(time: FloatArray) -> list[tuple[int, int]]:
-    """Stretches [start, stop) of increasing times (N,) [s] without a gap of the IMU."""
+    """Return stretches [start, stop) of increasing times (N,) [s] without a gap of the IMU."""
     breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
     return list(pairwise([0, *breaks.tolist(), len(time)]))
 
 
 def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
-    """First samples (M,) of the windows every `stride` samples."""
+    """Return the first samples (M,) of windows every `stride` samples."""
     return np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
 
 
 def windows_at(
     stream: WorldStream, starts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Windows (M, 6, 200) that begin at samples `starts` (M,), and displacements (M, 3) [m], in W.
+    """Return windows (M, 6, 200) from samples `starts` (M,), and displacements (M, 3) [m], in W.
 
-    Frame H is that turned by minus `headings_at`.
+    Rotating both by minus `headings_at` gives frame H.
     """
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
     windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
@@ -297,17 +299,17 @@ def windows_at(
 
 
 def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> FloatArray:
-    """The device's heading (M,) [rad] in the windows that begin at samples `starts` (M,).
+    """Return the device's heading (M,) [rad] in the windows that start at samples `starts`.
 
     Args:
-        facing: (N, 2) of the stream, as the function of that name gives it.
-        starts: (M,).
+        facing: (N, 2) facing directions along the stream, from the function of that name.
+        starts: (M,) first samples of the windows.
     """
     return mean_heading(facing[starts[:, None] + np.arange(0, WINDOW_SAMPLES, HEADING_STEP)])
 
 
 def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Maximal runs [start, stop) of True."""
+    """Return the maximal runs [start, stop) of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 

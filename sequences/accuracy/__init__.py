@@ -1,1 +1,1 @@
-"""How far a track is from the truth, and how honest its covariance."""
+"""Errors of a track against the ground truth, and consistency of its covariance."""

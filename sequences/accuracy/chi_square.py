@@ -1,4 +1,4 @@
-"""Quantiles of the chi-square distribution: gates and bounds, without the cost of `scipy.stats`."""
+"""Chi-square quantiles, for gates and bounds, without the cost of `scipy.stats`."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from scipy.special import gammaincinv
 
 @lru_cache(maxsize=4096)
 def chi2_quantile(probability: float, dof: float) -> float:
-    """The value that chi-square with so many degrees of freedom stays below with a probability."""
+    """Return the chi-square quantile for a probability and `dof` degrees of freedom."""
     return float(2.0 * gammaincinv(0.5 * dof, probability))

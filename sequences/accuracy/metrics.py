@@ -1,7 +1,7 @@
-"""How far a track is from the truth: ATE, RTE, PDE, AYE and NEES, each with one meaning.
+"""Errors of a track against the ground truth: ATE, RTE, PDE, AYE and NEES, each defined once.
 
-Every error is that of a pose of the estimate against the truth interpolated to its time, never
-across a gap of the truth. `CONVENTIONS` says in words what each number means.
+Every error compares a pose of the estimate with the truth interpolated to its time, never across a
+gap of the truth. `CONVENTIONS` defines each number in words.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Convention = Literal["rms", "ronin", "mean"]
 CONVENTIONS: dict[str, str] = {
     "ate_m": "absolute trajectory error [m]: root mean square of the position error's norm",
     "rte_m": "relative trajectory error [m]: root mean square of the norm of the displacement "
-    "error over 60 s, in world axes; for tracks shorter than that the end-to-end displacement "
-    "error scaled by 60 s / length",
+    "error over 60 s, in world axes; for tracks shorter than that, the end-to-end displacement "
+    "error scaled by 60 s / duration",
     "pde": "position drift error [1]: final position error / length of the true path",
     "aye_rad": "absolute yaw error [rad]: root mean square of the wrapped yaw error, which is the "
     "twist about the vertical of R_estimate R_truth^T",
@@ -30,17 +30,17 @@ CONVENTIONS: dict[str, str] = {
     "3-D; its expectation is 3",
     "nis": "normalised innovation squared [1]: innovation^T S^-1 innovation; its expectation is "
     "the number of components",
-    "coverage": "share [1] of the estimate's poses at whose time the truth is known; the truth is "
+    "coverage": "share [1] of the estimate's poses at times when the truth is known; the truth is "
     "interpolated linearly, never across its gaps",
     "path_m": "length of the true path [m] along 1 s chords, within the times compared",
     "duration_s": "time [s] between the first and the last pose compared",
-    "alignment": "what is done to the estimate before: none; first (yaw and position of the first "
-    "common pose); yaw (least squares in yaw and position, at rest the attitudes' yaw); tilt "
+    "alignment": "prior alignment of the estimate: none; first (yaw and position of the first "
+    "common pose); yaw (least squares in yaw and position; at rest, yaw of the attitudes); tilt "
     "is never changed",
-    "horizontal": "true: position errors and path in x and y alone; false: in x, y and z",
-    "convention": "rms as said above; ronin averages the squares over coordinates too, as RoNIN's "
-    "code does, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
-    "norms, not squares, as TLIO's code does; PDE and AYE are the same in all",
+    "horizontal": "true: position errors and path in x and y only; false: in x, y and z",
+    "convention": "rms as defined above; ronin also averages the squares over coordinates, as in "
+    "RoNIN's code, so ATE and RTE are smaller by sqrt(2) in 2-D and sqrt(3) in 3-D; mean averages "
+    "norms, not squares, as in TLIO's code; PDE and AYE are the same in all",
 }
 
 
@@ -48,8 +48,8 @@ CONVENTIONS: dict[str, str] = {
 class TrackMetrics:
     """Errors of one track, see `CONVENTIONS`; lengths in m, angles in rad, times in s.
 
-    `rte_m` is nan where gaps leave no pair of poses `rte_interval_s` apart, `pde` where the true
-    path has no length. `rte_scaled` tells that the track was shorter than the interval.
+    `rte_m` is NaN if gaps leave no pair of poses `rte_interval_s` apart, `pde` if the true path has
+    no length. `rte_scaled` is True if the track was shorter than the interval.
     """
 
     ate_m: float
@@ -67,7 +67,7 @@ class TrackMetrics:
 
 
 _PLACE_M = 0.05
-"""A track that stays within this of its middle [m] is of a device at rest."""
+"""A track that stays within this distance of its centre [m] is that of a device at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class PoseErrors:
 
 
 def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
-    """Compare two tracks as they are, at the estimate's times.
+    """Compare two tracks without alignment, at the estimate's times.
 
     Raises:
         InputError: there is no time at which both are known.
@@ -115,16 +115,16 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
 
 
 def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajectory:
-    """Turn an estimate about the vertical and shift it onto the truth; tilt stays as it is.
+    """Rotate an estimate about the vertical and shift it onto the truth; tilt is unchanged.
 
-    Position, attitude, velocity and covariance are turned alike.
+    Position, attitude, velocity and covariance are rotated together.
 
     Args:
         estimate: the track to move.
-        truth: where to.
+        truth: the track to align it with.
         mode: "none"; "first", by yaw and position of the first common pose; "yaw", by the yaw and
             position of least squared position error (Horn 1987, restricted to the vertical axis).
-            Positions of a device that stays where it is tell no yaw: there it is the attitudes'.
+            The positions of a stationary device give no yaw; there it comes from the attitudes.
 
     Raises:
         InputError: unknown mode, or no overlap.
@@ -155,13 +155,13 @@ def evaluate_track(
     convention: Convention = "rms",
     rte_interval: float = 60.0,
 ) -> TrackMetrics:
-    """Errors of a track against the truth, as `CONVENTIONS` defines them.
+    """Evaluate a track against the ground truth; `CONVENTIONS` defines the errors.
 
     Args:
         estimate: the track.
         truth: the true track; it may be sampled more coarsely and have gaps.
         alignment: see `align`.
-        horizontal: positions in x and y alone.
+        horizontal: whether to compare positions in x and y only.
         convention: how position errors are averaged.
         rte_interval: span of the relative error [s].
 
@@ -195,12 +195,12 @@ def evaluate_track(
 def _relative_error(
     time: FloatArray, error: FloatArray, interval: float, convention: Convention
 ) -> tuple[float, bool]:
-    """Average error of the displacement over `interval` [m], and whether it had to be scaled.
+    """Return the average displacement error over `interval` [m], and whether it had to be scaled.
 
-    The displacement's error between two poses is the difference of their position errors.
+    The displacement error between two poses is the difference of their position errors.
     """
     duration = time[-1] - time[0]
-    # A partner may lie half a step of the estimate off, but no more than a hundredth of the span.
+    # A partner may be half a step of the estimate off, but no more than 1 % of the interval.
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     tolerance = min(0.5 * step + 1e-6, 0.01 * interval)
     if duration < interval - tolerance:
@@ -235,7 +235,7 @@ def _path_length(truth: Trajectory, horizontal: bool) -> float:
 def _moved(
     trajectory: Trajectory, yaw: float, pivot_W: FloatArray, target_W: FloatArray
 ) -> Trajectory:
-    """Turn by `yaw` [rad] about the vertical through `pivot_W`, then take that to `target_W`."""
+    """Rotate by `yaw` [rad] about the vertical through `pivot_W`, then move that to `target_W`."""
     turn = about_z(yaw)
     R = turn.as_matrix()
     velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
@@ -266,7 +266,7 @@ def _span(trajectory: Trajectory) -> str:
 
 
 def check_convention(name: str) -> Convention:
-    """A word as a convention of averaging.
+    """Return the averaging convention of that name.
 
     Raises:
         InputError: there is no such convention.

@@ -1,4 +1,4 @@
-"""Whether errors are as large as their covariance says: NEES, its bounds, and that of positions."""
+"""Consistency of errors with their covariance: NEES, its bounds, and the NEES of positions."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class PositionNees:
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised estimation error squared, e^T P^-1 e; chi-square with k degrees if P is true.
+    """Return the normalised estimation error squared, e^T P^-1 e: chi-square(k) if P is correct.
 
     Args:
         error: (N, k).
         covariance: (N, k, k), in the squared units of `error`.
 
     Returns:
-        (N,), without unit.
+        (N,), dimensionless.
 
     Raises:
         InputError: shapes do not agree or a covariance is not positive definite.
@@ -54,12 +54,12 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Bounds of the mean NEES (or NIS) of a consistent estimator over independent samples.
+    """Return bounds of the mean NEES (or NIS) of a consistent estimator over independent samples.
 
     Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 5.4.
 
     Args:
-        dof: length of the error vector; the expectation of the mean.
+        dof: length of the error vector, which is the expectation of the mean.
         runs: number of independent samples averaged; poses of one track are not independent.
         confidence: probability between the bounds.
 
@@ -79,11 +79,11 @@ def nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[float, f
 def position_nees(
     estimate: Trajectory, truth: Trajectory, alignment: Alignment = "first"
 ) -> PositionNees:
-    """NEES of a track's 3-D position under its own covariance.
+    """Return the NEES of a track's 3-D position under its own covariance.
 
     Poses with a covariance of exactly zero, such as a start that is the origin by definition,
-    carry no statement and are left out. Aligning takes away the share of the initial yaw in the
-    error but not in the covariance: for a check of that share give the truth's frame and "none".
+    are skipped. Alignment removes the share of the initial yaw from the error but not from the
+    covariance: to check that share, give the estimate in the truth's frame and "none".
 
     Raises:
         InputError: no overlap, no covariance, or one that is not positive definite.
@@ -92,7 +92,7 @@ def position_nees(
         raise InputError("estimate.position_covariance_W", "None", "(N, 3, 3) [m^2]")
     errors = pose_errors(align(estimate, truth, alignment), truth)
     covariance = errors.estimate.position_covariance_W
-    assert covariance is not None  # align and selection keep it
+    assert covariance is not None  # alignment and selection keep it
     stated = covariance.any(axis=(1, 2))
     if not stated.any():
         raise InputError("estimate.position_covariance_W", "only zeros", "covariances [m^2]")

@@ -1,15 +1,14 @@
-"""Attitude from the IMU alone: gravity initialisation and a levelled integration.
+"""Attitude from the IMU alone: gravity initialisation and levelled integration.
 
-N is the frame this attitude is given in: gravity-aligned like W, its yaw zero at the start and
-drifting with the gyroscope. It needs neither truth nor network, so that windows can be prepared
-before any filter runs, streaming and batch see the same ones, and a network can be trained on what
-it will be shown.
+The attitude is relative to frame N: gravity-aligned like W, with a yaw that is zero at the start
+and drifts with the gyroscope. It needs neither ground truth nor a network, so that windows can be
+prepared before any filter runs and are the same in streaming and batch, in training and inference.
 
-A small Kalman filter over the attitude's error and the gyroscope's bias corrects the tilt: the
-specific force, averaged over an update period and seen in N, should point up, and the mean of a
-walker's acceleration vanishes over the filter's time constant of twelve seconds. The bias is one in
-body axes, so that it stays right when the device turns: phones that hand out raw rates are off by
-up to 0.1 rad/s. Nothing here tells the yaw.
+A small Kalman filter over the attitude error and the gyroscope bias corrects the tilt: the specific
+force, averaged over an update period and rotated into N, should point up, because a pedestrian's
+mean acceleration vanishes over the filter's time constant of twelve seconds. The bias is estimated
+in body axes, so that it stays valid when the device turns: phones that report raw rates are off by
+up to 0.1 rad/s. The yaw is not observable here.
 """
 
 from __future__ import annotations
@@ -25,42 +24,42 @@ from stario.sequences.attitude.so3 import cross, exp_so3
 from stario.sequences.sequence import FloatArray
 
 PERIOD = 0.1
-"""Between corrections of the tilt [s]."""
+"""Time between corrections of the tilt [s]."""
 
 START_SECONDS = 1.0
-"""Length of the stretch whose mean specific force levels the first attitude [s]."""
+"""Length of the initial stretch whose mean specific force levels the first attitude [s]."""
 
 STILL_ACCEL = 0.3
-"""Deviation of the specific force [m/s^2] up to which its mean shows the vertical to 0.01 rad."""
+"""Deviation of the specific force [m/s^2] up to which its mean gives the vertical to 0.01 rad."""
 
 STILL_GYRO = 0.1
-"""Root mean square rate [rad/s], likewise: no measure of rest, for a hand may tremble."""
+"""Root mean square rate [rad/s], likewise; not a test of rest, since a hand may tremble."""
 
 LEAST_FORCE = 1.0
-"""Mean specific force [m/s^2] below which it shows no vertical: free fall, a dead sensor."""
+"""Mean specific force [m/s^2] below which it gives no vertical: free fall, a dead sensor."""
 
 _TILT_SIGMA = 0.05
-"""Of the tilt at first and behind a gap [rad]."""
+"""Sigma of the tilt at the start, and added after a gap [rad]."""
 
 BIAS_SIGMA = 0.01
-"""Of the gyroscope's bias at first, per axis [rad/s]: right ones keep, raw ones find theirs."""
+"""Initial sigma of the gyroscope bias per axis [rad/s]; suits calibrated and raw gyroscopes."""
 
 _BIAS_WALK = 2e-5
-"""Of the bias [rad/s/sqrt(s)]."""
+"""Random walk of the bias [rad/s/sqrt(s)]."""
 
 _TURN_NOISE, _FORCE_NOISE = 8.5e-3, 0.1
-"""Densities of tilt [rad/sqrt(s)] and of the direction of force of a walker [rad sqrt(s)]; their
-ratio is the rate at which a settled filter levels [1/s]."""
+"""Noise densities of the tilt [rad/sqrt(s)] and of a pedestrian's force direction [rad sqrt(s)];
+their ratio is the rate at which the converged filter levels [1/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class GravityStart:
-    """First attitude from gravity.
+    """Initial attitude from gravity.
 
     Attributes:
         R_WB: (3, 3) at the first sample, yaw zero.
-        still: whether the device was at rest, so that the tilt can be trusted.
-        force: size of the mean specific force [m/s^2]; gravity, if the units are right.
+        still: whether the device was still enough for the tilt to be trusted.
+        force: magnitude of the mean specific force [m/s^2]; gravity, if the units are right.
     """
 
     R_WB: FloatArray
@@ -69,10 +68,10 @@ class GravityStart:
 
 
 def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> GravityStart:
-    """Level the first attitude by the mean specific force of a short stretch.
+    """Level the first attitude with the mean specific force of a short stretch.
 
-    The samples are turned into the first sample's axes with the gyroscope before averaging, so
-    that the stretch may be one of motion.
+    The samples are rotated into the first sample's axes with the gyroscope before averaging, so
+    that the device may move.
 
     Args:
         time: (n + 1,) [s], about one second.
@@ -92,9 +91,9 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
-    """Attitudes (n + 1, 3, 3) at the samples from the one at the first sample.
+    """Integrate attitudes (n + 1, 3, 3) at the samples from the one at the first sample.
 
-    Mean rate and coning (Savage 1998), as in the filter's preintegration.
+    Uses the mean rate and a coning correction (Savage 1998), as in the filter's preintegration.
     """
     dt = (time[1:] - time[:-1])[:, None]
     turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * cross(gyro[:-1], gyro[1:]))
@@ -106,7 +105,7 @@ def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArra
 
 
 def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-    """Attitudes R_NB (n, 3, 3) at the samples of an unbroken stretch, as in use.
+    """Return attitudes R_NB (n, 3, 3) at the samples of an unbroken stretch, as at inference.
 
     Args:
         time: (n,) [s].
@@ -133,19 +132,19 @@ class LevelledAttitude:
         R_NB: (3, 3) at the start.
 
     Attributes:
-        R_NB: (3, 3) now.
-        b_g: (3,) the gyroscope's bias, as far as gravity tells it [rad/s].
+        R_NB: (3, 3) current attitude.
+        b_g: (3,) gyroscope bias [rad/s], as far as it is observable from gravity.
     """
 
     def __init__(self, R_NB: FloatArray) -> None:
         self.R_NB = R_NB
         self.b_g = np.zeros(3)
         tilt, bias = _TILT_SIGMA**2, BIAS_SIGMA**2
-        # Of theta about N's axes, R = (I + [theta]x) R^, and of the bias, true minus estimate.
+        # Covariance of theta about N's axes, R = (I + [theta]x) R^, and of the bias error.
         self._P = np.diag([tilt, tilt, 0.0, bias, bias, bias])
 
     def advance(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-        """Move over one update period and return the attitudes (n + 1, 3, 3) at its samples.
+        """Advance by one update period and return the attitudes (n + 1, 3, 3) at its samples.
 
         Args:
             time: (n + 1,) [s].
@@ -158,12 +157,12 @@ class LevelledAttitude:
 
     @property
     def bias_sigma(self) -> float:
-        """Of the bias about the level axes, per axis [rad/s]; gravity never tells the third."""
+        """Sigma of the bias per horizontal axis [rad/s]; the third is unobservable from gravity."""
         level = self.R_NB[:2]
         return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
 
     def restart(self) -> None:
-        """After a gap the tilt is not known well: level quickly again."""
+        """Increase the tilt's uncertainty after a gap, so that it is levelled quickly again."""
         self._P = self._P + np.diag([_TILT_SIGMA**2] * 2 + [0.0] * 4)
 
     def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
@@ -175,14 +174,14 @@ class LevelledAttitude:
         gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
         P = P - gain @ P[:2]
         self._P = 0.5 * (P + P.T)
-        # The smallest turn that takes `up` to the vertical, to first order; none about it.
+        # The smallest rotation that takes `up` to the vertical, to first order; none about it.
         x = gain @ np.array([up[1], -up[0]])
         self.b_g = self.b_g + x[3:]
         turned: FloatArray = exp_so3(np.array([x[0], x[1], 0.0])) @ attitudes[-1]
         return turned
 
     def _propagated(self, attitudes: FloatArray, dt: float) -> FloatArray:
-        """The covariance after an update period: theta' = theta - dt R d_bg."""
+        """Return the covariance after an update period: theta' = theta - dt R d_bg."""
         F = np.eye(6)
         F[:3, 3:] = -dt * attitudes.mean(axis=0)
         turn, walk = dt * _TURN_NOISE**2, dt * _BIAS_WALK**2
@@ -191,6 +190,6 @@ class LevelledAttitude:
 
 
 def _inverse(P: FloatArray, noise: float) -> FloatArray:
-    """(P + noise I)^-1 of a symmetric P (2, 2)."""
+    """Return (P + noise I)^-1 of a symmetric P (2, 2)."""
     a, b, d = float(P[0, 0]) + noise, float(P[0, 1]), float(P[1, 1]) + noise
     return np.array([[d, -b], [-b, a]]) / (a * d - b * b)

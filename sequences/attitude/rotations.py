@@ -8,36 +8,36 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.sequence import FloatArray
 
 NORM_TOLERANCE = 1e-2
-"""A quaternion whose norm is off 1 by more is none: files round, but not that coarsely."""
+"""Largest deviation of a quaternion's norm from 1: files round, but not more coarsely."""
 
 
 def yaw_of(attitude_WB: Rotation) -> FloatArray:
-    """Yaw [rad] of the heading-preserving twist about world z (singular only upside down).
+    """Return the yaw [rad] of the twist about world z (singular only upside down).
 
-    The twist of a quaternion about z is the yaw of the shortest tilt-free part; unlike an Euler
-    angle it stays defined when a device stands upright.
+    The twist is the rotation that remains when the smallest tilt is removed; unlike an Euler angle
+    its yaw stays defined when a device stands upright.
     """
     quat_xyzw = np.atleast_2d(attitude_WB.as_quat())
     return wrap_angle(2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3]))
 
 
 def wrap_angle(angle: FloatArray) -> FloatArray:
-    """Angle [rad] brought into (-pi, pi]."""
+    """Wrap an angle [rad] to (-pi, pi]."""
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
 
 
 def about_z(yaw: FloatArray | float) -> Rotation:
-    """Rotation by `yaw` [rad] about the world's vertical."""
+    """Return the rotation by `yaw` [rad] about the world's vertical."""
     return Rotation.from_rotvec(np.multiply.outer(np.asarray(yaw, dtype=np.float64), [0.0, 0, 1]))
 
 
 def tilt_aligning(up_B: FloatArray) -> Rotation:
-    """The smallest rotation R_WB that takes the direction `up_B` (3,) to world z (yaw stays 0)."""
+    """Return the smallest rotation R_WB that takes direction `up_B` (3,) to world z (zero yaw)."""
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], np.atleast_2d(up_B))[0]
 
 
 def cumulative_rotations(steps: Rotation) -> FloatArray:
-    """Products q_0 q_1 ... q_k as (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
+    """Return products q_0 q_1 ... q_k (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
     count = len(steps) + 1
     width = int(np.ceil(np.sqrt(count)))
     padded = np.tile([0.0, 0.0, 0.0, 1.0], (width * width, 1))
@@ -54,7 +54,7 @@ def cumulative_rotations(steps: Rotation) -> FloatArray:
 
 
 def _product(p: FloatArray, q: FloatArray) -> FloatArray:
-    """Products of quaternions (..., 4), xyzw; SciPy's composition costs far more than this."""
+    """Multiply quaternions (..., 4), xyzw; SciPy's composition is far slower."""
     a, b = p[..., :3], q[..., :3]
     vector = p[..., 3:] * b + q[..., 3:] * a + np.cross(a, b)
     scalar = p[..., 3] * q[..., 3] - np.sum(a * b, axis=-1)

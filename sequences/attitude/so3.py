@@ -1,4 +1,4 @@
-"""Rotations as the matrix group SO(3), in closed form, for stacks of them.
+"""Closed-form functions of the matrix group SO(3), vectorised over stacks.
 
 Source: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics",
 2018, appendix B.
@@ -23,17 +23,17 @@ _ONES = np.ones(3)
 
 
 def skew(vector: FloatArray) -> FloatArray:
-    """Cross-product matrices [x]x (..., 3, 3) of vectors (..., 3)."""
+    """Return the cross-product matrices [x]x (..., 3, 3) of vectors (..., 3)."""
     return (vector @ _HAT).reshape(*vector.shape[:-1], 3, 3)
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Products a x b (..., 3); NumPy's own takes ten times as long for a handful of vectors."""
+    """Return a x b (..., 3); `np.cross` takes ten times as long for a handful of vectors."""
     return (skew(a) @ b[..., None])[..., 0]
 
 
 def exp_and_left_jacobian(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation matrices exp([theta]x) and left Jacobians J_l(theta), sharing their work.
+    """Return rotation matrices exp([theta]x) and left Jacobians J_l(theta), computed together.
 
     Args:
         theta: (..., 3) rotation vectors [rad].
@@ -49,17 +49,17 @@ def exp_and_left_jacobian(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def exp_so3(theta: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     return exp_and_left_jacobian(theta)[0]
 
 
 def log_so3(R: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) [rad], of norm up to pi, of rotation matrices (..., 3, 3)."""
+    """Return the rotation vectors (..., 3) [rad], of norm up to pi, of matrices (..., 3, 3)."""
     return np.asarray(Rotation.from_matrix(R, assume_valid=True).as_rotvec(), dtype=np.float64)
 
 
 def series_coefficients(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of Rodrigues' formula, (1 - cos t)/t^2 and (t - sin t)/t^3 (..., 1, 1), exact to zero."""
+    """Return (1 - cos t)/t^2 and (t - sin t)/t^3 (..., 1, 1) of Rodrigues' formula, also near 0."""
     squared = (theta * theta) @ _ONES
     b = 0.5 - squared * (1.0 / 24.0 - squared / 720.0)
     c = 1.0 / 6.0 - squared * (1.0 / 120.0 - squared / 5040.0)

@@ -1,1 +1,1 @@
-"""What a recording says of itself: units, rest, magnetic field."""
+"""Inspection of a recording from its own data: units, rest, magnetic field."""

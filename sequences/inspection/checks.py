@@ -1,9 +1,9 @@
-"""Wrong units, missing gravity and the like, found in the numbers before anything runs on them.
+"""Detection of wrong units, missing gravity and the like, before a recording is processed.
 
-What a recording must obey whatever was done with the device: specific force, turned into one
+Every recording must obey one rule, however the device was moved: specific force, rotated into one
 frame by the integrated gyroscope, averages to gravity, because a person's velocity stays bounded.
-A gyroscope in deg/s turns it 57 times too far, and the average falls apart. A sign that is wrong
-for all three axes of the accelerometer cannot be seen that way (both the force and the average
+A gyroscope in deg/s rotates it 57 times too far, and the average collapses. A sign that is wrong
+for all three axes of the accelerometer cannot be detected that way (both the force and the average
 change sign), only against a true attitude; nor can a gyroscope that is 57 times too slow, which
 looks like a device held still.
 """
@@ -24,57 +24,57 @@ from stario.sequences.units import GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
 
 MIN_SECONDS = 1.5
-"""Shortest recording that holds a window and something around it [s]."""
+"""Shortest recording that holds a window and a margin around it [s]."""
 
 _SHORTEST_S = 0.9
 _WINDOW_S = 4.0
 _WINDOWS = 12
-"""Length, least and usual [s], and number of the stretches that are looked at, spread over the
-recording: the cost does not grow with it."""
+"""Least and usual length [s] and number of the stretches that are checked, spread over the
+recording: the cost does not grow with its length."""
 
 _NO_SENSOR = 1e4
-"""Larger on average is no sensor's, in deg/s, m/s^2 or any unit between."""
+"""Largest median magnitude that a sensor can have, in deg/s, m/s^2 or any unit in between."""
 
 _FAST_RAD_S = 15.0
-"""Nobody turns a device faster for a twentieth of the time; the fastest recorded is 2.7 rad/s,
-the slowest one read as deg/s 41."""
+"""Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
+least 41 if deg/s are taken for rad/s."""
 
 _OFF_GRAVITY = 0.1
-"""Relative error of the average force that no calibration leaves; recorded are 0.008 at most."""
+"""Relative error of the average force beyond any calibration's; recordings have at most 0.008."""
 
 _SHAKEN_OFF_GRAVITY = 0.25
-"""The same of a device that is shaken, whose sensors saturate; without gravity it is near 1."""
+"""The same for a shaken device, whose sensors saturate; without gravity it is near 1."""
 
 _APART_RATIO = 6.0
-"""Factor by which a wrong turning takes more from the average than the right one does."""
+"""Factor by which a wrong gyroscope unit reduces the average more than the right one."""
 
 _COHERENT = 0.7
-"""A force that keeps less of its size in its average is not dominated by gravity."""
+"""Ratio of average to median force below which gravity does not dominate."""
 
 _NO_GRAVITY = 0.3
-"""A smaller average force holds gravity in no unit: a device at rest whose gravity was removed."""
+"""A smaller average force has no gravity in any unit: a device at rest with gravity removed."""
 
 _G_RANGE = (0.8, 1.25)
 _FORCE_RANGE = (7.5, 12.5)
 """Average force of a recording in g and in m/s^2: sensors are off by a few percent, not by 25."""
 
-_UNIT_NAMED = "its unit is the one that the file names: is that right?"
-"""Where `with_units` takes no other."""
+_UNIT_NAMED = "its unit is the one named in the file: is that right?"
+"""Remedy if `with_units` accepts no other unit."""
 
 _SAMPLES = 10_000
-"""That are turned by the true attitude: more say nothing more of the average force."""
+"""Maximum number of samples rotated by the true attitude; more do not improve the average force."""
 
 _MAX_TILT_RAD = math.radians(20.0)
-"""Largest angle between the average force, turned by the true attitude, and the vertical."""
+"""Largest angle between the vertical and the average force, rotated by the true attitude."""
 
 
 def check_units(sequence: ImuSequence) -> None:
-    """Refuse a recording whose numbers cannot be in s, rad/s and m/s^2.
+    """Check that a recording's numbers can be in s, rad/s and m/s^2.
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, the gyroscope is
-            dead or in deg/s, the accelerometer is in g, lacks gravity or has its sign turned
-            (known only where there is a true attitude). The text names the option that mends it.
+            dead or in deg/s, the accelerometer is in g, lacks gravity or has the opposite sign
+            (detected only with a true attitude). The text names the option that fixes it.
     """
     _check_content(sequence)
     _check_time(sequence)
@@ -85,11 +85,11 @@ def check_units(sequence: ImuSequence) -> None:
         )
     if dead_gyro(time, gyro, accel):
         raise InputError(
-            f"{sequence.name}: gyroscope", "values that never change while the accelerometer moves",
+            f"{sequence.name}: gyroscope", "values that never change while the accelerometer's do",
             "angular rates", "is another column meant?",
         )  # fmt: skip
     pieces = _pieces(time)
-    if pieces:  # else the gaps leave nothing to average over
+    if pieces:  # otherwise gaps leave nothing to average over
         force = float(np.median(np.linalg.norm(accel, axis=1)))
         average = average_force(time, gyro, accel, pieces)
         in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
@@ -113,15 +113,15 @@ def _check_content(sequence: ImuSequence) -> None:
         size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
             raise InputError(
-                f"{sequence.name}: {field}", f"{size:.3g} on average", "what a sensor can give",
-                "is another column meant, or a clock among them?",
+                f"{sequence.name}: {field}", f"{size:.3g} on average", "a plausible sensor value",
+                "is another column meant, or is one of them a clock?",
             )  # fmt: skip
 
 
 def _check_time(sequence: ImuSequence) -> None:
     if found := disorder(sequence.time):
         raise InputError(
-            f"{sequence.name}: time", found, "times that go on", "sort the rows by time"
+            f"{sequence.name}: time", found, "increasing times", "sort the rows by time"
         )
     rate = sequence.rate
     if MIN_RATE <= rate <= MAX_RATE:
@@ -143,31 +143,31 @@ def check_gyro(
     in_degrees: float,
     unit_known: bool = False,
 ) -> None:
-    """Refuse a gyroscope whose turns the accelerometer contradicts.
+    """Check the gyroscope's rotations against the accelerometer.
 
     Args:
-        name: of the recording.
+        name: name of the recording.
         gyro: (N, 3) [rad/s].
-        force: median size of the specific force [m/s^2].
-        average: `average_force` of it [m/s^2].
+        force: median magnitude of the specific force [m/s^2].
+        average: `average_force` of the recording [m/s^2].
         in_degrees: the same with the gyroscope read as deg/s.
-        unit_known: from the file, which takes no option then.
+        unit_known: whether the file names the unit; then no option changes it.
 
     Raises:
-        InputError: it cannot be in rad/s.
+        InputError: the gyroscope cannot be in rad/s.
     """
     speed = float(np.percentile(np.linalg.norm(gyro, axis=1), 95))
-    # A swinging arm presses the device outward: its samples exceed their average, which is
-    # gravity all the same. So an average that is gravity, in either unit, clears the gyroscope.
+    # On a swinging arm centripetal acceleration makes samples exceed their average, which is still
+    # gravity. So an average that equals gravity, in m/s^2 or g, clears the gyroscope.
     off = min(abs(average / STANDARD_GRAVITY - 1.0), abs(average - 1.0))
     lost, lost_in_degrees = force - average, max(force - in_degrees, 0.0)
-    seen = f"turns of {speed:.3g} rad/s"
+    seen = f"rotations of {speed:.3g} rad/s"
     if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _APART_RATIO * lost_in_degrees):
-        seen += " that the accelerometer does not see"
+        seen += " that contradict the accelerometer"
     elif speed <= _FAST_RAD_S:
         return
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
-    if speed <= _FAST_RAD_S:  # as fast as a hand turns it; in deg/s a device that lies still
+    if speed <= _FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif unit_known:
         fix = _UNIT_NAMED
@@ -176,17 +176,17 @@ def check_gyro(
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
     field = f"{sequence.name}: accelerometer"
-    # A device that is shaken presses harder than it weighs: an average that is gravity clears it.
-    # In a running hand the gyroscope saturates now and then, and the average loses a fifth.
+    # Shaking makes samples exceed gravity: an average that equals gravity is accepted anyway. In
+    # the hand of a runner the gyroscope saturates at times, and the average loses a fifth.
     gravity = abs(average / STANDARD_GRAVITY - 1.0) <= _SHAKEN_OFF_GRAVITY
     if not (gravity or average > _COHERENT * force) or average < _NO_GRAVITY:
         raise InputError(
             field,
-            f"an average of {average:.3g} in samples of {force:.3g}",
+            f"an average of {average:.3g} from samples of {force:.3g}",
             f"specific force with gravity, about {STANDARD_GRAVITY:.2f} m/s^2 on average",
             "if it is linear or user acceleration, "
             + (
-                "record the raw accelerometer: gravity cannot be put back without a true attitude"
+                "record the raw accelerometer: gravity cannot be restored without a true attitude"
                 if sequence.truth is None
                 else "pass `--gravity removed`"
             ),
@@ -198,20 +198,20 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
             _UNIT_NAMED
             if "accel" in sequence.converted
-            else "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if an iPhone "
-            "wrote it) or write `ax [g]` in the CSV's header",
+            else "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if it is from "
+            "an iPhone) or write `ax [g]` in the CSV's header",
         )
     if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
         raise InputError(
             field,
             f"an average of {average:.3g}",
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            "bring it to m/s^2 or g, with gravity left in",
+            "convert it to m/s^2 or g, with gravity included",
         )
 
 
 def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray) -> None:
-    """The true attitude must turn the average force (N, 3) at `time` (N,) upright."""
+    """Check that the true attitude turns the average force (N, 3) at `time` (N,) upright."""
     truth = sequence.truth
     if truth is None or truth.valid.sum() < 2:
         return
@@ -228,8 +228,8 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
     if tilt > math.pi - _MAX_TILT_RAD and axes is None:
         raise InputError(
             f"{sequence.name}: accelerometer",
-            "a force that points down in the true attitude",
-            "specific force: up at rest",
+            "a force that points down under the true attitude",
+            "specific force, which points up at rest",
             _UNIT_NAMED
             if "accel" in sequence.converted
             else "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header",
@@ -240,12 +240,12 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
         "quaternion x y z w, body to a world with z up",
         f"the IMU's axes are not the truth's: pass `--axes={axes}`"
         if axes
-        else "leave the truth out if it is wrong: nothing but the figures needs it",
+        else "omit the truth if it is wrong: it is only needed for error metrics",
     )
 
 
 def _axes(sequence: ImuSequence) -> str | None:
-    """The `--axes` that gyroscope and true attitude ask for, None if none."""
+    """Return the `--axes` that gyroscope and true attitude imply, None if none."""
     try:
         return fit_truth(sequence).axes()
     except InputError:
@@ -253,9 +253,9 @@ def _axes(sequence: ImuSequence) -> str | None:
 
 
 def _pieces(time: FloatArray) -> list[slice]:
-    """Up to 12 stretches of up to 4 s, none shorter than one and none across a gap.
+    """Return up to 12 stretches of up to 4 s, none shorter than 0.9 s and none across a gap.
 
-    Across a gap the gyroscope has not seen the turning, and nothing can be brought to one frame.
+    The gyroscope misses rotation within a gap, so samples on both sides have no common frame.
     """
     length = round(_WINDOW_S / float(np.median(np.diff(time))))
     pieces = []
@@ -271,7 +271,7 @@ def _pieces(time: FloatArray) -> list[slice]:
 def average_force(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice]
 ) -> float:
-    """Size [m/s^2] of a piece's force averaged in the frame of its first sample; the median."""
+    """Return the median over pieces of the mean force's magnitude [m/s^2], in each first frame."""
     sizes = []
     for piece in pieces:
         dt = np.diff(time[piece])[:, None]

@@ -1,15 +1,15 @@
-"""What a recording's magnetometer is worth: size, dip, clock, the device's own field, its bearing.
+"""Quality of a recording's magnetometer: magnitude, dip, lag, hard iron, bearing.
 
-Turning through a constant field, a magnetometer sees it turn the other way:
+When a device turns in a constant field, its magnetometer measures a field that turns the other way:
 
     dm/dt = -w x (m - b)
 
-with the rate w and a constant offset b that the device adds (its hard iron). That needs no
-attitude: how well it holds says whether axes and units are right, the shift in time at which it
-holds best how late the samples are stamped, and b follows by least squares.
+with the rate w and a constant offset b that the device adds (its hard iron). This needs no
+attitude: the quality of the fit indicates whether axes and units are right, the time shift of the
+best fit is the lag of the time stamps, and b follows by least squares.
 
-The bearing of the field, levelled by the IMU alone, stands still against the gyroscope's yaw but
-for the gyroscope's drift. How still it stands within a minute is what a filter can gain from it.
+The bearing of the field, levelled by the IMU alone, is constant relative to the gyroscope's yaw
+except for the gyroscope's drift. Its steadiness within a minute is what a filter can gain from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LAGS_S = np.arange(-0.05, 0.151, 0.01)
 _WINDOW_S = 60.0
 
 _TURNING_RAD_S = 0.1
-"""A device that turns less than this (root mean square) shows neither iron nor lag."""
+"""Rate (root mean square) below which neither hard iron nor lag can be determined."""
 
 _SIZES_UT = (15.0, 90.0)
 _LEVEL_UT = 6.0
@@ -40,25 +40,25 @@ _VERDICTS = (
     ("good", math.radians(12.0), 0.75),
     ("coarse", math.radians(25.0), 0.5),
 )
-"""Largest unsteadiness [rad] and least correlation of each."""
+"""Largest unsteadiness [rad] and least correlation of each verdict."""
 
 HELD_CHANGE = 2e-3
-"""Share of its size by which a measured field changes at least within half a second. Some phones
-give out a calibrated field that they carry on by their own gyroscope: of one size to 1e-4 for
-seconds, where a sensor's own changes by 1e-2."""
+"""Least relative change in magnitude of a measured field within half a second. Some phones report a
+calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
+1e-4 for seconds, while that of a measured field changes by 1e-2."""
 
 _NO_FIELD_UT = 1e-9
-"""For a sensor that gives zeros [uT]: not divided by."""
+"""Smallest magnitude to divide by [uT], for a sensor that reports zeros."""
 
 _HALF_SECOND, _TURNED_RAD, _OFTEN = 0.5, 0.05, 0.5
-"""Half seconds in which the field turns by so much in the sensor's axes are looked at; share of
-them from which on that deserves a word."""
+"""Half seconds in which the field turns by more than this in the sensor's axes are examined; share
+of them above which an extrapolated field is reported."""
 
 _UP_RAD = math.radians(20.0)
 _IRON_UT = 10.0
 _SURE = 5.0
-"""Size, horizontal size, dip and hard iron that deserve a word; the last counts from so many of its
-deviations."""
+"""Upward dip and hard iron above which a problem is reported; components of hard iron count if they
+exceed this many of their standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,21 +66,21 @@ class MagneticFindings:
     """Findings about a magnetometer.
 
     Attributes:
-        samples: as recorded.
+        samples: number of samples as recorded.
         rate_hz: median rate [Hz].
-        size_uT: median size of the field [uT].
-        spread_uT: its 10th and 90th percentile [uT].
+        size_uT: median magnitude of the field [uT].
+        spread_uT: 10th and 90th percentile of the magnitude [uT].
         dip_rad: median angle below the horizontal [rad].
-        correlation: between dm/dt and -w x (m - b), None where the device hardly turns.
-        lag_s: by which the samples are stamped late [s], None likewise and where it is beyond
-            what is looked for.
-        hard_iron_uT: b (3,) [uT], None where the lag is.
-        hard_iron_sigma_uT: its deviation (3,) [uT].
-        bearing_rms_rad: of the levelled bearing about its line within a minute, median [rad].
-        drift_rad_s: that line's slope, median: the gyroscope's drift in yaw [rad/s].
-        held: share of the half seconds in which the device turned over which it has carried the
-            field on by itself.
-        problems: what is wrong, one line each.
+        correlation: correlation of dm/dt and -w x (m - b); None if the device hardly turns.
+        lag_s: time by which the samples are stamped late [s]; None likewise, and if it is outside
+            the range searched.
+        hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
+        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None likewise.
+        bearing_rms_rad: median RMS of the levelled bearing about a line over a minute [rad].
+        drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
+        held: share of the half seconds with rotation in which the device extrapolated the field
+            instead of measuring it.
+        problems: problems found, one line each.
     """
 
     samples: int
@@ -99,7 +99,7 @@ class MagneticFindings:
 
     @property
     def verdict(self) -> str:
-        """Whether the levelled bearing can hold a yaw: "good", "coarse" or "not usable"."""
+        """Quality of the levelled bearing as a yaw reference: "good", "coarse" or "not usable"."""
         level = self.size_uT * math.cos(self.dip_rad)
         for word, steady, follows in _VERDICTS:
             agrees = self.correlation is None or self.correlation > follows
@@ -108,7 +108,7 @@ class MagneticFindings:
         return "not usable"
 
     def as_dict(self) -> dict[str, object]:
-        """The findings as plain values, units in the names."""
+        """Return the findings as plain values, with units in their names."""
         return {
             "samples": self.samples,
             "rate_hz": self.rate_hz,
@@ -126,11 +126,11 @@ class MagneticFindings:
         }
 
     def lines(self) -> list[str]:
-        """The findings for a person."""
+        """Return the findings as lines to print."""
         low, high = self.spread_uT
         lines = [
             f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, {self.size_uT:.1f} uT "
-            f"({low:.1f} to {high:.1f} in 80 %), dips by {math.degrees(self.dip_rad):.0f} deg"
+            f"(80 % within {low:.1f} to {high:.1f}), dip {math.degrees(self.dip_rad):.0f} deg"
         ]
         if self.correlation is not None:
             lines.append(
@@ -139,20 +139,20 @@ class MagneticFindings:
         lines.append(
             f"  levelled bearing: steady to {math.degrees(self.bearing_rms_rad):.1f} deg within a "
             f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
-            f"gyroscope: {self.verdict}"
+            f"gyroscope; as a yaw reference: {self.verdict}"
         )
         if self.held > _OFTEN:
             lines.append(
-                f"  by its size the device carries it on by its own gyroscope {self.held:.0%} of "
-                "the time: it counts for little there"
+                f"  constant in size: extrapolated by the device's own gyroscope {self.held:.0%} "
+                "of the time that it turns, and given little weight then"
             )
         return lines
 
     def _lag_words(self) -> str:
         if self.lag_s is None:
             first, last = (1e3 * lag for lag in (_LAGS_S[0], _LAGS_S[-1]))
-            return f"not within {first:+.0f} to {last:+.0f} ms late; lag and hard iron unknown"
-        return f"{1e3 * self.lag_s:+.0f} ms late{self._iron_words()}"
+            return f"lag outside {first:+.0f} to {last:+.0f} ms; lag and hard iron unknown"
+        return f"lag {1e3 * self.lag_s:+.0f} ms{self._iron_words()}"
 
     def _iron_words(self) -> str:
         if self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
@@ -162,7 +162,7 @@ class MagneticFindings:
 
 
 def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
-    """Findings about the first ten minutes; None where there is none or too little to judge.
+    """Assess up to ten minutes of the magnetometer; None if there is none or too little.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -209,9 +209,9 @@ def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
 def _against_gyro(
     time: FloatArray, gyro: FloatArray, stamps: FloatArray, values: FloatArray
 ) -> tuple[float, float | None, FloatArray | None, FloatArray | None] | None:
-    """Correlation, lag [s] and hard iron with its deviation [uT] by dm/dt = -w x (m - b).
+    """Return correlation, lag [s], hard iron and its sigma [uT], from dm/dt = -w x (m - b).
 
-    At the edge of the search the lag is not the best but the last, and iron takes on its error.
+    A lag at the edge of the search is not the best one and corrupts the hard iron: both are None.
     """
     edge = _SPAN_S + float(np.abs(_LAGS_S).max())
     grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
@@ -233,7 +233,7 @@ def _against_gyro(
         normal = cross.T @ cross + 1e-9 * np.eye(3)
         iron = np.asarray(np.linalg.solve(normal, cross.T @ target), dtype=np.float64)
         left = target - cross @ iron
-        # Neighbours share half their span and disturbances last: a tenth of the rows count.
+        # Neighbours share half their span and disturbances last: a tenth of the rows counts.
         spread = np.sqrt(10.0 * float(left.var()) * np.diag(np.linalg.inv(normal)))
         seen = -np.cross(rate, mean - iron).ravel()
         return correlation(change.ravel(), seen), iron, np.asarray(spread, dtype=np.float64)
@@ -250,13 +250,13 @@ def _against_gyro(
 
 
 def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
-    """Whether an offset is one that must be taken out before the field is judged."""
+    """Return whether an offset must be removed before the field is assessed."""
     sure = np.abs(iron) > _SURE * sigma
     return bool(np.linalg.norm(iron[sure]) > _IRON_UT)
 
 
 def _held(time: FloatArray, field: FloatArray) -> float:
-    """Share of half seconds over which a field (n, 3) turns and its size stays the same."""
+    """Return the share of half seconds with rotation in which a field (n, 3) keeps its size."""
     later = np.searchsorted(time, time + _HALF_SECOND)
     first = np.flatnonzero(later < len(time))
     size = np.maximum(np.linalg.norm(field, axis=1), _NO_FIELD_UT)
@@ -267,10 +267,10 @@ def _held(time: FloatArray, field: FloatArray) -> float:
 
 
 def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
-    """Root mean square [rad] of the bearing about a line and the line's slope [rad/s].
+    """Return the RMS deviation of the bearing from a line [rad] and the line's slope [rad/s].
 
-    Medians over windows of a minute. Turns are counted on means over a second, so that a sample
-    beside a magnet does not add one.
+    Both are medians over windows of a minute. The line is fitted to means over a second, so that a
+    sample near a magnet does not add a full turn.
 
     Args:
         time: (N,) [s].
@@ -300,12 +300,12 @@ def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
     if not _SIZES_UT[0] < findings.size_uT < _SIZES_UT[1]:
         problems.append(
             f"{field}: found {findings.size_uT:.3g} uT, expected the earth's 25 to 65; "
-            "is it uncalibrated, in another unit or beside a magnet?"
+            "is it uncalibrated, in another unit or near a magnet?"
         )
     if findings.correlation is not None and findings.correlation < _VERDICTS[-1][2]:
         problems.append(
             f"{field}: does not follow the gyroscope (correlation {findings.correlation:.2f}): "
-            "a disturbed place, a held reading or other axes"
+            "a disturbed field, stale readings or different axes"
         )
     if iron is not None and sigma is not None and _is_iron(iron, sigma):
         offset = ", ".join(f"{b:+.0f}" for b in iron)
@@ -313,6 +313,6 @@ def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
     if findings.dip_rad < -_UP_RAD:
         problems.append(
             f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
-            "magnetic equator; elsewhere the accelerometer has Apple's sign: --accel-sign apple"
+            "magnetic equator; elsewhere, the accelerometer has Apple's sign: --accel-sign apple"
         )
     return replace(findings, problems=tuple(problems))

@@ -1,4 +1,4 @@
-"""What a recording is like, and what is wrong with it, before anything is computed from it."""
+"""Inspection of a recording: its properties and problems, before anything is computed from it."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 @dataclass(frozen=True)
 class Timing:
-    """How the samples are spread in time.
+    """Timing of the samples.
 
     Attributes:
-        samples: as recorded.
-        duration_s: between the first and the last [s].
+        samples: number of samples as recorded.
+        duration_s: time between the first and the last sample [s].
         rate_hz: median rate [Hz].
-        jitter_s: median distance of a step from the median step [s].
+        jitter_s: median deviation of a step from the median step [s].
         gaps: start and length [s] of each step that has lost samples.
-        lost: samples that the gaps would have held.
-        repeated: samples at the time of the one before.
-        backward: samples earlier than the one before.
-        not_finite: samples with a time or a value that is no number.
+        lost: number of samples missing in the gaps.
+        repeated: number of samples at the time of the previous one.
+        backward: number of samples earlier than the previous one.
+        not_finite: number of samples with a time or a value that is not finite.
     """
 
     samples: int
@@ -54,13 +54,13 @@ class Timing:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of the recording has a truth.
+    """Ground truth available for a recording.
 
     Attributes:
-        share: of the IMU's samples.
+        share: share of the IMU's samples for which the truth is known.
         rate_hz: median rate of the truth [Hz].
-        gaps: in it, longer than what is interpolated across.
-        longest_gap_s: [s].
+        gaps: number of gaps in the truth that are too long to interpolate across.
+        longest_gap_s: longest step of the truth [s].
         path_m: length of the path [m].
     """
 
@@ -76,18 +76,18 @@ class Inspection:
     """Findings about a recording.
 
     Attributes:
-        name: the recording's.
-        timing: of its samples.
-        accel_norm: mean size of the accelerometer's samples [m/s^2].
-        gyro_norm: of the gyroscope's [rad/s].
-        rest: the sensors at rest, None if the device never rests.
-        coverage: of the truth, None without one.
-        fit: between truth and gyroscope, None where they cannot be compared.
-        problems: what is wrong, one line each, with what mends it.
-        truth: what is known of the true track, in words.
-        device_attitude: how many attitudes the device's own fusion has logged.
-        magnetic: the magnetometer's, None without one or where there is too little of it.
-        yaw: what turns the gyroscope's yaw away from the truth's, None where that cannot be told.
+        name: name of the recording.
+        timing: timing of its samples.
+        accel_norm: mean magnitude of the accelerometer's samples [m/s^2].
+        gyro_norm: mean magnitude of the gyroscope's samples [rad/s].
+        rest: sensor statistics at rest; None if the device never rests.
+        coverage: coverage by ground truth; None without one.
+        fit: fit of truth and gyroscope; None if they cannot be compared.
+        problems: problems found, one line each, with a remedy if there is one.
+        truth: description of the ground truth.
+        device_attitude: number of attitudes logged by the device's own sensor fusion.
+        magnetic: findings about the magnetometer; None without one or with too few samples.
+        yaw: drift of the gyroscope's yaw from the true one; None if it cannot be determined.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Inspection:
     yaw: YawDrift | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """The findings as plain values, units in the names."""
+        """Return the findings as plain values, with units in their names."""
         timing, rest, fit, coverage = self.timing, self.rest, self.fit, self.coverage
         return {
             "recording": self.name,
@@ -143,17 +143,17 @@ class Inspection:
         }
 
     def lines(self) -> list[str]:
-        """The findings for a person."""
+        """Return the findings as lines to print."""
         return [
             *self._timing_lines(),
             f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
             *(self.magnetic.lines() if self.magnetic else []),
-            *([f"device's own attitude: {self.device_attitude}"] if self.device_attitude else []),
+            *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
             *(f"! {problem}" for problem in self.problems or ()),
-            *([] if self.problems else ["units, signs and axes: nothing wrong was found"]),
+            *([] if self.problems else ["units, signs and axes: no problems found"]),
         ]
 
     def _timing_lines(self) -> list[str]:
@@ -172,20 +172,20 @@ class Inspection:
             lines.append("gaps: none")
         lines.append(
             f"times: {t.repeated} repeated, {t.backward} backward; "
-            f"{t.not_finite} samples not finite"
+            f"{t.not_finite} non-finite samples"
         )
         return lines
 
     def _rest_lines(self) -> list[str]:
         rest = self.rest
         if rest is None:
-            return ["at rest: never for a second, so noise and bias are not known"]
+            return ["at rest: never for a full second, so noise and bias are unknown"]
         bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
         return [
             f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",
             f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise:.2e} rad/s/sqrt(Hz)",
             f"  accelerometer: {rest.accel_norm:.4f} m/s^2 "
-            f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} to gravity), "
+            f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} relative to gravity), "
             f"noise {rest.accel_noise:.2e} m/s^2/sqrt(Hz)",
         ]
 
@@ -196,7 +196,7 @@ class Inspection:
         lines = [
             f"truth: covers {100 * coverage.share:.1f} % of the samples, "
             f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
-            f"(longest {coverage.longest_gap_s:.2f} s), {coverage.path_m:.1f} m of path"
+            f"(longest step {coverage.longest_gap_s:.2f} s), path of {coverage.path_m:.1f} m"
         ]
         if fit is not None:
             lines += fit_lines(fit, self.yaw)
@@ -204,14 +204,14 @@ class Inspection:
 
 
 def inspect_recording(sequence: ImuSequence) -> Inspection:
-    """Look a recording over; what is wrong with it is found, not raised.
+    """Inspect a recording; problems are returned, not raised.
 
     Raises:
-        InputError: it holds no finite sample.
+        InputError: the recording holds no finite sample.
     """
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
     if not finite.any():
-        raise InputError(f"{sequence.name}: samples", "none that is finite", "numbers")
+        raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     given = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
     problems = sample_problems(sequence)
     try:
@@ -227,7 +227,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         try:
             fit = fit_truth(sequence)
         except InputError as error:
-            if not problems:  # wrong units explain it
+            if not problems:  # otherwise wrong units explain it
                 problems.append(f"{sequence.name}: truth against gyroscope: {error}")
     yaw = None if fit is None else yaw_drift(sequence, fit)
     if fit is not None:
@@ -253,14 +253,14 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
 def _rest(sequence: ImuSequence) -> Rest | None:
     try:
         return find_rest(sequence)
-    except InputError:  # a rate that `check_units` has named already
+    except InputError:  # an invalid rate, which `check_units` reports
         return None
 
 
 def _magnetic(sequence: ImuSequence) -> MagneticFindings | None:
     try:
         return judge_magnetometer(sequence)
-    except InputError:  # a rate that `check_units` has named already
+    except InputError:  # an invalid rate, which `check_units` reports
         return None
 
 

@@ -1,4 +1,4 @@
-"""Samples that cannot be right by themselves: their times, or values that no sensor gives."""
+"""Samples that are wrong in themselves: by their times, or by values that no sensor gives."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from stario.sequences.windows import MIN_RATE, runs
 _log = logging.getLogger(__name__)
 
 _OUT_OF_ORDER = 0.05
-"""Beyond this share of steps that go back the rows are in disorder."""
+"""Share of backward steps above which the rows are out of order."""
 
 _SET_BACK = 5.0
-"""A step back by more than this [s] is of a clock that was set."""
+"""A step back by more than this [s] means that the clock was set."""
 
 _STUCK_S = 1.0
-"""A sensor whose values repeat exactly for so long [s] is stuck; recorded ones do for 0.1 s."""
+"""A sensor whose values repeat exactly for this time [s] is stuck; recorded ones do for 0.1 s."""
 
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
-"""A sensor whose largest values are smaller is not at its limit: coarse digits repeat as well."""
+"""Sensors with smaller maxima are not at their limit: coarsely rounded values repeat as well."""
 
 _OFTEN_AT_LIMIT, _NO_CHANCE = 0.005, 3
-"""Share of samples from which on that deserves a word, and their least number."""
+"""Least share and number of samples at the limit that are reported."""
 
 _SHAKEN_M_S2 = 0.5
 _TILTING_RAD_S = 0.1
-"""Scatter of the force, and of the rate across it, from which on a device moves."""
+"""Scatter of the force, and of the rate across it, above which a device moves."""
 
 
 def sample_problems(sequence: ImuSequence) -> list[str]:
-    """What is wrong with them, one line each; rows in disorder are left to `disorder`."""
+    """Return the samples' problems, one line each; rows out of order are left to `disorder`."""
     time, problems = sequence.time[np.isfinite(sequence.time)], []
     steps = np.diff(time)
     if len(steps) and steps.min() < -_SET_BACK and not disorder(time):
         k = int(np.argmin(steps))
         problems.append(
-            f"{sequence.name}: time: the clock goes back by {-steps[k]:.3g} s at "
+            f"{sequence.name}: time: the clock jumps back by {-steps[k]:.3g} s at "
             f"{time[k] - time[0]:.1f} s; split the recording there"
         )
     wild = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if wild:
-        problems.append(f"{sequence.name}: values that no sensor gives, in {wild} samples")
+        problems.append(f"{sequence.name}: values that no sensor can measure, in {wild} samples")
     return problems + _stuck_problems(sequence) + _limit_problems(sequence)
 
 
 def _stuck_problems(sequence: ImuSequence) -> list[str]:
-    """Which sensor repeats itself while the other moves; a `dead_gyro` is left to `check_units`."""
+    """Report a sensor that repeats while the other moves; `check_units` reports a `dead_gyro`."""
     given = usable(sequence) & np.isfinite(sequence.time)
     time, gyro, accel = sequence.time[given], sequence.gyro[given], sequence.accel[given]
     problems = []
@@ -63,23 +63,23 @@ def _stuck_problems(sequence: ImuSequence) -> list[str]:
             (float(time[a] - time[0]), float(time[b] - time[0]))
             for a, b in runs(repeated)
             if time[b] - time[a] >= _STUCK_S
-            and b - a >= MIN_RATE * _STUCK_S  # times in another unit make seconds of two samples
+            and b - a >= MIN_RATE * _STUCK_S  # in another unit two samples make a second
             and moves(time[a : b + 1], gyro[a : b + 1], accel[a : b + 1])
         ]
         if stuck and not (moves is _shaken and repeated.all()):
             start, stop = max(stuck, key=lambda stretch: stretch[1] - stretch[0])
             problems.append(
                 f"{sequence.name}: {sensor}: its values repeat exactly for "
-                f"{sum(b - a for a, b in stuck):.1f} s while the {other} moves, "
+                f"{sum(b - a for a, b in stuck):.1f} s while the {other} shows motion, "
                 f"longest from {start:.1f} to {stop:.1f} s"
             )
     return problems
 
 
 def _limit_problems(sequence: ImuSequence) -> list[str]:
-    """Which sensor is at its limit, by the values that repeat at an axis' largest size.
+    """Report a sensor at its limit, from values that repeat at the largest magnitude of an axis.
 
-    The rule of streams (`fusion.imu.outliers`), here with all of a recording to look at.
+    The rule is that of streams (`fusion.imu.outliers`), applied to the whole recording.
     """
     problems = []
     given = usable(sequence)
@@ -96,20 +96,20 @@ def _limit_problems(sequence: ImuSequence) -> list[str]:
             limit = float(largest[at_limit.any(axis=0)].max())
             problems.append(
                 f"{sequence.name}: {sensor}: {share:.1%} of its samples are at its limit of "
-                f"{limit:.3g} {unit}: what it missed nobody knows"
+                f"{limit:.3g} {unit}: stronger motion was not recorded"
             )
     return problems
 
 
 def dead_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Whether the rate (n, 3) never changes and the force (n, 3) is that of another motion."""
+    """Return whether the rate (n, 3) is constant and the force (n, 3) contradicts it."""
     return not np.diff(gyro, axis=0).any() and _shaken(time, gyro, accel)
 
 
 def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Whether a force (n, 3) is neither of a device at rest nor of one at the first rate.
+    """Return whether a force (n, 3) contradicts both rest and steady rotation at the first rate.
 
-    Turning evenly it stays the same in the device's axes (a circle) or in the world's (in place).
+    In steady rotation it is constant in the device's axes (in a circle) or the world's (in place).
     """
     turned = Rotation.from_rotvec(np.outer(time - time[0], gyro[0])).apply(accel)
     scatter = min(float(np.linalg.norm(force.std(axis=0))) for force in (accel, turned))
@@ -117,23 +117,23 @@ def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
 
 
 def _tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Whether a rate (n, 3) turns a force that stays the same in the device; an even one may."""
+    """Return whether the rate (n, 3) across the force varies, which a constant force rules out."""
     up = accel[0] / max(float(np.linalg.norm(accel[0])), 1e-9)
     return float(np.linalg.norm(np.cross(gyro, up).std(axis=0))) > _TILTING_RAD_S
 
 
 def disorder(time: FloatArray) -> str:
-    """How many of the times (n,) [s] go back; empty where few do."""
+    """Describe how many of the times (n,) [s] go back; empty if few do."""
     back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
     many = back > _OUT_OF_ORDER * len(time)
-    return f"{back} of {len(time)} times before the one above" if many else ""
+    return f"{back} of {len(time)} times earlier than the one above" if many else ""
 
 
 def in_order(sequence: ImuSequence) -> ImuSequence:
-    """The recording sorted by time where many rows are out of order, each by little.
+    """Sort a recording by time if many rows are out of order, each by little.
 
-    Some loggers write what comes within a few milliseconds in any order: left out, as a few are, a
-    twentieth of the samples were lost. Rows that lie far off are of no order to be guessed.
+    Some loggers write samples of a few milliseconds in any order. Dropping them, as is done with a
+    few, would lose a twentieth of the samples. If rows are far off, their order is not guessed.
     """
     time = sequence.time
     if not disorder(time):
@@ -142,7 +142,7 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
     if not back < MAX_IMU_GAP:
         return sequence
     _log.warning(
-        "%s: %s, by %.0f ms at most: sorted by time", sequence.name, disorder(time), 1e3 * back
+        "%s: %s, by up to %.0f ms: sorted by time", sequence.name, disorder(time), 1e3 * back
     )
     order = np.argsort(time, kind="stable")
     return replace(
@@ -151,7 +151,7 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
 
 
 def usable(sequence: ImuSequence) -> BoolArray:
-    """Which samples (n,) are numbers that a sensor may give."""
+    """Return which samples (n,) are numbers that a sensor can measure."""
     return np.asarray((np.abs(_values(sequence)) < ABSURD).all(axis=1))
 
 

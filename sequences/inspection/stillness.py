@@ -1,13 +1,13 @@
-"""Stillness: stretches in which a device lies still, and what its sensors say there.
+"""Stillness: stretches in which a device is stationary, and its sensors' statistics there.
 
-One test for all who ask, each with the factor that its question needs: the scatter of both sensors
-about their means against the white noise of a phone's IMU (`PHONE_NOISE`), by chi-square. The
-filter's own densities are no measure here: they stand for errors of scale and alignment, which only
-motion brings. (Whether a start's mean force shows the vertical is another question: a hand may
-tremble, but a trolley may not gain speed; `levelling`.)
+One chi-square test serves all callers, each with its own factor: the scatter of both sensors about
+their means against the white noise of a phone's IMU (`PHONE_NOISE`). The filter's own densities are
+unsuitable here: they include errors of scale and alignment, which arise only in motion. (Whether
+the mean force at the start gives the vertical is another question: a hand may tremble, but a
+trolley must not accelerate; see `levelling`.)
 
 Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
-rate and whatever filter the sensor has above 10 Hz (IEEE Std 952, annex C).
+rate and the sensor's filter above 10 Hz (IEEE Std 952, annex C).
 
 Source: I. Skog et al., "Zero-velocity detection: an algorithm evaluation", 2010 (the test on both
 sensors); the scatter about the mean replaces their known gravity and bias.
@@ -25,13 +25,13 @@ from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
 
 _LYING = 6.0
-"""Of a sensor that lies, which may be noisier than a phone's: what inspection measures noise by."""
+"""Factor for a device at rest, used by inspection: its sensors may be noisier than a phone's."""
 
 _SLOW = 0.06
-"""Mean rate [rad/s] that may be bias: 3.4 degrees per second."""
+"""Largest mean rate [rad/s] that may be a bias: 3.4 degrees per second."""
 
 _PROBABILITY = 0.999
-"""That a sensor at rest looks still."""
+"""Probability that a sensor at rest passes the test."""
 
 _BIN_S = 0.05
 _BLOCK_BINS = 10
@@ -39,26 +39,26 @@ _SHORTEST_S = 1.0
 
 
 def scatter_bound(count: float, seconds: float, factor: float) -> float:
-    """Largest sum of squares about the mean of white noise of density 1, times factor^2.
+    """Return the largest sum of squares about the mean of white noise of density `factor`.
 
     Args:
-        count: samples, each in three axes.
-        seconds: that they fill.
-        factor: on the noise's density.
+        count: number of samples, each in three axes.
+        seconds: time that the samples span [s].
+        factor: factor on the sensor's noise density.
     """
     return factor**2 * count / seconds * chi2_quantile(_PROBABILITY, 3.0 * (count - 1.0))
 
 
 def looks_still(gyro: float, accel: float, bound: float) -> bool:
-    """Whether sums of squares [rad^2/s^2], [m^2/s^4] are within a `scatter_bound`."""
+    """Return whether sums of squares [rad^2/s^2], [m^2/s^4] are within a `scatter_bound`."""
     noise = PHONE_NOISE
     return gyro <= bound * noise.gyro_noise**2 and accel <= bound * noise.accel_noise**2
 
 
 def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float) -> bool:
-    """Whether samples (n, 3) [rad/s], [m/s^2] over some seconds are those of no motion.
+    """Return whether samples (n, 3) [rad/s], [m/s^2] that span `seconds` show no motion.
 
-    A steady turn does not scatter: the mean rate must be one that may be bias, too.
+    A steady turn has no scatter: the mean rate must also be small enough to be a bias.
     """
     if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _SLOW:
         return False
@@ -68,13 +68,13 @@ def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float)
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What the sensors say at rest.
+    """Sensor statistics at rest.
 
     Attributes:
-        stretches: first and last time of each [s].
-        gyro_bias: (3,) mean rate [rad/s]; it holds the earth's 7e-5 rad/s.
+        stretches: first and last time of each stretch [s].
+        gyro_bias: (3,) mean rate [rad/s], including the earth's 7e-5 rad/s.
         gyro_noise: white noise density [rad/s/sqrt(Hz)], root mean square over the axes.
-        accel_norm: mean size of the force [m/s^2]; bias and scale along gravity show in it.
+        accel_norm: mean magnitude of the force [m/s^2], with bias and scale error along gravity.
         accel_noise: white noise density [m/s^2/sqrt(Hz)], root mean square over the axes.
     """
 
@@ -86,12 +86,12 @@ class Rest:
 
     @property
     def seconds(self) -> float:
-        """Length of all stretches [s]."""
+        """Total length of all stretches [s]."""
         return sum(stop - start for start, stop in self.stretches)
 
 
 def find_rest(sequence: ImuSequence) -> Rest | None:
-    """The recording's rest; None if it never lies still for a second.
+    """Find the stretches at rest; None if the device is never stationary for a second.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -129,7 +129,7 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
 
 
 def _density(stretches: list[FloatArray], tau: float) -> float:
-    """Allan deviation of means over two bins, as a density of white noise."""
+    """Return the Allan deviation of means over two bins, as a density of white noise."""
     squares = [
         np.square(np.diff(part.reshape(-1, 2, 3).mean(axis=1), axis=0)) for part in stretches
     ]

@@ -1,1 +1,1 @@
-"""How a recording's truth fits its IMU: clocks, axes, mounts."""
+"""Fit of a recording's ground truth to its IMU: clocks, axes, mounts."""

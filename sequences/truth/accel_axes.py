@@ -1,4 +1,4 @@
-"""Accelerometers that were logged in other axes than the gyroscope beside them."""
+"""Accelerometers that were logged in other axes than their gyroscope."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from stario.sequences.sequence import ImuSequence, Trajectory
 _log = logging.getLogger(__name__)
 
 _GRAVITY_KEPT = 0.9
-"""Share of the force's size that its mean along the vertical keeps where axes are right."""
+"""Least ratio of the mean force along the vertical to its mean magnitude if axes are right."""
 
 _BETTER, _SHARPER = 0.2, 0.02
-"""By how much another order must keep more than the one as logged, and than the next best."""
+"""Margins by which another axis order must exceed the logged and the next best in that ratio."""
 
 
 def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
-    """The recording with its accelerometer in the gyroscope's axes.
+    """Rotate the accelerometer to the gyroscope's axes if it was logged in others.
 
-    Turned by the true attitude, the specific force averages to gravity. Where it does not, and
-    does for another right-handed order of its axes (some phones log it so), that is taken and said.
+    Rotated by the true attitude, the specific force averages to gravity. If it does not, but does
+    in another right-handed axis order (some phones log it so), that order is used, with a warning.
 
     Args:
         sequence: the recording.
-        truth: its poses, in a world with y or z up.
+        truth: poses of the recording, in a world with y or z up.
     """
     finite = np.isfinite(sequence.time) & np.isfinite(sequence.accel).all(axis=1)
     times, first = np.unique(sequence.time[finite], return_index=True)
@@ -49,7 +49,7 @@ def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
         return sequence
     R = turns[best]
     _log.warning(
-        "%s: the accelerometer's axes are not the gyroscope's: turned to its %s",
+        "%s: the accelerometer's axes are not the gyroscope's: its %s is used as x,y,z",
         sequence.name, axes_named(R.as_matrix()),
     )  # fmt: skip
     return replace(sequence, accel=R.apply(sequence.accel))

@@ -1,13 +1,13 @@
 """Time offset and mount between an IMU and the body that a motion-capture system tracks.
 
-Frames: V is the tracked body (markers), B the IMU, W the capture system's world. The IMU sits in
-the tracked body with a constant rotation R_VB (the mount) and its clock is off by a constant lag.
-Over any short interval both see the same rotation, in their own axes:
+Frames: V is the tracked body (markers), B the IMU, W the capture system's world. The IMU is
+fixed to the tracked body with a constant rotation R_VB (the mount), and its clock is off by a
+constant lag. Over any short interval both measure the same rotation, in their own axes:
 
     R_VB  dR_B  =  dR_V  R_VB      so that      phi_V = R_VB phi_B
 
-for the rotation vectors phi; a tracked body that the system mistakes for its mirror image (a flip
-by 170-180 degrees) shows as a jump of dR_V that the gyroscope has not seen.
+for the rotation vectors phi. If the system mistakes the tracked body for its mirror image (a flip
+by 170-180 degrees), dR_V jumps but the gyroscope measures no such rotation.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ _CORRELATED_S = 0.1
 
 @dataclass(frozen=True)
 class BodyAlignment:
-    """Outcome of `align_tracked_body`.
+    """Result of `align_tracked_body`.
 
     Attributes:
-        lag: to be added to the truth's time [s].
-        correlation: between the gyroscope and the attitude's rate, both over 0.1 s, in B.
-        attitude_WB: the IMU's attitude at the truth's samples, level and mount applied.
-        leveling_WW: the rotation that made the world level, to be applied to positions.
-        valid: truth samples whose attitude agrees with the gyroscope.
-        mounts: R_VB of each piece between flips, with the piece's first and last time [s].
+        lag: offset to be added to the truth's time [s].
+        correlation: correlation of gyroscope and attitude rate, both over 0.1 s, in B.
+        attitude_WB: attitudes of the IMU at the truth's samples, with levelling and mount applied.
+        leveling_WW: rotation that levels the world, to be applied to positions.
+        valid: (M,) bool, whether a truth sample's attitude agrees with the gyroscope.
+        mounts: first and last time [s] and R_VB of each piece between flips.
     """
 
     lag: float
@@ -69,21 +69,22 @@ def align_tracked_body(
     position_WV: FloatArray | None = None,
     max_lag: float = 0.15,
 ) -> BodyAlignment:
-    """Estimate lag, mount (anew after every flip) and the world's tilt.
+    """Estimate lag, mount (again after every flip) and the tilt of the world.
 
     Args:
         imu_time: (N,) [s].
         gyro: (N, 3) angular rate in B [rad/s].
         accel: (N, 3) specific force in B [m/s^2].
-        truth_time: (M,) [s], evenly sampled, on the IMU's clock but for the lag.
+        truth_time: (M,) [s], evenly sampled, on the IMU's clock except for the lag.
         attitude_WV: M rotations of the tracked body.
-        valid: (M,) samples to be trusted at all.
-        position_WV: (M, 3) of the tracked body [m]; with it the accelerometer helps to find the
-            mount's turn about the vertical, which the gyroscope misses on wheels.
-        max_lag: largest lag looked for, either way [s].
+        valid: (M,) bool, whether a sample may be used at all.
+        position_WV: (M, 3) positions of the tracked body [m]; with them the accelerometer helps to
+            find the mount's rotation about the vertical, which the gyroscope misses on wheels.
+        max_lag: largest lag searched, in either direction [s].
 
     Raises:
-        InputError: less than 10 s without a break in which both saw the same rotations.
+        InputError: less than 10 s without a break in which both measured the same rotations, or
+            no gravity in the accelerometer.
     """
     _check_length("recording", imu_time)
     _check_length("capture", truth_time[valid])
@@ -109,7 +110,7 @@ def align_tracked_body(
         turn = heading_turn(time, rate_B, force_B, leveling.apply(position_WV), attitude_WB, inside)
         mounts = [mount * turn for mount in mounts]
         attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
-    # With the mount known, glitches about another axis than the motion's show as well.
+    # With the mount known, glitches about another axis than the motion's are detected as well.
     drift = attitude_WB * gyro_B.attitude(time).inv()
     kept &= ~_disagreeing(time, drift, Rotation.identity(len(drift)))
     return BodyAlignment(
@@ -128,7 +129,7 @@ def align_tracked_body(
 def _mounted(
     attitude_WV: Rotation, pieces: list[tuple[int, int]], mounts: list[Rotation]
 ) -> Rotation:
-    """The IMU's attitude in the capture's world, each piece with its mount."""
+    """Return the IMU's attitude in the capture system's world, each piece with its mount."""
     quat_WB = attitude_WV.as_quat()
     for (start, stop), mount in zip(pieces, mounts, strict=True):
         quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
@@ -138,11 +139,11 @@ def _mounted(
 def _level(
     attitude_WB: Rotation, force_B: FloatArray, kept: BoolArray
 ) -> tuple[Rotation, Rotation]:
-    """The attitude in a world whose mean force points up, and the rotation that made it so."""
+    """Return the attitude in a world whose mean force points up, and the rotation to it."""
     up = attitude_WB[kept].apply(force_B[kept]).mean(axis=0)
     if not np.linalg.norm(up) > LEAST_FORCE:
         found = f"a mean force of {np.linalg.norm(up):.3g} m/s^2"
-        raise InputError("accelerometer", found, "gravity, to level the truth by")
+        raise InputError("accelerometer", found, "gravity, to level the truth with")
     leveling = tilt_aligning(up)
     return leveling * attitude_WB, leveling
 
@@ -150,11 +151,11 @@ def _level(
 def _check_length(what: str, time: FloatArray) -> None:
     length = float(time[-1] - time[0]) if len(time) else 0.0
     if length < _MIN_FIT_S:
-        raise InputError(what, f"{length:.1f} s", f"{_MIN_FIT_S:.0f} s to find the mount in")
+        raise InputError(what, f"{length:.1f} s", f"at least {_MIN_FIT_S:.0f} s to find the mount")
 
 
 class _GyroIntegral:
-    """Attitude from integrating the gyroscope, sampled at any time, and its running integral."""
+    """Attitude integrated from the gyroscope, at any time, and the rate's running integral."""
 
     def __init__(self, time: FloatArray, gyro: FloatArray) -> None:
         self.time = time
@@ -164,7 +165,7 @@ class _GyroIntegral:
         self._rate = gyro
 
     def attitude(self, time: FloatArray) -> Rotation:
-        """Attitude of B against its start at times inside the recording (held outside)."""
+        """Return attitudes of B relative to its start at times in the recording (else clamped)."""
         clipped = np.clip(time, self.time[0], self.time[-1])
         left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
         tau = clipped - self.time[left]
@@ -173,13 +174,13 @@ class _GyroIntegral:
         )
 
     def silent(self, start: float, stop: float) -> bool:
-        """Whether samples are missing for too long between two times to carry an attitude over."""
+        """Return whether a gap between two times is too long to carry an attitude across."""
         first, last = np.searchsorted(self.time, [start, stop])
         inside = self.time[max(first - 1, 0) : last + 1]
         return bool(np.diff(inside).max(initial=0.0) > _SILENT_S)
 
     def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
-        """Mean rate [rad/s] from each of M times to the one `stride` later (M - stride, 3)."""
+        """Return mean rates (M - stride, 3) [rad/s] from each time to the one `stride` later."""
         angle = interpolated(time, self.time, self.angle)
         lengths = time[stride:] - time[:-stride]
         return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
@@ -200,14 +201,14 @@ def _lag(
     valid: BoolArray,
     max_lag: float,
 ) -> float:
-    """Lag at which the magnitudes of both rates correlate best: no mount is needed for it."""
+    """Return the lag at which the magnitudes of both rates correlate best; needs no mount."""
     stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
     rates_V, good = _rates(time, attitude_WV, valid, stride)
     speed_V = np.linalg.norm(rates_V, axis=1)
 
     def score(lag: float) -> float:
         speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
-        # Glitches are rare but huge: compare where the two do not contradict each other grossly.
+        # Glitches are rare but huge: compare where the two do not differ grossly.
         use = good & (np.abs(speed_V - speed_B) < 3.0)
         return correlation(speed_V[use], speed_B[use])
 
@@ -217,9 +218,9 @@ def _lag(
 def _lag_by_axes(
     gyro_B: _GyroIntegral, time: FloatArray, attitude_WB: Rotation, valid: BoolArray
 ) -> float:
-    """What is left of the lag, by the rates' axes as well, once the mount is known.
+    """Return the remaining lag from the rates as vectors, once the mount is known.
 
-    Magnitudes lose to the capture's noise where little is turned: up to 12 ms on a trolley.
+    From magnitudes alone, noise of the capture costs up to 12 ms where little is turned: a trolley.
     """
     stride = max(1, round(0.06 / float(np.median(np.diff(time)))))
     rates, good = _rates(time, attitude_WB, valid, stride)
@@ -233,7 +234,7 @@ def _lag_by_axes(
 
 
 def _best_lag(score: Callable[[float], float], reach: float) -> float:
-    """Lag of the highest score within reach, coarsely first, by a parabola at last."""
+    """Return the lag of the highest score within reach: coarse, then fine, then by a parabola."""
     coarse = np.arange(-reach, reach + 1e-9, 4 * _LAG_STEP_S)
     centre = coarse[int(np.argmax([score(lag) for lag in coarse]))]
     lags = centre + _LAG_STEP_S * np.arange(-4, 5)
@@ -246,7 +247,7 @@ def _best_lag(score: Callable[[float], float], reach: float) -> float:
 
 
 def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
-    """Samples whose rotation to most neighbours, before and after, contradicts the gyroscope."""
+    """Return whether each sample's rotation to most neighbours contradicts the gyroscope."""
     n = len(time)
     dt = float(np.median(np.diff(time)))
     ahead, behind = np.zeros(n), np.zeros(n)
@@ -259,7 +260,7 @@ def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) 
 
 
 def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
-    """Difference of the rotation angles over `stride` samples, which no mount changes."""
+    """Return the difference of rotation angles over `stride` samples; the mount cancels out."""
     half_V, half_B = (
         np.arccos(np.clip(np.abs(np.sum(quat[:-stride] * quat[stride:], axis=1)), 0.0, 1.0))
         for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
@@ -270,7 +271,7 @@ def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> Fl
 def _pieces(
     time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
 ) -> list[tuple[int, int]]:
-    """Runs of samples [start, stop) between attitude jumps, long enough to be of use."""
+    """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful."""
     known = np.flatnonzero(valid)
     if len(known) < 2:
         return []
@@ -286,9 +287,9 @@ def _mounts(
     gyro_B: _GyroIntegral,
     pieces: list[tuple[int, int]],
 ) -> list[Rotation]:
-    """R_VB of each piece: fitted where it is long, carried over by the gyroscope where not.
+    """Return R_VB of each piece: fitted if it is long, else carried over by the gyroscope.
 
-    What was turned while the gyroscope was silent is no flip: behind its gaps nothing is carried.
+    A rotation within a gap of the gyroscope is not a flip: nothing is carried across such a gap.
     """
     attitude_B = gyro_B.attitude(time)
     fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
@@ -322,12 +323,12 @@ def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[in
 def _fit(
     time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, piece: tuple[int, int]
 ) -> Rotation | None:
-    """R_VB that best takes the rotation vectors of B to those of V, outliers weighted down."""
+    """Fit R_VB, which takes rotation vectors of B to those of V, with outliers weighted down."""
     start, stop = piece
     if time[stop - 1] - time[start] < _MIN_FIT_S:
         return None
     stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
-    # Rotations that overlap by more than two thirds say little new.
+    # Rotations that overlap by more than two thirds add little information.
     before = np.arange(start, stop - stride, max(1, stride // 3))
     phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
     phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
@@ -344,7 +345,7 @@ def _fit(
 def _correlation(
     time: FloatArray, attitude_WB: Rotation, gyro_B: _GyroIntegral, valid: BoolArray
 ) -> float:
-    """Correlation of both rates over 0.1 s; below, the capture's noise drowns a trolley's turns."""
+    """Correlate both rates over 0.1 s; over less, the capture's noise hides a trolley's turns."""
     stride = max(1, round(_CORRELATED_S / float(np.median(np.diff(time)))))
     rates, good = _rates(time, attitude_WB, valid, stride)
     measured = gyro_B.mean_rate(time, stride)

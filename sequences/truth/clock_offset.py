@@ -1,4 +1,4 @@
-"""How far two clocks are apart that watched the same turning."""
+"""Offset between two clocks whose sensors measured the same rotation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stario.sequences.sequence import BoolArray, FloatArray
 _GRID_HZ = 50.0
 _NEAR_CLOCKS_S = 5.0
 _FASTEST_RAD_S = 12.0
-"""What turns faster is a glitch of the capture."""
+"""Faster rotation is a glitch of the capture [rad/s]."""
 
 
 def clock_offset(
@@ -22,24 +22,24 @@ def clock_offset(
     attitude_WV: Rotation,
     valid: BoolArray,
 ) -> float:
-    """What brings the truth's clock near the IMU's, by what both see of the turning [s].
+    """Return the offset [s] to add to the truth's clock, from the rotation that both measured.
 
-    Clocks that agree to within 5 s (both stretches overlap) are searched that far, others over all
-    their length. It is good to a few hundredths of a second: `align_tracked_body` does the rest.
+    If both stretches overlap in time, offsets of up to 5 s are searched, otherwise all of them. The
+    result is good to a few hundredths of a second; `align_tracked_body` refines it.
 
     Args:
         imu_time: (N,) [s].
         gyro: (N, 3) angular rate in B [rad/s].
         truth_time: (M,) [s], strictly increasing.
         attitude_WV: M rotations of the tracked body.
-        valid: (M,) samples to be trusted at all.
+        valid: (M,) bool, whether a sample may be used at all.
 
     Raises:
-        InputError: there are fewer than two valid samples.
+        InputError: there are fewer than two valid samples, or a clock jumps by days.
     """
     known = np.flatnonzero(valid)
     if min(len(known), len(imu_time)) < 2:
-        raise InputError("clocks", f"{len(known)} valid poses", "at least 2, and as many samples")
+        raise InputError("clocks", f"{len(known)} valid poses", "at least 2, and 2 IMU samples")
     turned = (attitude_WV[known[:-1]].inv() * attitude_WV[known[1:]]).magnitude()
     steps = np.diff(truth_time[known])
     speed_V = np.where(steps < 0.1, turned / steps, np.nan)
@@ -56,14 +56,14 @@ def clock_offset(
 
 
 _LONGEST_S = 2.0 * 86_400.0
-"""Nobody records for longer [s]: a single time that is off by decades must not cost memory."""
+"""Longest plausible recording [s]: a single time off by decades must not cost memory."""
 
 
 def _on_grid(time: FloatArray, speed: FloatArray) -> FloatArray:
-    """Angular speed at 50 Hz, averaged over each step; nan where there is none."""
+    """Average the angular speed over each step of a 50 Hz grid; NaN where there is none."""
     use = np.isfinite(speed) & (speed < _FASTEST_RAD_S)
     if not use.any() or float(time[use].max()) > _LONGEST_S:
-        raise InputError("truth's clock", "times that jump by days", "a recording's")
+        raise InputError("truth's clock", "times that jump by days", "times of one recording")
     cells = np.rint(time[use] * _GRID_HZ).astype(np.int64)
     count = np.bincount(cells)
     with np.errstate(invalid="ignore"):
@@ -71,7 +71,7 @@ def _on_grid(time: FloatArray, speed: FloatArray) -> FloatArray:
 
 
 def _correlations(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Correlation of a(k + lag) with b(k) for every lag at which half the shorter one overlaps."""
+    """Correlate a(k + lag) with b(k) at every lag at which half the shorter one overlaps."""
     masks = [np.isfinite(x).astype(np.float64) for x in (a, b)]
     values = [np.nan_to_num(x - np.nanmean(x)) for x in (a, b)]
     lags = np.arange(-(len(b) - 1), len(a)).astype(np.float64)

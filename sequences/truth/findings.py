@@ -1,4 +1,4 @@
-"""How a truth fits its IMU, for a person and as plain values, and what of it asks for mending."""
+"""Report on how ground truth fits its IMU: printed lines, plain values and problems to fix."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from stario.sequences.truth.yaw_drift import YawDrift
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)
 _LEANING_RAD = math.radians(3.0)
-"""Offset, misalignment and tilt from which a truth deserves a word."""
+"""Offset, misalignment and tilt above which the truth is reported as a problem."""
 
 _LOST = 0.02
-"""Share of gravity that a mount must not take away: it leans by 11 degrees then."""
+"""Largest share of gravity that a mount may remove; it leans by 11 degrees then."""
 
 _SCALED = 0.06
-"""Error of the gyroscope's scale that deserves one; of recorded phones it is 0.03 at most."""
+"""Gyroscope scale error above which it is reported; recorded phones reach at most 0.03."""
 
 
 def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
-    """As plain values, units in the names."""
+    """Return the fit as plain values, with units in their names."""
     return {
         "time_offset_s": fit.time_offset,
         "correlation": fit.correlation,
@@ -35,62 +35,60 @@ def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
 
 
 def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
-    """For a person."""
+    """Return the fit as lines to print."""
     lines = [
         f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
         f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
         f"correlation {fit.correlation:.3f}, "
-        f"world {math.degrees(fit.tilt):.2f} deg off level"
+        f"world tilted by {math.degrees(fit.tilt):.2f} deg"
     ]
     if yaw is not None:
         lines.append(
             f"  yaw: the gyroscope {_scale_words(yaw)} and drifts by "
-            f"{math.degrees(yaw.bias):+.3f} deg/s; {math.degrees(yaw.left):.1f} deg are left"
+            f"{math.degrees(yaw.bias):+.3f} deg/s; residual {math.degrees(yaw.left):.1f} deg"
         )
     return lines
 
 
 def _scale_words(yaw: YawDrift) -> str:
-    return f"turns {100 * abs(yaw.scale):.1f} % too {'far' if yaw.scale > 0.0 else 'little'}"
+    return f"reads {100 * abs(yaw.scale):.1f} % too {'high' if yaw.scale > 0.0 else 'low'}"
 
 
 def fit_problems(name: str, fit: TruthFit, yaw: YawDrift | None, known: str) -> list[str]:
-    """What the truth's comparison with the gyroscope asks for, unless it is `known`."""
+    """Return problems found by comparing truth and gyroscope, unless the text `known` has them."""
     field = f"{name}: truth"
     if not fit.alike:
         return [
             f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f}, "
             f"{fit.agreeing:.0%} of the poses agree): clocks more than {MAX_OFFSET_S:.0f} s apart, "
-            "another walk, or an axis or sign of the gyroscope"
+            "truth of another recording, or a wrong axis or sign of the gyroscope"
         ]
     problems = []
-    same_frames = fit.misalignment < _TURNED_RAD and fit.tilt < _LEANING_RAD  # else no yaw is told
+    same_frames = fit.misalignment < _TURNED_RAD and fit.tilt < _LEANING_RAD  # else yaws differ
     if yaw is not None and abs(yaw.scale) > _SCALED and same_frames:
-        problems.append(f"{name}: gyroscope: {_scale_words(yaw)}, as the truth has it")
+        problems.append(f"{name}: gyroscope: {_scale_words(yaw)}, compared with the truth")
     if abs(fit.time_offset) > _LATE_S:
         problems.append(
-            f"{field}: its clock is off, add {fit.time_offset:+.3f} s to its times in the file"
+            f"{field}: its clock is off: add {fit.time_offset:+.3f} s to its times in the file"
         )
     axes, degrees = fit.axes(), math.degrees(fit.misalignment)
     if fit.misalignment > _TURNED_RAD and fit.accel_against > _LOST:
         problems.append(
-            f"{name}: gyroscope: its axes or signs are not the accelerometer's, which agrees with "
-            f"the truth ({degrees:.0f} degrees off)"
+            f"{name}: gyroscope: its axes or signs are not those of the accelerometer, which agree "
+            f"with the truth ({degrees:.0f} degrees off)"
         )
         return problems
     if axes is not None and f"--axes={axes}" not in known:
         problems.append(
-            f"{field}: its axes are not the IMU's ({degrees:.0f} degrees): pass `--axes={axes}`"
+            f"{field}: its axes are {degrees:.0f} degrees off the IMU's: pass `--axes={axes}`"
         )
     elif axes is None and fit.misalignment > _TURNED_RAD:
         problems.append(
-            f"{field}: its axes are {degrees:.1f} degrees off the IMU's, which no option mends: "
-            "turn its attitude in the file"
+            f"{field}: its axes are {degrees:.1f} degrees off the IMU's, which no option fixes: "
+            "rotate its attitude in the file"
         )
     if fit.tilt > _LEANING_RAD and not known:
-        problems.append(f"{field}: its world is {math.degrees(fit.tilt):.1f} degrees off level")
+        problems.append(f"{field}: its world is tilted by {math.degrees(fit.tilt):.1f} degrees")
     if fit.jumps:
-        problems.append(
-            f"{field}: its attitude jumps by what the gyroscope has not seen, {fit.jumps} times"
-        )
+        problems.append(f"{field}: its attitude jumps {fit.jumps} times, unlike the gyroscope's")
     return problems

@@ -1,7 +1,7 @@
-"""How a recording's truth fits its IMU: time offset, turned axes, a world that is not level.
+"""Fit of a recording's ground truth to its IMU: time offset, rotated axes, tilted world.
 
-Both see the same rotations, so the gyroscope and the differentiated attitude tell the offset of
-their clocks and the constant rotation between their axes (`stario.sequences.truth.alignment`).
+Both measure the same rotations, so the offset of their clocks and the constant rotation between
+their axes follow from gyroscope and differentiated attitude (`stario.sequences.truth.alignment`).
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples
 
 LONGEST_S = 600.0
-"""What is looked at of a longer recording [s], from its middle: the cost does not grow with it."""
+"""Length of the middle part that is used of a longer recording [s], which bounds the cost."""
 
 MAX_OFFSET_S = 5.0
-"""Largest time offset looked for, either way [s]."""
+"""Largest time offset searched, in either direction [s]."""
 
 _RATE = 100.0
 _NEAR_RAD = np.deg2rad(20.0)
 _GLITCH_RAD_S = 12.0
-"""A truth that turns faster has jumped."""
+"""A truth that rotates faster than this [rad/s] has jumped."""
 
 _ALIKE, _AGREEING = 0.9, 0.7
-"""Correlation, and share of the truth, below which gyroscope and truth have not seen the same
-rotations; of published recordings the least are 0.97 and 0.999. An even gait is like itself a few
-steps later: to 0.94, at the price of the share."""
+"""Correlation, and share of agreeing truth samples, below which gyroscope and truth did not measure
+the same rotations; published recordings have at least 0.97 and 0.999. An even gait correlates with
+itself a few steps later by up to 0.94, but with a lower share."""
 
 _EDGE_S = 0.05
-"""An offset so near the largest looked for is not the best but the last."""
+"""An offset this close [s] to the largest one searched is the end of the search, not the best."""
 
 
 @dataclass(frozen=True, eq=False)
 class TruthFit:
-    """Outcome of `fit_truth`.
+    """Result of `fit_truth`.
 
     Attributes:
-        time_offset: to be added to the truth's time [s].
-        correlation: between gyroscope and differentiated attitude after all corrections.
-        R_TB: takes the IMU's axes to those whose attitude the truth gives.
-        tilt: of the truth's world against the vertical [rad].
-        agreeing: share of the truth's samples that the gyroscope agrees with.
-        jumps: how often the truth's attitude jumps by what the gyroscope has not seen.
-        accel_against: share of the force's mean that `R_TB` takes from the one upright in the truth
-            as it is: where it is large, the accelerometer is on the truth's side.
+        time_offset: offset to be added to the truth's time [s].
+        correlation: correlation of gyroscope and differentiated attitude after all corrections.
+        R_TB: rotation from the IMU's axes to those whose attitude the truth gives.
+        tilt: angle between the vertical axis of the truth's world and gravity [rad].
+        agreeing: share of the truth's samples that agree with the gyroscope.
+        jumps: number of jumps of the truth's attitude that the gyroscope did not measure.
+        accel_against: loss of the mean vertical force if `R_TB` is applied, as a share of the mean
+            force: if it is large, the accelerometer agrees with the truth, not the gyroscope.
         times: (M,) [s] on the IMU's clock, for a figure.
-        speed: (M,) angular rate of the truth there [rad/s], NaN where unknown.
+        speed: (M,) angular rate of the truth at `times` [rad/s], NaN where unknown.
     """
 
     time_offset: float
@@ -74,12 +74,12 @@ class TruthFit:
 
     @property
     def alike(self) -> bool:
-        """Whether both saw the same rotations, so that offset and axes are those of the truth."""
+        """Whether both measured the same rotations, so that offset and axes are meaningful."""
         inside = abs(self.time_offset) < MAX_OFFSET_S - _EDGE_S
         return inside and self.correlation > _ALIKE and self.agreeing > _AGREEING
 
     def axes(self) -> str | None:
-        """The `--axes` that turns the IMU to the truth's; None where none is needed or fits."""
+        """Return `--axes` to rotate the IMU to the truth's axes; None if none is needed or fits."""
         text = axes_named(self.R_TB.as_matrix())
         left = Rotation.from_matrix(axes_matrix(text)).inv() * self.R_TB
         near = self.alike and left.magnitude() < _NEAR_RAD
@@ -90,7 +90,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     """Compare gyroscope and true attitude over up to 10 minutes.
 
     Raises:
-        InputError: there is no truth, or less than 10 s in which both saw the same rotations.
+        InputError: there is no truth, or less than 10 s in which both measured the same rotations.
     """
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
@@ -134,7 +134,7 @@ def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -
 
 
 def middle(sequence: ImuSequence) -> ImuSequence:
-    """The samples of a recording that are looked at, `LONGEST_S` at most."""
+    """Return the part of a recording that is used, at most `LONGEST_S` from its middle."""
     if sequence.duration <= LONGEST_S:
         return sequence
     centre = float(np.nanmedian(sequence.time))
@@ -149,7 +149,7 @@ def _grid(start: float, stop: float) -> FloatArray:
 
 
 def _speed(attitude: Rotation, valid: BoolArray, stride: int = 4) -> FloatArray:
-    """Angular rate [rad/s] around each sample of an even grid, NaN where it is not known."""
+    """Return the angular rate [rad/s] around each sample of an even grid, NaN where unknown."""
     speed = np.full(len(valid), np.nan)
     if len(valid) > stride:
         half = stride // 2
@@ -160,7 +160,7 @@ def _speed(attitude: Rotation, valid: BoolArray, stride: int = 4) -> FloatArray:
 
 
 def _coarse_offset(time: FloatArray, gyro: FloatArray, truth: Trajectory) -> float:
-    """Offset at which both speeds of rotation correlate best, to a hundredth of a second."""
+    """Return the offset at which both angular speeds correlate best, to a hundredth of a second."""
     grid = _grid(time[0] - MAX_OFFSET_S, time[-1] + MAX_OFFSET_S)
     pose = truth.at(grid)
     speed_T = _speed(pose.attitude_WB, pose.valid)

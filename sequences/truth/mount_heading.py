@@ -1,15 +1,15 @@
-"""What the accelerometer knows of a mount's turn about the vertical, where the gyroscope does not.
+"""Rotation of a mount about the vertical, from the accelerometer where the gyroscope fails.
 
-On a trolley a device turns about the vertical alone, and rotation vectors along one axis leave the
-mount's turn about that axis open. The accelerometer closes it: what it feels sideways must be the
-second derivative of the captured path. With the second difference over h, which is the mean of the
-acceleration under a triangle,
+On a trolley a device rotates about the vertical only, and rotation vectors along one axis do not
+determine the mount's rotation about that axis. The accelerometer does: the horizontal acceleration
+must be the second derivative of the captured path. With the second difference over h, which is the
+mean of the acceleration under a triangle,
 
     (p(t + h) - 2 p(t) + p(t - h)) / h^2  =  mean of  R_WB (f - b_a) + g + R_WB ([w']x + [w]x^2) s
 
-is linear in a small turn about the vertical, in the accelerometer's bias b_a and in the lever s
-from the sensor to the point that is tracked (0.1 m in OxIOD), so that neither is taken for a turn.
-Both estimates are weighed by what they know.
+is linear in a small rotation about the vertical, in the accelerometer bias b_a and in the lever arm
+s from the sensor to the tracked point (0.1 m in OxIOD), so that neither is mistaken for a rotation.
+The estimates of gyroscope and accelerometer are weighted by their information.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from stario.sequences.sequence import BoolArray, FloatArray
 
 _H_S = 0.3
 _TURN_S = 0.1
-"""Interval over which the gyroscope is held against the attitude."""
+"""Interval over which gyroscope and attitude are compared [s]."""
 
 _LEVER_M = 0.3
 _BIAS_M_S2 = 0.3
-"""What lever and bias are at most about: they stay bounded where a track says little of them."""
+"""Prior sigmas of lever arm and bias, which bound them where a track determines them poorly."""
 
 _CAUTION = 2.5
-"""The force's deviation is taken to be this many times what its residuals say: recordings of one
-session, and halves of one recording, differ by that much."""
+"""Factor by which the accelerometer's deviation is taken to exceed that of its residuals: results
+of recordings of one session, and of halves of one recording, differ by that much."""
 
 _MIN_ROWS = 100
 _PASSES = 5
@@ -44,18 +44,18 @@ def heading_turn(
     attitude_WB: Rotation,
     valid: BoolArray,
 ) -> Rotation:
-    """A correction R_BB' of the mount about the vertical: the better attitude is R_WB R_BB'.
+    """Return a mount correction R_BB' about the vertical; corrected attitudes are R_WB R_BB'.
 
     Args:
-        time: (N,) [s] of the capture, evenly sampled, on the IMU's clock.
+        time: (N,) times of the capture [s], evenly sampled, on the IMU's clock.
         gyro: (N, 3) angular rate in B [rad/s] at those times.
         force: (N, 3) specific force in B [m/s^2] at those times.
-        position_W: (N, 3) of the tracked point in a level world [m].
-        attitude_WB: N rotations, right but for a few degrees about the vertical.
-        valid: (N,) samples to be trusted.
+        position_W: (N, 3) positions of the tracked point in a level world [m].
+        attitude_WB: N rotations, correct except for a few degrees about the vertical.
+        valid: (N,) bool, whether a sample may be used.
 
     Returns:
-        The rotation; identity where there is too little to tell.
+        The rotation; identity if there are too few samples.
     """
     up_B = attitude_WB[valid].apply([0.0, 0.0, 1.0], inverse=True).mean(axis=0)
     up_B /= np.linalg.norm(up_B)
@@ -77,7 +77,7 @@ def heading_turn(
 def _gyro_information(
     time: FloatArray, gyro: FloatArray, attitude_WB: Rotation, valid: BoolArray, up_B: FloatArray
 ) -> float:
-    """Inverse variance [1/rad^2] of the turn about `up_B` that the gyroscope's fit leaves."""
+    """Return the inverse variance [1/rad^2] of the gyroscope's fit for rotation about `up_B`."""
     stride = max(1, round(_TURN_S / float(np.median(np.diff(time)))))
     angle = np.vstack([np.zeros(3), np.cumsum(_trapezia(time, gyro), axis=0)])
     use = valid[:-stride] & valid[stride:]
@@ -94,7 +94,7 @@ def _trapezia(time: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 def _deviation(residual: FloatArray) -> float:
-    """Standard deviation by the median, deaf to outliers."""
+    """Return the standard deviation from the median, robust to outliers."""
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
 
 
@@ -107,9 +107,9 @@ def _rows(
     valid: BoolArray,
     up_B: FloatArray,
 ) -> FloatArray:
-    """Rows (M, 10), two for each of the moments, of which each column is a mean in W.
+    """Return rows (M, 10), two for each instant, whose columns are means in W.
 
-    Lever (3), bias (3), the force's part along `up_B`, its part across, that part turned by 90
+    Lever arm (3), bias (3), the force along `up_B`, the force across it, the latter rotated by 90
     degrees, and the second difference of the position.
     """
     dt = float(np.median(np.diff(time)))
@@ -123,7 +123,7 @@ def _rows(
     columns = [np.cross(gyro, np.cross(gyro, axis)) + np.cross(spin, axis) for axis in np.eye(3)]
     columns += [np.tile(axis, (len(time), 1)) for axis in np.eye(3)]
     columns += [along, force - along, np.cross(up_B, force)]
-    matrices = attitude_WB.as_matrix()[:, :2]  # only what is level counts
+    matrices = attitude_WB.as_matrix()[:, :2]  # only horizontal components are used
     level = np.matmul(matrices, np.stack(columns, axis=2)).reshape(len(time), 18)
     means = _triangle(level, k)[moments].reshape(-1, 9)
     second = position_W[moments + k] - 2.0 * position_W[moments] + position_W[moments - k]
@@ -131,7 +131,7 @@ def _rows(
 
 
 def _turned(rows: FloatArray, turn: float) -> FloatArray:
-    """The linear system (M, 8) about a turn: for a further turn, lever, bias; what they explain."""
+    """Return the linear system (M, 8) at `turn`: further turn, lever, bias; right-hand side."""
     along, across, turned, second = rows[:, 6:].T
     sine, cosine = np.sin(turn), np.cos(turn)
     missing = second - along - cosine * across - sine * turned
@@ -139,13 +139,13 @@ def _turned(rows: FloatArray, turn: float) -> FloatArray:
 
 
 def _triangle(values: FloatArray, k: int) -> FloatArray:
-    """Mean under a triangle of half width `k` rows, centred."""
+    """Return the centred mean under a triangle of half width `k` rows."""
     once = uniform_filter1d(values, k, axis=0)
     return np.asarray(uniform_filter1d(once, k, axis=0, origin=-1 if k % 2 == 0 else 0))
 
 
 def _robust_turn(rows: FloatArray) -> tuple[float, float]:
-    """The turn [rad] and its inverse variance, lever and bias estimated beside it."""
+    """Return the turn [rad] and its inverse variance, estimated jointly with lever and bias."""
     A, b = rows[:, :7], rows[:, 7]
     weights = np.ones(len(rows))
     prior = np.array([0.0, *[1 / _LEVER_M**2] * 3, *[1 / _BIAS_M_S2**2] * 3])
@@ -156,6 +156,6 @@ def _robust_turn(rows: FloatArray) -> tuple[float, float]:
         residual = b - A @ x
         deviation = _deviation(residual)
         weights = 1.0 / (1.0 + np.square(residual / (2.0 * deviation))) ** 2
-    # Rows half a window apart: every second one says something new.
+    # Rows are half a window apart: only every second one adds information.
     variance = 2.0 * np.linalg.inv(normal)[0, 0]
     return float(x[0]), float(1.0 / variance)

@@ -1,11 +1,11 @@
-"""What turns the gyroscope's yaw away from the true one: its scale, and its bias.
+"""Causes of the gyroscope's yaw drift: scale error and bias.
 
-A scale error s and a bias b about the vertical make the levelled yaw psi drift against the truth's:
+A scale error s and a bias b about the vertical make the levelled yaw psi drift from the true one:
 
     psi_true - psi = -s / (1 + s) (psi - psi_0) - b (t - t_0) + const
 
-Phones whose system takes the bias off still turn by some percent too far or too little; on a walk
-in loops that adds up, and neither gravity nor the network tells it.
+Phones whose system removes the bias still have scale errors of a few percent; on a walk in loops
+these add up, and neither gravity nor the network makes them observable.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
 _LEAST_TURNED_RAD = 0.3
-"""Deviation of the true yaw from an even turning below which scale and bias are not told apart."""
+"""Least deviation of the true yaw from an even rotation at which scale and bias are separable."""
 
 
 @dataclass(frozen=True)
 class YawDrift:
-    """The gyroscope's yaw against the truth's.
+    """Drift of the gyroscope's yaw relative to the true one.
 
     Attributes:
-        scale: share by which the gyroscope turns too far.
-        bias: of it about the vertical [rad/s].
-        left: root mean square of what both do not explain [rad].
+        scale: scale error of the gyroscope, positive if it reads too high.
+        bias: its bias about the vertical [rad/s].
+        left: root mean square of the residual yaw [rad].
     """
 
     scale: float
@@ -43,19 +43,19 @@ class YawDrift:
 
 
 def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
-    """Fit scale and bias over the longest unbroken stretch of what `fit_truth` looks at.
+    """Fit scale and bias over the longest unbroken stretch of the part that `fit_truth` uses.
 
     Args:
-        sequence: with a truth.
-        fit: of that truth.
+        sequence: recording with ground truth.
+        fit: fit of that truth.
 
     Returns:
-        None where the device turned too little to tell.
+        The drift; None if the device turned too little.
 
     Raises:
         InputError: as for `clean_samples`.
     """
-    assert sequence.truth is not None  # there is a fit of it
+    assert sequence.truth is not None  # a fit of it exists
     time, gyro, accel = clean_samples(middle(sequence))
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
@@ -72,7 +72,7 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     if len(off) < 3:
         return None
     even = np.column_stack([np.ones(len(off)), seconds])
-    # By the truth: a gyroscope that turns a fiftieth of it is told as well.
+    # From the true yaw: a gyroscope that measures only a fiftieth of it is reported as well.
     turned = yaw + off - even @ np.linalg.lstsq(even, yaw + off, rcond=None)[0]
     if float(turned.std()) < _LEAST_TURNED_RAD:
         return None

@@ -57,7 +57,7 @@ def test_all_24_right_handed_axes_are_rotations_and_are_named() -> None:
 
 @pytest.mark.parametrize("axes", ["y,x,z", "-x,y,z", "x,-z,-y", "-x,-y,-z"])
 def test_left_handed_axes_are_refused(walk: ImuSequence, axes: str) -> None:
-    with pytest.raises(InputError, match=r"left-handed.*turn one sign over"):
+    with pytest.raises(InputError, match=r"left-handed.*change the sign"):
         with_axes(walk, axes)
 
 

@@ -83,7 +83,7 @@ def test_missing_folder_and_other_modes_are_named(tmp_path):
 @pytest.mark.parametrize("write", [atomic_write, atomic_folder])
 def test_what_the_system_refuses_names_path_reason_and_fix(tmp_path, write):
     long = tmp_path / ("x" * 300)
-    told = rf"path: found .*{long.name}: File name too long, expected .*; choose another place"
+    told = rf"path: found .*{long.name}: File name too long, expected .*; choose another folder"
     with pytest.raises(InputError, match=told), write(long):
         pass
 

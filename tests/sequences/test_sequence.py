@@ -83,7 +83,7 @@ def test_truth_at_the_slowest_rate_is_whole_whatever_rounding_does(start: float)
     track = screw(start + np.round(np.arange(201) * 0.1, 1))
     assert track.covers(start + np.linspace(0.05, 19.95, 400)).all()
     assert not too_slow(track)
-    assert "at 5 Hz, at least 10 Hz are needed" in too_slow(screw(track.time[::2]))
+    assert "at 5 Hz; at least 10 Hz are needed" in too_slow(screw(track.time[::2]))
 
 
 def test_gaps_are_not_bridged_at_times_since_1970() -> None:

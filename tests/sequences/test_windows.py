@@ -218,7 +218,7 @@ def test_a_wild_time_costs_its_own_sample_alone(
     time[100] += 1e6
     wild = replace(walk, time=time)
     assert np.array_equal(clean_samples(wild)[0], np.delete(walk.time, 100))
-    assert "samples ahead of their time left out: 1" in caplog.text
+    assert "samples ahead of their time dropped: 1" in caplog.text
     (stream,), (whole,) = world_streams(wild), world_streams(walk)
     assert len(stream) == len(whole)
 

@@ -190,7 +190,7 @@ def test_what_cannot_be_learned_from_is_skipped(tmp_path: Path) -> None:
     paths = [tmp_path / f"{name}.csv" for name in wrong]
     outcomes = list(recorded(paths, read_recording, {}, tmp_path / "cache"))
     reasons = [outcome.reason for outcome in outcomes if isinstance(outcome, Skipped)]
-    told = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz, at least 10 Hz are needed")
+    told = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz; at least 10 Hz are needed")
     for reason, words in zip(reasons, told, strict=True):
         assert words in reason
 

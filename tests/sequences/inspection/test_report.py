@@ -38,7 +38,7 @@ def problem(sequence: ImuSequence) -> str:
 def test_nothing_is_wrong_with_a_good_recording(walk: ImuSequence) -> None:
     found = inspect_recording(walk)
     assert found.problems == ()
-    assert "nothing wrong" in found.lines()[-1]
+    assert "no problems found" in found.lines()[-1]
     assert found.timing.samples == len(walk)
     assert found.timing.rate_hz == pytest.approx(100.0)
     assert found.timing.gaps == ()
@@ -101,7 +101,7 @@ def test_a_truth_too_slow_to_compare_is_named_as_that(walk: ImuSequence) -> None
     assert truth is not None
     found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
     (problem,) = found.problems
-    assert "5 Hz, at least 10 Hz" in problem
+    assert "5 Hz; at least 10 Hz" in problem
     assert found.fit is None
 
 
@@ -111,7 +111,7 @@ def test_a_truth_of_another_body_is_named_in_degrees(walk: ImuSequence) -> None:
     turned = truth.attitude_WB * Rotation.from_rotvec([0.0, 0.0, 0.6])
     text = problem(replace(walk, truth=replace(truth, attitude_WB=turned)))
     assert "34." in text
-    assert "no option mends" in text
+    assert "no option fixes" in text
 
 
 def test_rest_is_reported(walk: ImuSequence) -> None:
@@ -147,7 +147,7 @@ def test_poor_recordings_are_described_not_refused(walk: ImuSequence) -> None:
         found = inspect_recording(poor)
         assert found.lines()
         json_text(found.as_dict())
-    with pytest.raises(InputError, match="none that is finite"):
+    with pytest.raises(InputError, match="no finite sample"):
         inspect_recording(replace(walk, gyro=np.nan * walk.gyro))
 
 

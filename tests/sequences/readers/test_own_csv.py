@@ -306,7 +306,7 @@ def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path)
     header = "t,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
     read = read_own_csv(written(tmp_path / "named.csv", header, *GOOD[1:]))
     for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
-        with pytest.raises(InputError, match=r"for named, whose file names its unit, .*leave the"):
+        with pytest.raises(InputError, match=r"for named, whose file names its unit, .*omit the"):
             with_units(read, **options)
     assert np.array_equal(with_units(read).gyro, read.gyro)
     plain = read_own_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better

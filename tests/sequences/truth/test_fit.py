@@ -116,7 +116,7 @@ def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
     other = replace(fit, **{"time_offset": -2.0} | found)
     assert other.axes() is None
     (problem,) = fit_problems("w", other, None, "")
-    assert "clocks more than 5 s apart, another walk" in problem
+    assert "clocks more than 5 s apart, truth of another" in problem
 
 
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
@@ -135,7 +135,7 @@ def test_a_gyroscope_with_wrong_signs_is_not_the_truths_fault(
 def test_the_accelerometer_says_whether_gyroscope_or_truth_is_turned(walk: ImuSequence) -> None:
     fit = fit_truth(replace(walk, gyro=walk.gyro @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix().T))
     (problem,) = fit_problems("w", fit, None, "")
-    assert "gyroscope: its axes or signs are not the accelerometer's" in problem
+    assert "gyroscope: its axes or signs are not those of the accelerometer" in problem
     truth = truth_of(walk)
     turned = replace(truth, attitude_WB=truth.attitude_WB * Rotation.from_rotvec([0.5, 0, 0]))
     problems = fit_problems("w", fit_truth(replace(walk, truth=turned)), None, "")

@@ -40,8 +40,8 @@ def test_a_person_reads_how_far_it_turns(walk: ImuSequence) -> None:
         "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).lines())
         for scale in (1.03, 0.97)
     )
-    assert re.search(r"the gyroscope turns (2\.9|3\.[01]) % too far", far)
-    assert re.search(r"the gyroscope turns (2\.9|3\.[01]) % too little", little)
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too high", far)
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too low", little)
 
 
 def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
@@ -58,11 +58,11 @@ def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
 
 @pytest.mark.parametrize(
     ("scale", "words"),
-    [(1.3, r"(29|30)\.\d % too far"), (1 / 57.3, r"98\.\d % too little"), (1.04, "")],
+    [(1.3, r"(29|30)\.\d % too high"), (1 / 57.3, r"98\.\d % too low"), (1.04, "")],
 )
 def test_a_scale_that_no_sensor_has_is_a_problem(
     walk: ImuSequence, scale: float, words: str
 ) -> None:
     told = "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).problems)
-    assert ("gyroscope: turns" in told) is bool(words)
+    assert ("gyroscope: reads" in told) is bool(words)
     assert re.search(words, told)

@@ -420,7 +420,7 @@ def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_put_right(
     for name, values in (("acce", wrong), ("gyro", walk.gyro), ("ARKit_pose", poses)):
         save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, joint=" ")
     read = read_recording(tmp_path / "s")
-    assert "turned to its -y,-x,-z" in caplog.text
+    assert "its -y,-x,-z is used as x,y,z" in caplog.text
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
 
 
