@@ -25,7 +25,7 @@ _FITS_TO_REPLACE = 2
 _FITS_TO_DROP = 4
 """That fit both: it was one outlier, or few, and nothing is left to decide."""
 
-_LONGEST = 6.0
+_MAX_SECONDS = 6.0
 """The IMU alone knows no more beyond."""
 
 Result = TypeVar("Result")
@@ -66,7 +66,7 @@ class AlternativeHypothesis:
     @property
     def is_obsolete(self) -> bool:
         """Whether it is of no more use."""
-        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _LONGEST
+        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _MAX_SECONDS
 
 
 class HypothesisPair:

@@ -18,7 +18,7 @@ from stario.fusion.lie import yaw_rotation
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
-_RARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
+_RARE_SHARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 """While fewer than this share of the displacements of the last seconds were outliers they are the
 network's fault, and inflated by this power of NIS / gate; a filter that calls more of them outliers
 may itself be wrong. Some five seconds of false displacements are bridged so."""
@@ -55,12 +55,12 @@ class DisplacementUpdates:
             covariance_N: (3, 3) [m^2].
         """
         f, before = self._config, self._ekf.state
-        rare = self.outlier_share < _RARE
+        rare = self.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
         gated = is_gated(result)
-        late = 1.0 / (f.update_rate * _SHARE_SECONDS)
-        self.outlier_share += late * (gated - self.outlier_share)
+        gain = 1.0 / (f.update_rate * _SHARE_SECONDS)
+        self.outlier_share += gain * (gated - self.outlier_share)
         if f.adaptive:
             self.accel_noise = self.accel_noise.updated(result)
         if self.hypotheses.alternative is None and rare and gated:

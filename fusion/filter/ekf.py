@@ -41,7 +41,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
 
-_SAME_PRIOR = 1e-6
+_PRIOR_TOLERANCE = 1e-6
 """Relative difference of variances that is none."""
 
 
@@ -132,7 +132,7 @@ class StateCloningEkf(ErrorStateEngine):
         P[:, first : first + CLONE] = rows.T
         rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
         rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
-        self.state = changed(s, X=X, P=P, clone_times=_with(s.clone_times, slot, s.time))
+        self.state = changed(s, X=X, P=P, clone_times=_with_time(s.clone_times, slot, s.time))
         return slot
 
     def release(self, slot: int) -> None:
@@ -146,7 +146,7 @@ class StateCloningEkf(ErrorStateEngine):
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
         P[:, first : first + CLONE] = 0.0
-        self.state = changed(s, P=P, clone_times=_with(s.clone_times, slot, None))
+        self.state = changed(s, P=P, clone_times=_with_time(s.clone_times, slot, None))
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -269,9 +269,9 @@ class StateCloningEkf(ErrorStateEngine):
         assert s.field is not None
         m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
         bearing = math.atan2(m_W[1], m_W[0])
-        off = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
+        residual = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
         blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
-        return self.update_linear(np.array([off]), blocks, np.array([[variance]]), gate)
+        return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
     def exchange_gyro_bias_prior(self, old: float, new: float) -> None:
         """Everything as if the gyroscope bias's prior, zero mean, had been another from the start.
@@ -285,10 +285,10 @@ class StateCloningEkf(ErrorStateEngine):
             old: variance per axis of the prior until now [rad^2/s^2].
             new: of the one that takes its place.
         """
-        if new > (1.0 + _SAME_PRIOR) * old:
+        if new > (1.0 + _PRIOR_TOLERANCE) * old:
             widest = float(np.linalg.eigvalsh(self.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
             old, new = max(old, widest), new * max(1.0, widest / old)
-        while abs(new - old) > _SAME_PRIOR * old:
+        while abs(new - old) > _PRIOR_TOLERANCE * old:
             step = min(new, 2.0 * old)  # a larger one would be badly conditioned
             P = self.state.P
             rows = P[GYRO_BIAS]
@@ -307,18 +307,18 @@ class StateCloningEkf(ErrorStateEngine):
         xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
         X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        field = None if s.field is None else _moved(s.field, dx[s.first_field :])
+        field = None if s.field is None else _corrected_field(s.field, dx[s.first_field :])
         turn = s.network_turn + float(dx[s.turn_row])
         self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
 
 
-def _with(
+def _with_time(
     times: tuple[float | None, ...], slot: int, time: float | None
 ) -> tuple[float | None, ...]:
     return (*times[:slot], time, *times[slot + 1 :])
 
 
-def _moved(field: FieldState, dx: FloatArray) -> FieldState:
+def _corrected_field(field: FieldState, dx: FloatArray) -> FieldState:
     azimuth, wander = field.azimuth + float(dx[0]), field.wander + float(dx[1])
     return FieldState(azimuth, wander, field.hard_iron_B + dx[2:])

@@ -26,12 +26,12 @@ _CLONE_COLUMNS = [0, 1, 2, 4]
 GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
 
-_FAR = 1e3
+_MAX_ORIGIN_DISTANCE = 1e3
 """Farther from the origin than this [m] positions are counted from a point nearby: in the
 right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
 digits for centimetres."""
 
-_AT_ONCE = 2000
+_CHUNK = 2000
 """Estimates that are turned at once: an hour's would take hundreds of megabytes besides."""
 
 
@@ -109,7 +109,7 @@ class EkfState:
     @classmethod
     def initial(cls, state: NavState, slots: int) -> EkfState:
         """A state without clones, from one with plain errors."""
-        origin_W = state.p_W if np.linalg.norm(state.p_W) > _FAR else np.zeros(3)
+        origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
         P = np.zeros((CORE + CLONE * slots + 1,) * 2)
@@ -204,7 +204,7 @@ class EkfState:
             shift: (3,) [m].
         """
         moved = R @ self.origin_W + shift
-        origin_W = moved if np.linalg.norm(moved) > _FAR else np.zeros(3)
+        origin_W = moved if np.linalg.norm(moved) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         shift = moved - origin_W  # what is left of it for the poses
         X = R @ self.X
         X[:, :, 4] += shift
@@ -284,8 +284,8 @@ def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
 
 def nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
     """The newest states as callers get them."""
-    parts = range(0, len(estimates), _AT_ONCE)
-    return [state for k in parts for state in _nav_states(estimates[k : k + _AT_ONCE])]
+    parts = range(0, len(estimates), _CHUNK)
+    return [state for k in parts for state in _nav_states(estimates[k : k + _CHUNK])]
 
 
 def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:

@@ -22,7 +22,7 @@ from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
 
-_FAR_BETTER = 1e9
+_JOSEPH_RATIO = 1e9
 """A measurement of so many times less variance than the state's costs the difference its digits."""
 
 
@@ -154,7 +154,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
+        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
             return self._correct_as_joseph(blocks)
         # P is symmetric: its transpose is the same matrix in the order of BLAS.
         P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T

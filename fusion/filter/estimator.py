@@ -44,7 +44,7 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
-_ROUNDING = 1e-6
+_TIME_TOLERANCE = 1e-6
 """Of times [s]."""
 
 
@@ -152,7 +152,7 @@ class Estimator:
         if self._streaming:
             before = changed(self.state, history=())
             step = Step(before, interval.without_window(), displacement, tuple(fixes))
-            oldest = interval.stop - WINDOW_SECONDS - _ROUNDING
+            oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
             kept = (s for s in self._history if s.interval.stop >= oldest)
             self._history = (*kept, step)
 
@@ -181,13 +181,14 @@ class Estimator:
             accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
         return None, accepted
 
-    def _propagate_piece(self, interval: ImuInterval, began: float) -> Segment:
+    def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:
         """A piece of the interval that began at a time [s]."""
         before = self.ekf.state.p_W
         segment = self._hypotheses.apply_to_both(lambda: self._propagate_samples(interval))
         if interval.gap:
             sigma = math.sqrt(
-                gap_yaw_variance(interval.stop - began) - gap_yaw_variance(interval.start - began)
+                gap_yaw_variance(interval.stop - interval_start)
+                - gap_yaw_variance(interval.start - interval_start)
             )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)

@@ -20,8 +20,8 @@ from stario.fusion.changed import changed
 from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.sequence import FloatArray, Trajectory
 
-_ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-_LEVEL = np.diag([1.0, 1.0, 0.0])
+_E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_HORIZONTAL = np.diag([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class FrameTransform:
             covariance: (3, 3) before.
             own: variance of the yaw there, in the track's own frame [rad^2].
         """
-        turned = _turned(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
+        turned = _turn_covariance(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
         covariance = self.R @ covariance @ self.R.T + turned[6:9, 6:9]
         return (
             covariance
@@ -93,7 +93,9 @@ class FrameTransform:
         for first in (0, 3, 6):
             A[first : first + 3, first : first + 3] = self.R
         covariance = A @ state.covariance @ A.T
-        covariance += _turned(self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot)
+        covariance += _turn_covariance(
+            self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot
+        )
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
         return changed(
@@ -106,27 +108,27 @@ class FrameTransform:
         )
 
 
-def _moments(variance: float) -> tuple[float, float, float]:
+def _turn_moments(variance: float) -> tuple[float, float, float]:
     """Second moments of a turn t by a normal angle of this variance, also where it is large.
 
     Returns:
         E sin^2 t, E (1 - cos t)^2 and E t sin t: across an arm of length one, along it, and of
         across with the angle; the variance, 0 and the variance where it is small.
     """
-    once, twice = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
-    return 0.5 * (1.0 - twice), 1.0 - 2.0 * once + 0.5 * (1.0 + twice), variance * once
+    cos_1, cos_2 = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
+    return 0.5 * (1.0 - cos_2), 1.0 - 2.0 * cos_1 + 0.5 * (1.0 + cos_2), variance * cos_1
 
 
-def _turned(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
+def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
     """Covariance (15, 15) of a state by its turn: yaw, velocity (3,) and arm (3,) to the pivot."""
-    across, along, both = _moments(variance)
-    level = np.zeros((15, 2))  # columns: across and along
-    level[3:6, 0], level[6:9, 0] = _ACROSS @ v_W, _ACROSS @ arm
-    level[3:6, 1], level[6:9, 1] = _LEVEL @ v_W, _LEVEL @ arm
-    covariance = level @ np.diag([across, along]) @ level.T
+    across, along, with_angle = _turn_moments(variance)
+    columns = np.zeros((15, 2))  # columns: across and along
+    columns[3:6, 0], columns[6:9, 0] = _E3_CROSS @ v_W, _E3_CROSS @ arm
+    columns[3:6, 1], columns[6:9, 1] = _HORIZONTAL @ v_W, _HORIZONTAL @ arm
+    covariance = columns @ np.diag([across, along]) @ columns.T
     covariance[2, 2] = variance
-    covariance[2] += both * level[:, 0]
-    covariance[:, 2] += both * level[:, 0]
+    covariance[2] += with_angle * columns[:, 0]
+    covariance[:, 2] += with_angle * columns[:, 0]
     return covariance
 
 

@@ -22,34 +22,34 @@ from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
 
-_CORRECTED = 0.01
+_MAX_CORRECTED_BIAS = 0.01
 """Of a gyroscope that the device corrects, at most, by what levelling says of it [rad/s]."""
 
-_SHARED = 0.4
+_SHARED_FRACTION = 0.4
 """What is not known yet about the level axes counts by this share: what is known of them tells of
 the vertical one as well, since a device corrects all or none."""
 
 _SIGNIFICANT = 3.0
 """Deviations of what the data say, about any axis, within which the prior is left alone."""
 
-_PRECISE = 5e-3
+_PRECISE_SIGMA = 5e-3
 """Data that tell less than this [rad/s] are the network's displacements alone: too little to go
 by, since their errors are alike for long. Rest, gravity, fixes and the magnetic field tell more."""
 
 _WIDEST = 0.015
 """To which data widen it [rad/s]; what lies outside is raw, which levelling tells sooner."""
 
-_AT_REST = 2.5e-3
+_REST_SIGMA = 2.5e-3
 """Where rest tells it, at least [rad/s]: a glide that turns is no rest."""
 
-_PATIENCE, _RAW = 30.0, 0.1
+_LONG_REST, _RAW_SIGMA = 30.0, 0.1
 """What looks like rest for so long [s] is rest, though the gyroscope reads up to this [rad/s]: of
 what is raw about the vertical gravity tells nothing, and nobody turns so long so evenly."""
 
-_ROUNDING = 1e-6
+_TIME_TOLERANCE = 1e-6
 """Of times [s]."""
 
-_LEAST_GAIN, _UNTOLD = 1e-6, 1.0
+_MIN_GAIN, _VAGUE_SIGMA = 1e-6, 1.0
 """Share of the information by which an update must add to it; sigma along axes untold [rad/s]."""
 
 
@@ -78,7 +78,7 @@ class GyroBiasPrior:
 
     def before_levelling(self) -> GyroBiasPrior:
         """As wide as while levelling knows nothing of the bias."""
-        return changed(self, variance=self.sigma**2 + (_SHARED * BIAS_SIGMA) ** 2)
+        return changed(self, variance=self.sigma**2 + (_SHARED_FRACTION * BIAS_SIGMA) ** 2)
 
     def updated(
         self,
@@ -97,9 +97,9 @@ class GyroBiasPrior:
             P: (3, 3) its covariance.
             wander: variance by which it may have changed since the start [rad^2/s^2].
         """
-        uncorrected = max(self.uncorrected, levelled - _CORRECTED)
+        uncorrected = max(self.uncorrected, levelled - _MAX_CORRECTED_BIAS)
         evidence = max(self.evidence, min(self._variance_from_data(b_g, P, wander), _WIDEST**2))
-        known = self.sigma**2 + (_SHARED * levelled_sigma) ** 2 + uncorrected**2
+        known = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
         return changed(
             self, variance=max(known, evidence), uncorrected=uncorrected, evidence=evidence
         )
@@ -114,7 +114,7 @@ class GyroBiasPrior:
         prior = self.variance + wander
         p, axes = np.linalg.eigh(P)
         p = np.maximum(p, 1e-6 * prior)
-        precise = p < prior * _PRECISE**2 / (prior + _PRECISE**2)
+        precise = p < prior * _PRECISE_SIGMA**2 / (prior + _PRECISE_SIGMA**2)
         if not precise.any():
             return 0.0
         e = p[precise] * prior / (prior - p[precise])  # squares
@@ -159,7 +159,7 @@ class AdaptiveBiasPrior:
 
     def widen_for_rest(self) -> None:
         """Rest tells the bias, be it what it may."""
-        sigma = _AT_REST if self.prior.refused_seconds < _PATIENCE else _RAW
+        sigma = _REST_SIGMA if self.prior.refused_seconds < _LONG_REST else _RAW_SIGMA
         self._exchange(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
 
     def note_refused_rest(self, seconds: float) -> None:
@@ -177,7 +177,7 @@ class AdaptiveBiasPrior:
 
     def _half_seconds(self, time: float) -> int:
         """Whole half seconds since the start: what is known of a bias changes no faster."""
-        return math.floor(2.0 * (time - self._start) + _ROUNDING)
+        return math.floor(2.0 * (time - self._start) + _TIME_TOLERANCE)
 
     @property
     def _wander(self) -> float:
@@ -199,9 +199,9 @@ def gained_bias_information(
     """
     was, now = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
     gained, axes = np.linalg.eigh(now - was)
-    most, axis = float(gained[-1]), axes[:, -1]
-    if most < _LEAST_GAIN * float(np.trace(was)):
+    gain, axis = float(gained[-1]), axes[:, -1]
+    if gain < _MIN_GAIN * float(np.trace(was)):
         return None
-    told = float(axis @ (now @ after.b_g - was @ before.b_g)) / most
-    covariance = np.outer(axis, axis) / most + _UNTOLD**2 * (np.eye(3) - np.outer(axis, axis))
-    return told * axis, covariance
+    value = float(axis @ (now @ after.b_g - was @ before.b_g)) / gain
+    covariance = np.outer(axis, axis) / gain + _VAGUE_SIGMA**2 * (np.eye(3) - np.outer(axis, axis))
+    return value * axis, covariance

@@ -24,7 +24,7 @@ STILL_TILT_SIGMA = 0.01
 WALKING_SPEED = 1.5
 """How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
 
-_ORTHOGONAL, _ROUNDED = 1e-4, 1e-9
+_ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
 """By so much a rotation's rows may be off unit length and right angles: rounded input."""
 
 FARTHEST = 1e4
@@ -61,9 +61,9 @@ class PriorPose:
         for name in ("v_W", "p_W"):
             object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
         R_WB = checked("R_WB", self.R_WB, (3, 3))
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R_WB) < 0.0:
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROTATION_ERROR or np.linalg.det(R_WB) < 0.0:
             raise InputError("R_WB", "a matrix that is no rotation", "a rotation from B to W")
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDED:
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDING_ERROR:
             left, _, right = np.linalg.svd(R_WB)
             R_WB = left @ right  # the nearest rotation
         object.__setattr__(self, "R_WB", R_WB)
@@ -101,8 +101,8 @@ def reinitialise(
     reach = min(WALKING_SPEED * seconds, FARTHEST)
     covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
-    turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
-    drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
+    turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
+    drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))
     covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
     # Where the track is hangs on the bias that led there.
     covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]

@@ -196,8 +196,8 @@ _BIAS_SWAP[12:15, 9:12] = np.eye(3)
 def _nav_transition(dt: float, gravity: float) -> FloatArray:
     """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
     transition = _IDENTITY.copy()
-    fall, drop = gravity * dt, 0.5 * gravity * dt * dt
-    transition[3, 1], transition[4, 0] = fall, -fall
-    transition[6, 1], transition[7, 0] = drop, -drop
+    g_dt, half_g_dt2 = gravity * dt, 0.5 * gravity * dt * dt
+    transition[3, 1], transition[4, 0] = g_dt, -g_dt
+    transition[6, 1], transition[7, 0] = half_g_dt2, -half_g_dt2
     transition[6, 3] = transition[7, 4] = transition[8, 5] = dt
     return transition

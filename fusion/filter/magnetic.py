@@ -38,7 +38,7 @@ PERIOD = 0.5
 WANDER_SIGMA = 0.4
 """Of g, the field's azimuth about its mean, at most [rad]: buildings turn it by 5 to 30 degrees."""
 
-_LEAST_WANDER = 0.1
+_MIN_WANDER_SIGMA = 0.1
 """The same in a field that hardly varies [rad]."""
 
 _WANDER_PER_SPREAD = 2.0
@@ -55,25 +55,25 @@ BEARING_SIGMA = 0.3
 """White noise of one bearing [rad] where g wanders by `WANDER_SIGMA`, else in proportion: steel
 within a step, late samples while the device turns."""
 
-_UNKNOWN = math.pi
+_FIRST_AZIMUTH_SIGMA = math.pi
 """Standard deviation of c at first [rad]."""
 
 _GATE = 0.95
 """Probability of the bearing's chi-square test: outliers are common, so they weigh down early."""
 
-_LEAST_HORIZONTAL = 4.0
+_MIN_HORIZONTAL = 4.0
 """Horizontal field [uT] below which its bearing means nothing."""
 
-_USUAL_SIZE, _USUAL_DIP = 0.05, 0.05
+_SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (share) and dip [rad] that double the variance."""
 
 NORTH_SIGMA = 0.1
 """Of the direction that magnetic north has on the average where somebody walks [rad]."""
 
-_NORTH_AFTER = 20
+_MIN_NORTH_COUNT = 20
 """Bearings from which on north is told: those of ten seconds."""
 
-_MEMORY = 120
+_AVERAGING_COUNT = 120
 """Bearings that make the place's usual size, dip and spread: a minute of them."""
 
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
@@ -82,7 +82,7 @@ _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 _HELD_FACTOR = 10.0
 """On the variance of a field that the device has carried on by its own gyroscope."""
 
-_WALKING = 0.3
+_MIN_SPEED = 0.3
 """Speed below which the spread is not looked at [m/s]: in one spot the field is always quiet."""
 
 
@@ -111,7 +111,7 @@ class MagneticReference:
     @property
     def wander_sigma(self) -> float:
         """Of the azimuth about its mean, by how much size and dip vary [rad]."""
-        return min(max(_WANDER_PER_SPREAD * self.spread, _LEAST_WANDER), WANDER_SIGMA)
+        return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
     @property
     def bearing_sigma(self) -> float:
@@ -138,19 +138,19 @@ class MagneticReference:
         count = self.count + 1
         if count == 1:
             return changed(self, time=time, count=1, size=size, dip=dip)
-        share = 1.0 / min(count, _MEMORY)
-        near = 2.0 * _USUAL_SIZE * self.size
-        usual_size = self.size + share * min(max(size - self.size, -near), near)
-        off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
-        usual_dip = self.dip + share * off
-        found = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
+        share = 1.0 / min(count, _AVERAGING_COUNT)
+        size_clip = 2.0 * _SIZE_TOLERANCE * self.size
+        usual_size = self.size + share * min(max(size - self.size, -size_clip), size_clip)
+        dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
+        usual_dip = self.dip + share * dip_change
+        means = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
         if not new_place:
-            return found
+            return means
         distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
         moving_count = self.moving_count + 1
-        late = 1.0 / min(moving_count + _FIRST_COUNT, _MEMORY)
+        gain = 1.0 / min(moving_count + _FIRST_COUNT, _AVERAGING_COUNT)
         return changed(
-            found, spread=self.spread + late * (distance - self.spread), moving_count=moving_count
+            means, spread=self.spread + gain * (distance - self.spread), moving_count=moving_count
         )
 
 
@@ -165,7 +165,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
         declination: of magnetic from true north, positive east [rad].
     """
     yaw = yaw_twist(s.R_WB)
-    if s.field is None or reference.count < _NORTH_AFTER or not math.isfinite(yaw):
+    if s.field is None or reference.count < _MIN_NORTH_COUNT or not math.isfinite(yaw):
         return None
     c, P = s.first_field, s.P
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
@@ -177,7 +177,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
 def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """The state with an azimuth that is as the first field (3,) [uT] points, and unknown."""
     x, y, _ = s.R_WB @ m_B
-    variances = [_UNKNOWN**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
+    variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
     n = len(s.P)
     P = np.zeros((n + len(variances),) * 2)
     P[:n, :n], P[n:, n:] = s.P, np.diag(variances)
@@ -217,15 +217,15 @@ def update_bearing(
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
-    if horizontal < _LEAST_HORIZONTAL:
+    if horizontal < _MIN_HORIZONTAL:
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
     held = reference.is_held(measured)
-    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
+    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
-        (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
+        (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
     variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * (_HELD_FACTOR if held else 1.0)
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

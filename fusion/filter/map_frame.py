@@ -60,7 +60,7 @@ _SIGMA_RATIO = 2.0
 _LENGTH_TOLERANCE = 0.5
 """Share of the shorter one by which a network's way and the true one may differ in length."""
 
-_MUCH_LARGER, _LARGEST = 1e3, 1e5
+_INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
 """An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
 beyond, the covariance keeps no digits for the fix."""
 
@@ -149,15 +149,15 @@ class MapFrame:
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
         """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
         now, s = _nav_state(ekf), self.state
-        lost = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
-        if not (s.placed or s.oriented) or lost <= KNOWN_YAW**2:
+        variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
+        if not (s.placed or s.oriented) or variance <= KNOWN_YAW**2:
             return
         since = now.time if s.placed else s.since  # what no fix has placed goes along
-        left = s.unoriented
+        unoriented = s.unoriented
         if not s.oriented:
-            left = (*left, _unoriented_stretch(s.pivot, s.since, now.time))
+            unoriented = (*unoriented, _unoriented_stretch(s.pivot, s.since, now.time))
         self.state = MapFrameState(
-            False, False, s.transforms, now.p_W, since, unoriented=left, jumps=s.jumps
+            False, False, s.transforms, now.p_W, since, unoriented=unoriented, jumps=s.jumps
         )
 
     def _needs_placing(self, ekf: StateCloningEkf, fix: Fix) -> bool:
@@ -171,12 +171,12 @@ class MapFrame:
         if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
-        seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-        apart = abs(seen - ours) > 3.0 * _plane_sigma(now, 6, fix) + _LENGTH_TOLERANCE * min(
-            seen, ours
-        )
+        fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
+        differs = abs(fix_distance - track_distance) > 3.0 * _plane_sigma(
+            now, 6, fix
+        ) + _LENGTH_TOLERANCE * min(fix_distance, track_distance)
         self.state = changed(
-            self.state, distance_mismatches=self.state.distance_mismatches + 1 if apart else 0
+            self.state, distance_mismatches=self.state.distance_mismatches + 1 if differs else 0
         )
         return self.state.distance_mismatches >= _OUTLIERS_IN_A_ROW
 
@@ -184,8 +184,8 @@ class MapFrame:
         now, since = _nav_state(ekf), self.state.since
         transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
         ekf.state = ekf.state.transformed(np.eye(3), transform.shift)
-        left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
-        sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
+        variance = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
+        sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
         ekf.state = ekf.state.with_position_inflated(sigma)
         self.state = changed(
             self.state,
@@ -196,7 +196,7 @@ class MapFrame:
             distance_mismatches=0,
             yaw_variance=float(now.covariance[2, 2]),
         )
-        self._remember(ekf, fix)
+        self._add_to_alignment(ekf, fix)
         return transform
 
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
@@ -212,15 +212,15 @@ class MapFrame:
                 return None
             turn, inflation = self.state.alignment.turn
             if inflation > FAR_ENOUGH:
-                self._remember(ekf, fix)
+                self._add_to_alignment(ekf, fix)
                 return None
         R = exp_so3(np.array([0.0, 0.0, turn]))
         drift = float(now.covariance[2, 2])
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
         moved = ekf.state.transformed(transform.R, transform.shift)
         ekf.state = moved.with_yaw_inflated(pivot, inflation)
-        left = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
-        transforms = (*self.state.transforms, *left)
+        stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
+        transforms = (*self.state.transforms, *stretches)
         self.state = changed(
             self.state,
             oriented=True,
@@ -230,13 +230,13 @@ class MapFrame:
         )
         return transform
 
-    def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
+    def _add_to_alignment(self, ekf: StateCloningEkf, fix: Fix) -> None:
         """A position, for the direction that several tell together."""
         now, pivot = _nav_state(ekf), self.state.pivot
-        track, seen = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
+        track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
         drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
-        alignment = self.state.alignment.with_position(track, seen, variance, drift)
+        alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
@@ -262,20 +262,20 @@ class MapFrame:
         """Outliers are inflated; some in a row that are off alike say that the track is."""
         before = ekf.state
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
-        off = result.residual
-        if off is None or not is_gated(result):
+        residual = result.residual
+        if residual is None or not is_gated(result):
             self.state = changed(self.state, outlier_residuals=())
             return result
-        alike = tuple(
+        aligned = tuple(
             r
             for r in self.state.outlier_residuals
-            if r @ off > _SAME_DIRECTION * norm(r) * norm(off)
+            if r @ residual > _SAME_DIRECTION * norm(r) * norm(residual)
         )
-        self.state = changed(self.state, outlier_residuals=(*alike, off))
+        self.state = changed(self.state, outlier_residuals=(*aligned, residual))
         if len(self.state.outlier_residuals) < _OUTLIERS_IN_A_ROW:
             return result
         self.state = changed(self.state, outlier_residuals=(), jumps=self.state.jumps + 1)
-        ekf.state = before.with_position_inflated(float(norm(off)))
+        ekf.state = before.with_position_inflated(float(norm(residual)))
         return ekf.update_position_W(fix.value, fix.covariance, gate)
 
 
@@ -296,11 +296,11 @@ def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float,
     if fix.kind == "yaw":
         turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
         return turn, math.sqrt(fix.covariance[0, 0])
-    first, seen, ours = 3, fix.value, state.v_W
+    first, measured, estimated = 3, fix.value, state.v_W
     if fix.kind == "position":
-        first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
-    arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
-    turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
+        first, measured, estimated = 6, fix.value - pivot, state.p_W - pivot
+    arm = min(math.hypot(measured[0], measured[1]), math.hypot(estimated[0], estimated[1]))
+    turn = math.atan2(measured[1], measured[0]) - math.atan2(estimated[1], estimated[0])
     return turn, _plane_sigma(state, first, fix) / arm if arm > 0.0 else math.inf
 
 

@@ -46,9 +46,9 @@ class PlanarAlignment:
         """
         (a, b), (c, d) = track, fix
         row = np.array([1.0, a, b, c, d, a * c + b * d, a * d - b * c, a * a + b * b])
-        usual = self.count / self.sums[0] if self.count else 1.0
-        kept = usual / (usual + max(0.0, drift - self.drift))
-        return PlanarAlignment(kept * self.sums + row / variance, self.count + 1, drift)
+        mean_variance = self.count / self.sums[0] if self.count else 1.0
+        discount = mean_variance / (mean_variance + max(0.0, drift - self.drift))
+        return PlanarAlignment(discount * self.sums + row / variance, self.count + 1, drift)
 
     @property
     def turn(self) -> tuple[float, float]:
@@ -59,5 +59,5 @@ class PlanarAlignment:
         along -= (a * c + b * d) / weight
         across -= (a * d - b * c) / weight
         # Noise makes either side look longer than it is.
-        told = min(math.hypot(along, across), size - (a * a + b * b) / weight)
-        return math.atan2(across, along), 1.0 / math.sqrt(told) if told > 0.0 else math.inf
+        modulus = min(math.hypot(along, across), size - (a * a + b * b) / weight)
+        return math.atan2(across, along), 1.0 / math.sqrt(modulus) if modulus > 0.0 else math.inf

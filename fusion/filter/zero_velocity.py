@@ -20,11 +20,11 @@ from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
-_HIDDEN = 10.0 * PHONE_NOISE.accel_noise
+_HIDDEN_MOTION_NOISE = 10.0 * PHONE_NOISE.accel_noise
 """Ten times a phone's white noise: the slow motion of a device that only looks still [m/s^1.5]."""
 
-_BY_VELOCITY = np.eye(6, 3)
-_BY_BIAS = np.eye(6, 3, k=-3)
+_H_VELOCITY = np.eye(6, 3)
+_H_BIAS = np.eye(6, 3, k=-3)
 
 
 class ZeroVelocity(NamedTuple):
@@ -45,15 +45,15 @@ def zero_velocity(stillness: StillnessDetector) -> ZeroVelocity:
     """
     rates = stillness.mean_rates()
     n = len(rates)
-    hidden = _HIDDEN**2 * WINDOW_SECONDS
-    white = PHONE_NOISE.gyro_noise**2 / stillness.mean_seconds()
-    spread = np.maximum(rates.var(axis=0), white)
-    return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden] * 3, *(n * spread)]))
+    hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
+    white_variance = PHONE_NOISE.gyro_noise**2 / stillness.mean_seconds()
+    rate_variance = np.maximum(rates.var(axis=0), white_variance)
+    return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden_variance] * 3, *(n * rate_variance)]))
 
 
 def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: float) -> UpdateResult:
     """Update a filter; refused, not inflated, where an even glide only looks still."""
     s = ekf.state
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
-    blocks = [(3, _BY_VELOCITY), (9, _BY_BIAS)]
+    blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
     return ekf.update_linear(residual, blocks, measured.covariance, gate, "reject")
