@@ -1,11 +1,11 @@
-"""What the accelerometer is worth, estimated while running from the innovations.
+"""Online estimate of the accelerometer's effective noise from the innovations.
 
-README.md, "Noise and the gyroscope's bias". The density that the configuration gives is a prior:
-errors of scale, tilt and saturation act like noise, and differ between a phone held in front of the
-chest and one in a runner's pocket. What the innovations of displacements tell is a factor on it,
-found by stochastic approximation (Robbins and Monro 1951): it rises with each that is larger than
-typical and falls with each that is smaller, by at most as much. So it follows their median, and
-some false displacements are not taken for a bad accelerometer.
+README.md, "Noise and the gyroscope's bias". The configured density is a prior: errors of scale,
+tilt and saturation act like noise, and differ between a phone held in front of the chest and one in
+a runner's pocket. The innovations of displacements determine a factor on it, by stochastic
+approximation (Robbins and Monro 1951): the factor rises with each innovation that is larger than
+typical and falls with each smaller one, in steps of at most the gain. It therefore follows their
+median, and a few false displacements are not mistaken for a bad accelerometer.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from dataclasses import dataclass
 from stario.fusion.filter.engine import UpdateResult
 
 TARGET_NIS = 0.3
-"""NIS per degree of freedom that is aimed at, its median: the network's errors are alike for
-seconds, so that honest innovations are smaller than single errors."""
+"""Target for the median NIS per degree of freedom: the network's errors are similar for seconds, so
+that consistent innovations are smaller than single errors."""
 
 GAIN, FIRST_GAIN = 0.05, 0.2
-"""Of the logarithm, per displacement: in the long run, and at first, when nothing is known."""
+"""Step of the logarithm per displacement: in the long run, and at first, when nothing is known."""
 
 MAX_FACTOR = 30.0
-"""Factor at most: the accelerometer then says no more than that nobody jumps."""
+"""Maximum factor: the accelerometer then rules out little more than jumps."""
 
 _STEPS = 4
-"""Factors given out lie so many to a doubling, so that few different noise models are made."""
+"""Number of factors per doubling, so that few different noise models are created."""
 
 
 @dataclass(frozen=True)
 class AccelNoiseScale:
-    """How much noisier the accelerometer acts than the configuration says.
+    """Factor by which the accelerometer is noisier than configured.
 
     Attributes:
         log_factor: natural logarithm of the factor on its noise density.
-        gain: of the next displacement.
+        gain: step size for the next displacement.
     """
 
     log_factor: float = 0.0
@@ -43,11 +43,11 @@ class AccelNoiseScale:
 
     @property
     def factor(self) -> float:
-        """On the noise density, in steps."""
+        """Factor on the noise density, in steps."""
         return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
 
     def updated(self, result: UpdateResult) -> AccelNoiseScale:
-        """With what one displacement's innovation tells; nothing where there is none."""
+        """Return the scale after one displacement; unchanged if it has no innovation."""
         if not math.isfinite(result.nis):
             return self
         ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2

@@ -1,9 +1,9 @@
-"""A second opinion while displacements are taken for outliers: the filter as it is without them.
+"""Alternative hypothesis while displacements are gated: the filter's state without the outliers.
 
-README.md, "Gates". Inflated displacements that keep on pulling win in the end, right or wrong, and
-a filter that has followed false ones takes the right ones behind them for outliers. So from the
-first outlier on the filter without any is kept beside it, for some seconds at most; where the
-displacements agree with that one again, and no longer with the filter, they take its place.
+README.md, "Gates". Inflated displacements that keep pulling prevail in the end, right or wrong, and
+a filter that has followed false ones takes the correct ones after them for outliers. Therefore,
+from the first outlier on, a state without outliers is kept alongside the filter for a few seconds;
+if later displacements fit that state and no longer the filter, it replaces the filter's state.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 
 GATE = 0.95
-"""Probability of the chi-square test beyond which a displacement does not fit the sceptic."""
+"""Probability of the chi-square test beyond which a displacement does not fit the alternative."""
 
 _FITS_TO_REPLACE = 2
-"""Displacements that fit the sceptic alone, until it is believed."""
+"""Displacements that must fit only the alternative before it replaces the filter's state."""
 
 _FITS_TO_DROP = 4
-"""That fit both: it was one outlier, or few, and nothing is left to decide."""
+"""Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
 
-_LONGEST = 6.0
-"""The IMU alone knows no more beyond."""
+_MAX_SECONDS = 6.0
+"""Maximum age of the alternative [s]: the IMU alone is not accurate for longer."""
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
 class AlternativeHypothesis:
-    """The filter had it left out the displacements that do not fit.
+    """State of the filter if it had rejected the displacements that failed the gate.
 
     Attributes:
-        ekf: its state.
+        ekf: state of the filter under this hypothesis.
         began: time of the first outlier [s].
-        right: displacements since that fitted it and not the filter.
-        alike: in a row that fitted both.
+        exclusive_fits: displacements that fitted only it, since one fitted only the filter.
+        shared_fits: number of latest displacements in a row that fitted both.
     """
 
     ekf: EkfState
@@ -48,7 +48,7 @@ class AlternativeHypothesis:
     shared_fits: int = 0
 
     def updated(self, fits: bool, fits_filter: bool) -> AlternativeHypothesis:
-        """With whether a displacement fits it, and whether it fits the filter."""
+        """Return the hypothesis after a displacement that fits it, the filter, both or neither."""
         if not fits:
             alone = self.exclusive_fits if not fits_filter else 0
             return changed(self, exclusive_fits=alone, shared_fits=0)
@@ -60,24 +60,24 @@ class AlternativeHypothesis:
 
     @property
     def should_replace(self) -> bool:
-        """Whether it should take the filter's place."""
+        """Whether it should replace the filter's state."""
         return self.exclusive_fits >= _FITS_TO_REPLACE
 
     @property
     def is_obsolete(self) -> bool:
-        """Whether it is of no more use."""
-        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _LONGEST
+        """Whether it can be dropped."""
+        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _MAX_SECONDS
 
 
 class HypothesisPair:
-    """A filter, and the sceptic beside it while there is one.
+    """A filter and, while there is one, the alternative hypothesis.
 
     Args:
-        ekf: the filter; its state is put aside while the sceptic takes its turn.
+        ekf: the filter; its state is set aside while the alternative is updated.
 
     Attributes:
         ekf: the filter.
-        sceptic: None while all displacements fit.
+        alternative: the alternative hypothesis; None while all displacements fit.
     """
 
     def __init__(self, ekf: StateCloningEkf) -> None:
@@ -85,7 +85,7 @@ class HypothesisPair:
         self.alternative: AlternativeHypothesis | None = None
 
     def apply_to_both(self, work: Callable[[], Result]) -> Result:
-        """Do it to the filter, then to the sceptic; returns what came of the first."""
+        """Apply `work` to the filter and then to the alternative; return the filter's result."""
         result = work()
         if self.alternative is not None:
             filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
@@ -97,11 +97,12 @@ class HypothesisPair:
         return result
 
     def compare(self, fits: Callable[[], bool], fits_filter: bool) -> None:
-        """About a displacement that the filter has taken in.
+        """Test the alternative with a displacement that the filter has applied; adopt or drop it.
 
         Args:
-            fits: updates whatever state the filter holds with it, if it fits that one.
-            fits_filter: whether it fitted the filter.
+            fits: updates the filter's current state with the displacement if that fits, and returns
+                whether it does.
+            fits_filter: whether the displacement fitted the filter.
         """
         if self.alternative is None:
             return

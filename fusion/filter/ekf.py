@@ -1,7 +1,7 @@
 """State-cloning EKF with a right-invariant error, on filterpy's `ExtendedKalmanFilter`.
 
 The state lies on SE_2(3) and SE(3) (`EkfState`): filterpy's `x` is the mean of the error, zero
-before each update, and moved into the state by the group's exponential after it. An empty slot has
+before each update and moved into the state by the group's exponential after it. An empty slot has
 zero covariance and zero columns in every Jacobian. Derivation: README.md, "Error state" to
 "Clones".
 
@@ -41,22 +41,22 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
 
-_SAME_PRIOR = 1e-6
-"""Relative difference of variances that is none."""
+_PRIOR_TOLERANCE = 1e-6
+"""Relative difference up to which two variances count as equal."""
 
 
 class StateCloningEkf(ErrorStateEngine):
     """Right-invariant EKF over the current state and `slots` cloned poses.
 
     Use it as: `initialise`, then `propagate` segments, `clone` poses, `update_...`, `release`.
-    What filterpy tells of the last step is described in `engine.ErrorStateEngine`.
+    `engine.ErrorStateEngine` describes filterpy's attributes of the last step.
 
     Args:
         slots: number of poses that can be held at once.
-        gravity: magnitude [m/s^2].
+        gravity: magnitude of gravity [m/s^2].
 
     Attributes:
-        state: all that varies; an earlier one may be put back.
+        state: everything that varies; assign an earlier one to restore it.
     """
 
     def __init__(self, slots: int, gravity: float = STANDARD_GRAVITY) -> None:
@@ -79,10 +79,10 @@ class StateCloningEkf(ErrorStateEngine):
         self.state = changed(self.state, P=value)
 
     def initialise(self, state: NavState) -> None:
-        """Set the state, with plain errors as callers know them, and forget every clone.
+        """Set the state from one with plain errors, and drop all clones.
 
         Raises:
-            InputError: a shape is wrong, a value is not finite, `R_WB` is no rotation, or the
+            InputError: a shape is wrong, a value is not finite, `R_WB` is not a rotation, or the
                 covariance is not symmetric and positive semi-definite.
         """
         v, p, b_g, b_a = (
@@ -91,14 +91,14 @@ class StateCloningEkf(ErrorStateEngine):
         R = checked("R_WB", state.R_WB, (3, 3))
         covariance = checked("covariance", state.covariance, (CORE, CORE))
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-            raise InputError("R_WB", "a matrix that is no rotation", "R R^T = I with det R = 1")
+            raise InputError("R_WB", "a matrix that is not a rotation", "R R^T = I with det R = 1")
         check_covariance(covariance)
         now = checked("time", state.time, ()).item()
         self.state = EkfState.initial(NavState(now, R, v, p, b_g, b_a, covariance), self.slots)
         self.x[:] = 0.0
 
     def propagate(self, segment: Segment) -> None:
-        """Move the current state and its covariance across a preintegrated segment."""
+        """Propagate the current state and its covariance through a preintegrated segment."""
         s = self.state
         pose = s.X[0]
         end = propagated(segment, pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a)
@@ -111,10 +111,10 @@ class StateCloningEkf(ErrorStateEngine):
         """Copy the current pose into a slot and return its number.
 
         Args:
-            instead_of: slot of a clone that makes way; None for a free slot.
+            instead_of: slot of a clone to replace; None for a free slot.
 
         Raises:
-            InputError: every slot is taken, `release` one first; or `instead_of` holds no clone.
+            InputError: every slot is taken (`release` one first), or `instead_of` holds no clone.
         """
         s = self.state
         if instead_of is not None:
@@ -132,7 +132,7 @@ class StateCloningEkf(ErrorStateEngine):
         P[:, first : first + CLONE] = rows.T
         rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
         rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
-        self.state = changed(s, X=X, P=P, clone_times=_with(s.clone_times, slot, s.time))
+        self.state = changed(s, X=X, P=P, clone_times=_with_time(s.clone_times, slot, s.time))
         return slot
 
     def release(self, slot: int) -> None:
@@ -146,7 +146,7 @@ class StateCloningEkf(ErrorStateEngine):
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
         P[:, first : first + CLONE] = 0.0
-        self.state = changed(s, P=P, clone_times=_with(s.clone_times, slot, None))
+        self.state = changed(s, P=P, clone_times=_with_time(s.clone_times, slot, None))
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -160,24 +160,24 @@ class StateCloningEkf(ErrorStateEngine):
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
     ) -> UpdateResult:
-        """Displacement from clone i to clone j, seen in the estimated world.
+        """Update with the displacement from clone i to clone j, in the estimated world.
 
-        `d_W` is expressed in the filter's estimated world: the network saw the window rotated by
-        the estimated attitude, so that the displacement carries the yaw error of clone i,
-        p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own turn. Nothing here is an
-        Euler angle, so no attitude of the device is singular, and the Jacobian times the yaw
+        `d_W` is expressed in the filter's estimated world: the network's input was rotated by the
+        estimated attitude, so the displacement contains the yaw error of clone i,
+        p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own yaw error (turn). No Euler
+        angles are used, so no attitude of the device is singular, and the Jacobian times the yaw
         direction is exactly zero.
 
         Args:
             slot_i: slot of the window's first pose.
-            slot_j: slot of its last pose, None for the current pose.
-            d_W: (3,) [m].
-            covariance: (3, 3) [m^2] in the same axes; overlapping windows see the same motion
-                again, so the caller scales it by update rate x window length.
-            gate: NIS from which the measurement counts as an outlier (a quantile of chi-square
-                with 3 degrees of freedom), None for no gate.
+            slot_j: slot of its last pose; None for the current pose.
+            d_W: (3,) displacement [m].
+            covariance: (3, 3) covariance in the same axes [m^2]; overlapping windows contain the
+                same motion, so the caller scales it by update rate x window length.
+            gate: NIS above which the measurement counts as an outlier (a quantile of chi-square
+                with 3 degrees of freedom); None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
-            power: how strongly they are inflated; see `update_linear`.
+            power: how strongly outliers are inflated; see `update_linear`.
 
         Raises:
             InputError: a slot holds no clone.
@@ -203,19 +203,20 @@ class StateCloningEkf(ErrorStateEngine):
         gain_W: FloatArray = _NO_GAIN,
         seconds: float = 0.0,
     ) -> UpdateResult:
-        """Mean velocity of a window that ends now, for measurements without clones.
+        """Update with the mean velocity of a window that ends now, for measurements without clones.
 
-        The IMU's own gain since that mean makes it the velocity now, v = m + gain, and is as wrong
-        as attitude and accelerometer bias. The yaw error enters as in `update_displacement`,
-        m = (I + theta_z [e3]x) v_mean + n, taken at the current pose.
+        The velocity gain since that mean, from the IMU, converts it to the current velocity,
+        v = m + gain, and carries the errors of attitude and accelerometer bias. The yaw error
+        enters as in `update_displacement`, m = (I + theta_z [e3]x) v_mean + n, taken at the current
+        pose.
 
         Args:
-            v_mean_W: (3,) [m/s] in the estimated world.
-            covariance: (3, 3) [m^2/s^2].
-            gate: NIS from which the measurement counts as an outlier, None for no gate.
+            v_mean_W: (3,) mean velocity in the estimated world [m/s].
+            covariance: (3, 3) covariance of the mean velocity [m^2/s^2].
+            gate: NIS above which the measurement counts as an outlier; None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
-            gain_W: (3,) velocity now minus its mean over the window [m/s], from the IMU alone.
-            seconds: length of the window [s]; 0 for a velocity of now.
+            gain_W: (3,) current velocity minus its mean over the window [m/s], from the IMU alone.
+            seconds: length of the window [s]; 0 for a current velocity.
         """
         s = self.state
         force_W = gain_W + np.array([0.0, 0.0, 0.5 * seconds * self.gravity])
@@ -229,7 +230,7 @@ class StateCloningEkf(ErrorStateEngine):
         covariance: FloatArray,
         gate: float | None = None,
     ) -> UpdateResult:
-        """Current position (3,) [m] with covariance (3, 3) [m^2]."""
+        """Update with the current position (3,) [m], covariance (3, 3) [m^2]."""
         predicted = self.state.X[0, :, 4]
         residual = p_W - self.state.origin_W - predicted
         blocks = position_jacobian(predicted)
@@ -241,13 +242,13 @@ class StateCloningEkf(ErrorStateEngine):
         covariance: FloatArray,
         gate: float | None = None,
     ) -> UpdateResult:
-        """Current velocity (3,) [m/s] in W itself, not in its estimate, covariance (3, 3)."""
+        """Update with the current velocity (3,) [m/s] in the true W, covariance (3, 3)."""
         predicted = self.state.v_W
         blocks = velocity_jacobian(predicted)
         return self.update_linear(v_W - predicted, blocks, covariance, gate)
 
     def update_yaw(self, yaw: float, sigma: float, gate: float | None = None) -> UpdateResult:
-        """Current yaw [rad] as `yaw_twist` defines it; refused where the device is upside down."""
+        """Update with the current yaw [rad] as defined by `yaw_twist`; rejected if upside down."""
         R = self.state.R_WB
         residual = np.array([math.remainder(yaw - yaw_twist(R), 2.0 * math.pi)])
         if not math.isfinite(residual[0]):
@@ -258,37 +259,37 @@ class StateCloningEkf(ErrorStateEngine):
     def update_bearing(
         self, m_B: FloatArray, variance: float, gate: float | None = None
     ) -> UpdateResult:
-        """Bearing of a magnetic field (3,) [uT] in B against the state's azimuth.
+        """Update with the bearing of a magnetic field against the state's azimuth.
 
         Args:
-            m_B: as measured; the state has a field (`magnetic.first_field`).
-            variance: of its bearing [rad^2].
-            gate: as for the others; outliers are inflated.
+            m_B: (3,) measured field [uT]; the state must have a field (`magnetic.first_field`).
+            variance: variance of its bearing [rad^2].
+            gate: as for the other updates; outliers are inflated.
         """
         s = self.state
         assert s.field is not None
         m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
         bearing = math.atan2(m_W[1], m_W[0])
-        off = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
+        residual = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
         blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
-        return self.update_linear(np.array([off]), blocks, np.array([[variance]]), gate)
+        return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
     def exchange_gyro_bias_prior(self, old: float, new: float) -> None:
-        """Everything as if the gyroscope bias's prior, zero mean, had been another from the start.
+        """Replace the gyroscope bias's zero-mean prior as if the new one had been used throughout.
 
-        The old prior's information is taken off and the new one's added: an update by a measurement
-        of zero, of negative variance where the prior widens; exact as far as the filter is linear
-        and the bias constant. One that has wandered may be less certain than its prior was: no more
-        information can be taken off than there is, so both priors then count as wider, alike.
+        The old prior's information is removed and the new one's added: an update by a measurement
+        of zero, with negative variance if the prior widens; exact as far as the filter is linear
+        and the bias constant. A bias that has wandered may be less certain than its prior: since no
+        more information can be removed than there is, both priors are then widened by one factor.
 
         Args:
-            old: variance per axis of the prior until now [rad^2/s^2].
-            new: of the one that takes its place.
+            old: variance per axis of the previous prior [rad^2/s^2].
+            new: variance per axis of the new prior [rad^2/s^2].
         """
-        if new > (1.0 + _SAME_PRIOR) * old:
+        if new > (1.0 + _PRIOR_TOLERANCE) * old:
             widest = float(np.linalg.eigvalsh(self.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
             old, new = max(old, widest), new * max(1.0, widest / old)
-        while abs(new - old) > _SAME_PRIOR * old:
+        while abs(new - old) > _PRIOR_TOLERANCE * old:
             step = min(new, 2.0 * old)  # a larger one would be badly conditioned
             P = self.state.P
             rows = P[GYRO_BIAS]
@@ -307,18 +308,18 @@ class StateCloningEkf(ErrorStateEngine):
         xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
         X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        field = None if s.field is None else _moved(s.field, dx[s.first_field :])
+        field = None if s.field is None else _corrected_field(s.field, dx[s.first_field :])
         turn = s.network_turn + float(dx[s.turn_row])
         self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
 
 
-def _with(
+def _with_time(
     times: tuple[float | None, ...], slot: int, time: float | None
 ) -> tuple[float | None, ...]:
     return (*times[:slot], time, *times[slot + 1 :])
 
 
-def _moved(field: FieldState, dx: FloatArray) -> FieldState:
+def _corrected_field(field: FieldState, dx: FloatArray) -> FieldState:
     azimuth, wander = field.azimuth + float(dx[0]), field.wander + float(dx[1])
     return FieldState(azimuth, wander, field.hard_iron_B + dx[2:])

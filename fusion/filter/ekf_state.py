@@ -1,8 +1,8 @@
-"""What the filter knows at one time, as a value that is never changed in place.
+"""State of the filter at one time, as a value that is never modified in place.
 
 Error state, its order and meaning: README.md, "Error state". The poses lie on SE_2(3) (clones:
-SE(3)); the covariance is that of their right-invariant error. Callers get plain errors; the
-estimates of a recording are turned into them all at its end.
+SE(3)); the covariance is that of their right-invariant error. Callers get plain errors; all
+estimates of a recording are converted to them at its end.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 _CLONE_COLUMNS = [0, 1, 2, 4]
-"""Columns R, p of a pose: a clone has no velocity."""
+"""Columns R and p of a pose: a clone has no velocity."""
 
 GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
 
-_FAR = 1e3
-"""Farther from the origin than this [m] positions are counted from a point nearby: in the
-right-invariant error they multiply the attitude's, and in coordinates of a map that leaves no
-digits for centimetres."""
+_MAX_ORIGIN_DISTANCE = 1e3
+"""Positions farther than this from the origin [m] are expressed relative to a nearby point: in the
+right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
+they are map coordinates."""
 
-_AT_ONCE = 2000
-"""Estimates that are turned at once: an hour's would take hundreds of megabytes besides."""
+_CHUNK = 2000
+"""Estimates converted at a time: an hour's at once would take hundreds of megabytes more."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a filter knows of its newest state, or of a clone.
+    """A filter's estimate of its newest state, or of a clone.
 
     Attributes:
         time: [s].
-        X: (3, 5) R_WB, v_W, p_W; of a clone (3, 4) R_WB, p_W. The position is counted from the
-            origin.
+        X: (3, 5) R_WB, v_W, p_W; for a clone (3, 4) R_WB, p_W. The position is relative to
+            `origin_W`.
         origin_W: (3,) [m].
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
-        P: (15, 15) of theta, rho_v, rho_p, d_bg, d_ba; of a clone (6, 6) of theta, rho_p.
+        P: (15, 15) covariance of theta, rho_v, rho_p, d_bg, d_ba; for a clone (6, 6) of theta,
+            rho_p.
         in_gap: as in `NavState`.
         map_frame: as in `NavState`.
     """
@@ -63,11 +64,12 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of the magnetic field; its errors are the last five of the error state.
+    """Estimate of the magnetic field; its errors are the last five of the error state.
 
     Attributes:
-        azimuth: of the horizontal field in W, counter-clockwise from x, its constant part [rad].
-        wander: its part that changes from place to place [rad].
+        azimuth: constant part of the horizontal field's azimuth in W, counter-clockwise from x
+            [rad].
+        wander: part of the azimuth that changes from place to place [rad].
         hard_iron_B: (3,) the device's own field [uT].
     """
 
@@ -80,20 +82,20 @@ class FieldState:
 class EkfState:
     """The current pose and biases, the cloned poses, and their covariance.
 
-    Whoever changes anything makes a new one, so that a reference to an old one is a checkpoint.
+    Every change creates a new value, so a reference to an old one suffices to restore it.
 
     Attributes:
         time: [s].
         X: (1 + slots, 3, 5) columns R, v, p; row 0 is the current pose, row 1 + s the clone in slot
-            s, whose v is zero. p is counted from the origin.
+            s, whose v is zero. p is relative to `origin_W`.
         origin_W: (3,) [m].
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         P: (n, n) covariance of the error state; zero for an empty slot.
-        clone_times: [s], None for an empty slot.
-        network_turn: by which the network's displacements are turned to the left [rad]; known to be
-            zero until fixes tell the direction (`network_turn.py`).
-        field: the magnetic field, None before the first was measured.
+        clone_times: times of the clones [s]; None for an empty slot.
+        network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
+            zero until fixes determine the direction (`network_turn.py`).
+        field: the magnetic field; None before its first measurement.
     """
 
     time: float
@@ -108,8 +110,8 @@ class EkfState:
 
     @classmethod
     def initial(cls, state: NavState, slots: int) -> EkfState:
-        """A state without clones, from one with plain errors."""
-        origin_W = state.p_W if np.linalg.norm(state.p_W) > _FAR else np.zeros(3)
+        """Create a state without clones from one with plain errors."""
+        origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
         P = np.zeros((CORE + CLONE * slots + 1,) * 2)
@@ -142,12 +144,12 @@ class EkfState:
 
     @property
     def turn_row(self) -> int:
-        """Row of the error of the network's turn."""
+        """Row of the network's turn in the error state."""
         return CORE + CLONE * len(self.clone_times)
 
     @property
     def has_turn(self) -> bool:
-        """Whether the network's turn is a state: before fixes tell it is known to be zero."""
+        """Whether the network's turn is estimated; until then it is fixed at zero."""
         return bool(self.P[self.turn_row, self.turn_row] > 0.0)
 
     @property
@@ -156,7 +158,7 @@ class EkfState:
         return self.turn_row + 1
 
     def time_of_clone(self, slot: int) -> float:
-        """When a clone was taken [s].
+        """Return the time at which a clone was taken [s].
 
         Raises:
             InputError: the slot holds no clone.
@@ -164,11 +166,11 @@ class EkfState:
         time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
         if time is None:
             taken = [k for k, known in enumerate(self.clone_times) if known is not None]
-            raise InputError("slot", repr(slot), f"one that holds a clone: {taken}")
+            raise InputError("slot", repr(slot), f"a slot that holds a clone: {taken}")
         return time
 
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
-        """R_WB (3, 3) and p_W (3,) of a clone as estimated now.
+        """Return R_WB (3, 3) and p_W (3,) of a clone as currently estimated.
 
         Raises:
             InputError: the slot holds no clone.
@@ -178,12 +180,12 @@ class EkfState:
         return X[:, :3], np.asarray(X[:, 4] + self.origin_W)
 
     def estimate(self, in_gap: bool = False, map_frame: int = 0) -> Estimate:
-        """The current pose and biases."""
+        """Return the estimate of the current pose and biases."""
         P = self.P[:CORE, :CORE]
         return self._estimate(self.time, self.X[0], P, in_gap, map_frame)
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
-        """A clone as it is known now.
+        """Return the current estimate of a clone.
 
         Raises:
             InputError: the slot holds no clone.
@@ -194,18 +196,18 @@ class EkfState:
         return self._estimate(time, X, P, False, map_frame)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
-        """Every pose in another frame: p <- R p + shift, likewise attitude and velocity.
+        """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
 
-        A turn about the vertical (and any shift) leaves gravity where it is; the error turns with
-        the frame exactly, by the adjoint of (R, shift).
+        A rotation about the vertical (and any shift) leaves gravity unchanged; the error is
+        transformed with the frame exactly, by the adjoint of (R, shift).
 
         Args:
             R: (3, 3) rotation about the vertical.
             shift: (3,) [m].
         """
         moved = R @ self.origin_W + shift
-        origin_W = moved if np.linalg.norm(moved) > _FAR else np.zeros(3)
-        shift = moved - origin_W  # what is left of it for the poses
+        origin_W = moved if np.linalg.norm(moved) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
+        shift = moved - origin_W  # the part that remains for the poses
         X = R @ self.X
         X[:, :, 4] += shift
         A = np.eye(len(self.P))
@@ -223,13 +225,13 @@ class EkfState:
     def with_yaw_inflated(
         self, about_W: FloatArray, sigma: float, field_too: bool = True
     ) -> EkfState:
-        """The covariance inflated by a turn of all poses about a vertical.
+        """Return the state with its covariance inflated by a turn of all poses about a vertical.
 
         Args:
-            about_W: (3,) a point of the vertical [m].
-            sigma: of the turn [rad].
-            field_too: whether the magnetic field turns with them, as where the frame does; where
-                the device turned unseen it does not.
+            about_W: (3,) a point on the vertical [m].
+            sigma: standard deviation of the turn [rad].
+            field_too: whether the magnetic field turns with them: True if the frame turns, False if
+                the device turned during a gap.
         """
         x, y, _ = about_W - self.origin_W
         N = np.zeros((len(self.P), 1))
@@ -241,7 +243,7 @@ class EkfState:
         return changed(self, P=self.P + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:
-        """The covariance inflated by a shift of all poses by `sigma` [m] per axis."""
+        """Return the state with its covariance inflated by a shift, `sigma` [m] per axis."""
         N = np.zeros((len(self.P), 3))
         for _, rho in self._poses():
             N[rho : rho + 3] = np.eye(3)
@@ -261,13 +263,13 @@ class EkfState:
 
 
 def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:
-    """A covariance (n, n) after the error of a row has forgotten all but `kept` of itself.
+    """Return a covariance (n, n) after one error has taken a Gauss-Markov step.
 
     Args:
-        P: before.
-        row: of an error that wanders about zero with deviation `sigma`.
-        kept: correlation with what it was.
-        sigma: its deviation in the long run.
+        P: covariance before the step.
+        row: row of the error, which varies about zero.
+        kept: correlation of the error with its value before the step.
+        sigma: stationary standard deviation of the error.
     """
     P = P.copy()
     P[row] *= kept
@@ -277,15 +279,15 @@ def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArr
 
 
 def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
-    """(N, n, n) of errors about W's axes, each true minus estimate."""
+    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate."""
     P, X = (np.array([getattr(e, name) for e in estimates]) for name in ("P", "X"))
     return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
 
 
 def nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
-    """The newest states as callers get them."""
-    parts = range(0, len(estimates), _AT_ONCE)
-    return [state for k in parts for state in _nav_states(estimates[k : k + _AT_ONCE])]
+    """Convert estimates of newest states to `NavState`, with plain errors."""
+    parts = range(0, len(estimates), _CHUNK)
+    return [state for k in parts for state in _nav_states(estimates[k : k + _CHUNK])]
 
 
 def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
@@ -295,7 +297,7 @@ def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
             e.X[:, :3],
             e.X[:, 3],
             e.X[:, 4] + e.origin_W,
-            e.b_g.copy(),  # they are the filter's own
+            e.b_g.copy(),  # the filter's own arrays
             e.b_a.copy(),
             covariance,
             e.in_gap,
@@ -306,7 +308,7 @@ def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
 
 
 def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
-    """Clones as callers get them."""
+    """Convert estimates of clones to `SmoothedPose`, with plain errors."""
     if not clones:
         return []
     return [

@@ -1,9 +1,9 @@
 """Structured algebra on filterpy's `ExtendedKalmanFilter` for an error state.
 
-filterpy multiplies matrices of the full size. Here only the blocks that a step touches are computed
+filterpy multiplies full-size matrices. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
-`benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never changed in
-place: whoever holds an earlier one may go back to it. README.md, "Gates".
+`benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never modified in
+place, so a reference to an earlier one can be restored. README.md, "Gates".
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
 
-_FAR_BETTER = 1e9
-"""A measurement of so many times less variance than the state's costs the difference its digits."""
+_JOSEPH_RATIO = 1e9
+"""Ratio of state to measurement variance above which P - W^T W would lose its digits."""
 
 
 class UpdateResult(NamedTuple):
-    """What became of one measurement.
+    """Outcome of one measurement.
 
     Attributes:
-        nis: normalised innovation squared under the covariance given, before any inflation;
-            not-a-number where it could not be computed.
+        nis: normalised innovation squared under the given covariance, before any inflation;
+            not-a-number if it could not be computed.
         dof: dimension of the measurement, the expectation of `nis`.
-        accepted: False where the state was left alone.
+        accepted: False if the state was left unchanged.
         scale: factor by which the measurement covariance was inflated (1: not gated).
-        reason: why the measurement was refused; empty where it was accepted.
-        residual: (m,) measured minus predicted, None where the measurement made no sense.
-        sigma: (m,) standard deviations of the residual under the covariance given, likewise.
+        reason: why the measurement was rejected; empty if it was accepted.
+        residual: (m,) measured minus predicted; None if the measurement was invalid.
+        sigma: (m,) standard deviations of the residual under the given covariance; None likewise.
     """
 
     nis: float
@@ -54,10 +54,10 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     filterpy's `P`, `R`, `y`, `z`, `S`, `SI`, `K`, `log_likelihood`, `mahalanobis`, `x_post`,
     `P_prior` and `P_post` describe the last step; `x` is the error's mean. Its `predict` and
-    `update` are the dense engine and not meant to be called from outside.
+    `update` use dense algebra and are not meant to be called from outside.
 
     Args:
-        dim: size of the error state; the first `CORE` rows are the current state's.
+        dim: size of the error state; the first `CORE` rows belong to the current state.
     """
 
     def __init__(self, dim: int) -> None:
@@ -74,21 +74,21 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
     ) -> UpdateResult:
-        """Update with any measurement that is linear in the error.
+        """Update with a measurement that is linear in the error.
 
         Args:
             residual: (m,) measured minus predicted.
-            blocks: Jacobian of the residual by the error (true minus estimate), as blocks
-                (first column, (m, width)); columns in no block are zero.
-            covariance: (m, m).
-            gate: NIS from which the measurement counts as an outlier, None for no gate.
-            gate_mode: "inflate" multiplies an outlier's covariance by NIS / gate, so that a run
-                of outliers can still pull a filter back that is itself wrong; "reject" drops it.
-            power: of NIS / gate by which an outlier's covariance is multiplied.
+            blocks: Jacobian of the residual with respect to the error (true minus estimate), as
+                blocks (first column, (m, width)); columns in no block are zero.
+            covariance: (m, m) covariance of the measurement.
+            gate: NIS above which the measurement counts as an outlier; None for no gate.
+            gate_mode: "inflate" multiplies an outlier's covariance by a power of NIS / gate, so
+                that a run of outliers can still correct a wrong filter; "reject" drops it.
+            power: exponent of NIS / gate in that factor.
 
         Returns:
-            What happened. Values that are not finite and covariances that are not positive
-            definite are refused with a reason; the state stays as it was.
+            The outcome. Values that are not finite and covariances that are not positive definite
+            are rejected with a reason; the state is then unchanged.
         """
         m = len(residual)
         if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
@@ -154,9 +154,9 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        if (HPH.diagonal() > _FAR_BETTER * covariance.diagonal()).any():
+        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
             return self._correct_as_joseph(blocks)
-        # P is symmetric: its transpose is the same matrix in the order of BLAS.
+        # P is symmetric: its transpose is the same matrix in BLAS order.
         P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
         return P
 
@@ -177,7 +177,7 @@ def _sum(terms: list[FloatArray]) -> FloatArray:
 
 
 def _whitener(covariance: FloatArray) -> FloatArray:
-    """Inverse of the lower Cholesky factor; not-a-number where there is none."""
+    """Inverse of the lower Cholesky factor; not-a-number if there is none."""
     factor, failed = dpotrf(covariance, lower=1)
     if failed:
         return np.full_like(covariance, math.nan)

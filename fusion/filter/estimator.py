@@ -1,6 +1,6 @@
-"""The filter behind one IMU interval after the other: propagate, zero velocity, update, clone.
+"""The filter driven by successive IMU intervals: propagate, zero velocity, update, clone.
 
-README.md, "One interval". The displacement between clones follows TLIO (Liu et al. 2020), on the
+README.md, "One interval". The displacement between clones follows TLIO (Liu et al. 2020), with the
 right-invariant error (Barrau and Bonnabel 2017).
 """
 
@@ -44,8 +44,8 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
-_ROUNDING = 1e-6
-"""Of times [s]."""
+_TIME_TOLERANCE = 1e-6
+"""Tolerance when comparing times [s]."""
 
 
 class Estimator:
@@ -54,13 +54,13 @@ class Estimator:
     Args:
         config: noise and filter settings.
         start: time and levelled attitude of the first sample.
-        prior: what is known of the first pose; None starts level, at rest, at the origin.
-        streaming: True for streams: innovations are not kept, since memory must not grow, and the
-            last second is, since fixes may come late.
+        prior: prior on the first pose; None starts levelled, at rest, at the origin.
+        streaming: True for streams: innovations are not kept, since memory must not grow, but the
+            steps of the last second are, since fixes may arrive late.
 
     Attributes:
         ekf: the filter.
-        released: the newest pose that left the window, corrected by all of it; None at first.
+        released: newest pose that left the window, corrected by the whole window; None at first.
         in_gap: whether the last interval had no samples.
     """
 
@@ -99,12 +99,12 @@ class Estimator:
     def step(
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> IntervalMeasurements:
-        """Move to the interval's end and take in the displacement of the window that ends there.
+        """Move to the interval's end and apply the displacement of the window that ends there.
 
         Args:
-            interval: that follows the one before.
-            displacement: None where no window ends, or nothing is known of it.
-            fixes: with times up to the interval's end that were not given before, in order.
+            interval: the interval that follows the previous one.
+            displacement: predicted displacement; None if no window ends or none is available.
+            fixes: fixes up to the interval's end that were not given before, in order of time.
         """
         factor = self._displacements.accel_noise.factor
         if factor != interval.accel_factor:
@@ -114,7 +114,7 @@ class Estimator:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
         at_rest = self._update_zero_velocity(interval)
-        # Rest says it better than a network that learned from walking and sees 1 cm/s in it.
+        # Zero velocity beats a network trained on walking, which predicts 1 cm/s at rest.
         offered = displacement if at_rest is None else None
         taken = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
@@ -125,13 +125,13 @@ class Estimator:
         return IntervalMeasurements(interval, offered, taken, bearing, at_rest, accepted, segment)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Take in a fix at a time before now; None where it is more than a window late.
+        """Apply a fix from the past; return None if it is more than a window late.
 
-        The state is then the one it would be had the fix come in time: the filter goes back to the
-        state before it and takes the steps since again, with the fix in its place.
+        The state becomes what it would be had the fix arrived in time: the filter returns to the
+        state before it and repeats the steps since then with the fix in its place.
 
         Returns:
-            All fixes taken in since then, in order.
+            All fixes applied since then, in order.
         """
         steps = self._history
         oldest = max(self._start, self.time - WINDOW_SECONDS)
@@ -152,19 +152,19 @@ class Estimator:
         if self._streaming:
             before = changed(self.state, history=())
             step = Step(before, interval.without_window(), displacement, tuple(fixes))
-            oldest = interval.stop - WINDOW_SECONDS - _ROUNDING
+            oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
             kept = (s for s in self._history if s.interval.stop >= oldest)
             self._history = (*kept, step)
 
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
     ) -> tuple[Segment | None, list[Accepted]]:
-        """To the interval's end, through its fixes: the samples where not cut, the fixes taken."""
+        """Propagate through the fixes; return the segment (None if split) and the fixes applied."""
         self.in_gap = interval.gap
         if interval.gap:
             self._forget_window()
         if interval.restart is not None:
-            # Fixes within a long gap are of no use: nothing ties their time to what is behind it.
+            # Fixes within a long gap are useless: nothing links them to the track after it.
             for _ in fixes:
                 self._counts = changed(
                     self._counts, fixes=counted(self._counts.fixes, "in a long gap")
@@ -181,13 +181,14 @@ class Estimator:
             accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
         return None, accepted
 
-    def _propagate_piece(self, interval: ImuInterval, began: float) -> Segment:
-        """A piece of the interval that began at a time [s]."""
+    def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:
+        """Propagate through a piece of the interval that started at `interval_start` [s]."""
         before = self.ekf.state.p_W
         segment = self._hypotheses.apply_to_both(lambda: self._propagate_samples(interval))
         if interval.gap:
             sigma = math.sqrt(
-                gap_yaw_variance(interval.stop - began) - gap_yaw_variance(interval.start - began)
+                gap_yaw_variance(interval.stop - interval_start)
+                - gap_yaw_variance(interval.start - interval_start)
             )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
             self._map_frame.lose_yaw(self.ekf)
@@ -225,8 +226,8 @@ class Estimator:
     def _update_displacement(
         self, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
     ) -> Displacement | None:
-        """Of the window that began with the oldest clone; as inflated, None where left out."""
-        assert interval.R_NB_window is not None  # a window comes with the attitude it started at
+        """Update with a displacement from the oldest clone; return it as inflated, or None."""
+        assert interval.R_NB_window is not None  # a window comes with its initial attitude
         result = self._displacements.update(
             self._clones[0], interval.R_NB_window, d_N, covariance_N
         )
@@ -236,7 +237,7 @@ class Estimator:
         return (d_N, result.scale * covariance_N) if result.accepted else None
 
     def _update_north(self) -> list[Accepted]:
-        """By what the magnetic field says of yaw, once, where it is asked and not known yet."""
+        """Apply the magnetic field's yaw once, if a declination is set and yaw is still unknown."""
         declination = self._config.filter.declination
         if declination is None or self._map_frame.state.oriented:
             return []
@@ -247,11 +248,11 @@ class Estimator:
         if not result.accepted:
             return []
         self._counts = self._counts.add_north()
-        self._hypotheses.alternative = None  # its frame is no more
+        self._hypotheses.alternative = None  # it is in the old frame
         return [Accepted(fix, result.scale)]
 
     def _update_bearing(self, interval: ImuInterval) -> tuple[EkfState, EkfState] | None:
-        """Returns the filter before and after, of a stream."""
+        """Update with the magnetic field; for streams return the state before and after."""
         if interval.field_B is None or not self._magnetic.is_due(interval.stop):
             return None
         field_B, before = interval.field_B, self.ekf.state
@@ -273,16 +274,16 @@ class Estimator:
         )
 
     def _forget_window(self) -> None:
-        """No displacement spans a gap: its clones are of no more use."""
+        """Release the clones: no displacement spans a gap."""
         for slot in self._clones:
             self.ekf.release(slot)
         self._clones = ()
 
-    # --- what it knows ---------------------------------------------------------------------------
+    # --- state and results -----------------------------------------------------------------------
 
     @property
     def state(self) -> EstimatorState:
-        """All that varies, but the innovations of a recording; an earlier one may be put back."""
+        """Everything that varies except a recording's innovations; assign one to restore it."""
         return EstimatorState(
             self.ekf.state,
             self._clones,
@@ -311,55 +312,55 @@ class Estimator:
 
     @property
     def accel_noise(self) -> AccelNoiseScale:
-        """What it is worth, as the innovations tell."""
+        """Scale of the accelerometer's noise, estimated from the innovations."""
         return self._displacements.accel_noise
 
     @property
     def bias_prior(self) -> GyroBiasPrior:
-        """Of the gyroscope's bias, as it stands in the filter."""
+        """Prior of the gyroscope's bias, as currently applied in the filter."""
         return self._bias.prior
 
     @property
     def time(self) -> float:
-        """Of the newest state [s]."""
+        """Time of the newest state [s]."""
         return self.ekf.state.time
 
     @property
     def map_frame(self) -> int:
-        """How many frame transforms there were so far."""
+        """Number of frame transforms so far."""
         return len(self._map_frame.state.transforms)
 
     @property
     def map_frame_state(self) -> MapFrameState:
-        """The transforms there were so far."""
+        """What is known about the map frame, including all transforms so far."""
         return self._map_frame.state
 
     @property
     def gating_counts(self) -> object:
-        """What became of displacements and rest so far: a late fix may change it."""
+        """Outcomes of displacement and zero-velocity updates; a late fix may change them."""
         return self._counts.gated, self._counts.refused, self._counts.zero_velocity
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """`released` as callers get it."""
+        """`released` as a `SmoothedPose`; None at first."""
         return smoothed_poses([self.released])[0] if self.released else None
 
     def estimate(self) -> Estimate:
-        """The filter's newest state."""
+        """Return the estimate of the filter's newest state."""
         return self.ekf.state.estimate(self.in_gap, self.map_frame)
 
     def nav_state(self) -> NavState:
-        """The newest state as callers get it."""
+        """Return the newest state with plain errors."""
         return nav_states([self.estimate()])[0]
 
     def innovations(self) -> Innovations:
-        """Every innovation so far."""
+        """Return every innovation so far."""
         return stacked(self._innovations)
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
-        """The report so far, with the sigmas of another estimator's state where one is given."""
+        """Return the report so far, with the sigmas of another estimator's state if given."""
         health = self._counts.health(counts, state or self.nav_state())
         if self._config.filter.declination is not None and not self._map_frame.state.oriented:
-            note = "nothing told where north is: the track begins with yaw zero"
+            note = "north could not be determined: the track starts with yaw zero"
             health = changed(health, notes=[*health.notes, note])
         return changed(health, accel_noise_factor=self._displacements.accel_noise.factor)

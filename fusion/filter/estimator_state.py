@@ -1,4 +1,4 @@
-"""What goes into an estimator's step and comes out of it, and all that it knows in between."""
+"""Input, output and complete state of an estimator's step."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from stario.sequences.sequence import FloatArray
 
 
 class IntervalMeasurements(NamedTuple):
-    """An IMU interval and what became of what was measured in it."""
+    """An IMU interval and the measurements applied in it."""
 
     interval: ImuInterval
     offered: Displacement | None
-    """What the network said of the window that ends here; None where there is none, or at rest."""
+    """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     displacement: Displacement | None
-    """The same with its covariance as inflated, None where it was left out."""
+    """The same with its inflated covariance; None if it was rejected."""
     bearing: tuple[EkfState, EkfState] | None
-    """The filter before and after a bearing of the magnetic field; None where there was none, and
-    of recordings, whose measurements are kept."""
+    """Filter state before and after a bearing of the magnetic field; None if there was none, and
+    for recordings, all of whose measurements stay in memory."""
     zero_velocity: ZeroVelocity | None
-    """None where the device moved, or the measurement was refused."""
+    """None if the device moved or the measurement was rejected."""
     fixes: list[Accepted]
-    """Those taken in, in order."""
+    """Fixes applied, in order."""
     segment: Segment | None
-    """The samples, None where fixes cut them."""
+    """The preintegrated samples; None if fixes split them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step that a late fix may ask to be taken again, and the state before it."""
+    """Inputs of a step and the state before it, from which a late fix can repeat it."""
 
     before: EstimatorState
     interval: ImuInterval
@@ -52,22 +52,22 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """Everything that an estimator knows between two intervals; nothing is changed in place.
+    """Complete state of an estimator between two intervals; never modified in place.
 
     Attributes:
         ekf: pose, biases, clones and their covariance.
         clones: slots of the clones, oldest first.
-        map_frame: where the fixes' frame lies.
-        stillness: the last second's sums (`StillnessDetector`).
-        magnetic: what the magnetic field usually is.
-        outlier_share: of the displacements of late.
-        bias_prior: of the gyroscope's bias, as it stands in the filter.
-        accelerometer: what it is worth.
-        sceptic: the filter without the outliers of the last seconds, where there were some.
-        counts: what became of the updates.
+        map_frame: what is known about the map frame.
+        stillness: sums over the last second (`StillnessDetector`).
+        magnetic: usual size, dip and spread of the magnetic field.
+        outlier_share: fraction of outliers among recent displacements.
+        bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
+        accel_noise: estimated scale of the accelerometer's noise.
+        alternative: state of the filter without the outliers of the last seconds; None if none.
+        counts: updates by outcome.
         in_gap: whether the last interval had no samples.
-        released: the newest pose that left the window, corrected by all of it.
-        history: the steps of the last second of a stream.
+        released: newest pose that left the window, corrected by the whole window.
+        history: steps of the last second, of a stream.
     """
 
     ekf: EkfState

@@ -1,10 +1,10 @@
-"""Frame transforms: a track's own frame moved and turned to the one that fixes are given in.
+"""Frame transforms: shift and turn from a track's own frame to the frame of the fixes.
 
-In the words of ROS REP 105 the track starts in an `odom` frame of its own and a transform takes it
-to `map`. What is not known of a transform is added to the covariance of the states before it, as if
-it were independent of theirs; that is on the safe side, for the fix saw the track's errors too. A
-turn says how the track lay at the fix: by how far its yaw may have drifted, or turned in a gap,
-since a state is added as well.
+In the terms of ROS REP 105, the track starts in an `odom` frame of its own and a transform takes it
+to `map`. The uncertainty of a transform is added to the covariance of the states before it as if
+the two were independent; this is conservative, since the transform contains the track's errors too.
+A turn holds for the track's yaw at the time of the fix: for an earlier state, the variance of the
+yaw drift since, including turns during gaps, is added as well.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from stario.fusion.changed import changed
 from stario.fusion.state import NavState, SmoothedPose
 from stario.sequences.sequence import FloatArray, Trajectory
 
-_ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-_LEVEL = np.diag([1.0, 1.0, 0.0])
+_E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_HORIZONTAL = np.diag([1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTransform:
-    """p <- R p + shift.
+    """The transform p <- R p + shift.
 
     Attributes:
-        time: of the fix that told it [s].
+        time: time of the fix that determined it [s].
         R: (3, 3) rotation about the vertical.
-        shift: (3,) [m].
-        pivot: (3,) the point of the new frame that a wrong turn would leave where it is [m].
-        placed: whether it is the shift of a position fix, not a turn.
+        shift: (3,) translation [m].
+        pivot: (3,) point of the new frame that an error of the turn leaves in place [m].
+        placed: whether it is the shift by a position fix, not a turn.
         since: states before this time [s] are not transformed: they are in the map already.
-        until: nor are states from this time on [s].
-        yaw_sigma: of the turn [rad].
+        until: states from this time [s] on are not transformed either.
+        yaw_sigma: standard deviation of the turn [rad].
         drift: variance of the track's own yaw at the time of a turn [rad^2].
-        position_covariance: (3, 3) of the shift [m^2].
+        position_covariance: (3, 3) covariance of the shift [m^2].
     """
 
     time: float
@@ -53,28 +53,28 @@ class FrameTransform:
     position_covariance: FloatArray | None = None
 
     def position(self, p_W: FloatArray) -> FloatArray:
-        """A position (3,) in the new frame [m]."""
+        """Return a position (3,) in the new frame [m]."""
         return np.asarray(self.R @ p_W + self.shift)
 
     def applies_to(self, time: float) -> bool:
-        """Whether a state of before, at a time [s], is transformed."""
+        """Return whether an earlier state at a time [s] is transformed."""
         return self.since <= time < self.until
 
     def turn_variance(self, own: float) -> float:
-        """Of the yaw of a state that had this variance in the track's own frame [rad^2]."""
+        """Return the turn's variance [rad^2] for a state of yaw variance `own` before it."""
         return self.yaw_sigma**2 + max(0.0, self.drift - own)
 
     def position_covariance_of(
         self, p_W: FloatArray, covariance: FloatArray, own: float
     ) -> FloatArray:
-        """Covariance (3, 3) of a position that is now `p_W`, from the one it had before [m^2].
+        """Return the covariance (3, 3) of a transformed position [m^2].
 
         Args:
-            p_W: (3,) [m].
-            covariance: (3, 3) before.
+            p_W: (3,) position after the transform [m].
+            covariance: (3, 3) covariance before the transform [m^2].
             own: variance of the yaw there, in the track's own frame [rad^2].
         """
-        turned = _turned(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
+        turned = _turn_covariance(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
         covariance = self.R @ covariance @ self.R.T + turned[6:9, 6:9]
         return (
             covariance
@@ -83,7 +83,7 @@ class FrameTransform:
         )
 
     def state(self, state: NavState) -> NavState:
-        """A state of before, in the new frame."""
+        """Return an earlier state in the new frame; a later one is unchanged."""
         if state.time >= self.time:
             return state
         if not self.applies_to(state.time):
@@ -93,7 +93,9 @@ class FrameTransform:
         for first in (0, 3, 6):
             A[first : first + 3, first : first + 3] = self.R
         covariance = A @ state.covariance @ A.T
-        covariance += _turned(self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot)
+        covariance += _turn_covariance(
+            self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot
+        )
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
         return changed(
@@ -106,32 +108,32 @@ class FrameTransform:
         )
 
 
-def _moments(variance: float) -> tuple[float, float, float]:
-    """Second moments of a turn t by a normal angle of this variance, also where it is large.
+def _turn_moments(variance: float) -> tuple[float, float, float]:
+    """Second moments of a turn by a normally distributed angle t, also of large variance.
 
     Returns:
-        E sin^2 t, E (1 - cos t)^2 and E t sin t: across an arm of length one, along it, and of
-        across with the angle; the variance, 0 and the variance where it is small.
+        E sin^2 t, E (1 - cos t)^2 and E t sin t: variance across an arm of unit length, along it,
+        and covariance of across with t. For a small variance: the variance, 0 and the variance.
     """
-    once, twice = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
-    return 0.5 * (1.0 - twice), 1.0 - 2.0 * once + 0.5 * (1.0 + twice), variance * once
+    cos_1, cos_2 = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
+    return 0.5 * (1.0 - cos_2), 1.0 - 2.0 * cos_1 + 0.5 * (1.0 + cos_2), variance * cos_1
 
 
-def _turned(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
-    """Covariance (15, 15) of a state by its turn: yaw, velocity (3,) and arm (3,) to the pivot."""
-    across, along, both = _moments(variance)
-    level = np.zeros((15, 2))  # columns: across and along
-    level[3:6, 0], level[6:9, 0] = _ACROSS @ v_W, _ACROSS @ arm
-    level[3:6, 1], level[6:9, 1] = _LEVEL @ v_W, _LEVEL @ arm
-    covariance = level @ np.diag([across, along]) @ level.T
+def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
+    """Covariance (15, 15) of a state due to a turn; velocity (3,) and arm (3,) from the pivot."""
+    across, along, with_angle = _turn_moments(variance)
+    columns = np.zeros((15, 2))  # columns: across and along
+    columns[3:6, 0], columns[6:9, 0] = _E3_CROSS @ v_W, _E3_CROSS @ arm
+    columns[3:6, 1], columns[6:9, 1] = _HORIZONTAL @ v_W, _HORIZONTAL @ arm
+    covariance = columns @ np.diag([across, along]) @ columns.T
     covariance[2, 2] = variance
-    covariance[2] += both * level[:, 0]
-    covariance[:, 2] += both * level[:, 0]
+    covariance[2] += with_angle * columns[:, 0]
+    covariance[:, 2] += with_angle * columns[:, 0]
     return covariance
 
 
 def in_last_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
-    """States of a track, every one of them in the frame the track ends in."""
+    """Return the states of a track, all in the frame in which the track ends."""
     for transform in transforms:
         states = [transform.state(state) for state in states]
     return states
@@ -140,7 +142,7 @@ def in_last_frame(states: list[NavState], transforms: Sequence[FrameTransform]) 
 def smoothed_track(
     poses: list[SmoothedPose], transforms: Sequence[FrameTransform]
 ) -> Trajectory | None:
-    """Smoothed poses as a track, in the frame it ends in; None where there is none."""
+    """Return smoothed poses as a track in its final frame; None if there are none."""
     if not poses:
         return None
     rows = []

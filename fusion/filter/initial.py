@@ -1,4 +1,4 @@
-"""The filter's first state, and the one behind a gap too long to be bridged."""
+"""The filter's first state, and its state after a gap too long to bridge."""
 
 from __future__ import annotations
 
@@ -19,34 +19,35 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.settings import check_number
 
 STILL_TILT_SIGMA = 0.01
-"""Of the first attitude when the device was at rest [rad]."""
+"""Tilt sigma of the first attitude if the device was at rest [rad]."""
 
 WALKING_SPEED = 1.5
-"""How far a walker gets in a long gap, per second and axis, one standard deviation [m/s]."""
+"""Standard deviation of a pedestrian's mean velocity over a long gap, per axis [m/s]."""
 
-_ORTHOGONAL, _ROUNDED = 1e-4, 1e-9
-"""By so much a rotation's rows may be off unit length and right angles: rounded input."""
+_ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
+"""Limits on |R R^T - I|: above the first a matrix is not a rotation; above the second its input was
+rounded, and the nearest rotation is used."""
 
 FARTHEST = 1e4
-"""No gap is taken to have led farther than this [m]: the covariance must keep its digits."""
+"""Maximum distance assumed to be covered in a gap [m]: the covariance must keep its digits."""
 
 
 @dataclass(frozen=True, eq=False)
 class PriorPose:
-    """What is known of the first pose, at the time of the first sample.
+    """Prior on the first pose, at the time of the first sample.
 
     Attributes:
         R_WB: (3, 3) attitude.
         v_W: (3,) velocity [m/s].
         p_W: (3,) position [m].
-        tilt_sigma: [rad].
-        yaw_sigma: [rad].
-        velocity_sigma: per axis [m/s].
-        position_sigma: per axis [m].
+        tilt_sigma: standard deviation of the tilt [rad].
+        yaw_sigma: standard deviation of the yaw [rad].
+        velocity_sigma: standard deviation of the velocity per axis [m/s].
+        position_sigma: standard deviation of the position per axis [m].
 
     Raises:
-        InputError: a value has another shape or is not finite, `R_WB` is no rotation, or a sigma is
-            negative.
+        InputError: a value has the wrong shape or is not finite, `R_WB` is not a rotation, or a
+            sigma is negative.
     """
 
     R_WB: FloatArray
@@ -61,9 +62,9 @@ class PriorPose:
         for name in ("v_W", "p_W"):
             object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
         R_WB = checked("R_WB", self.R_WB, (3, 3))
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R_WB) < 0.0:
-            raise InputError("R_WB", "a matrix that is no rotation", "a rotation from B to W")
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDED:
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROTATION_ERROR or np.linalg.det(R_WB) < 0.0:
+            raise InputError("R_WB", "a matrix that is not a rotation", "a rotation from B to W")
+        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDING_ERROR:
             left, _, right = np.linalg.svd(R_WB)
             R_WB = left @ right  # the nearest rotation
         object.__setattr__(self, "R_WB", R_WB)
@@ -75,7 +76,7 @@ class PriorPose:
 def initialise(
     ekf: StateCloningEkf, start: Start, prior: PriorPose | None, config: NavigatorConfig
 ) -> None:
-    """Set the first state: the prior's, else level by gravity, at rest, at the origin."""
+    """Set the first state: the prior if given, else levelled by gravity, at rest, at the origin."""
     f = config.filter
     tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
     zero = np.zeros(3)
@@ -91,7 +92,7 @@ def initialise(
 def reinitialise(
     ekf: StateCloningEkf, interval: ImuInterval, start: Start, config: NavigatorConfig
 ) -> None:
-    """Behind a long gap: tilt from gravity, speed and yaw unknown, somewhere in walking reach."""
+    """Restart after a long gap: tilt from gravity, speed and yaw unknown, within walking reach."""
     f, s = config.filter, ekf.state
     P, seconds = s.plain_covariance, interval.stop - interval.start
     covariance = np.zeros_like(P)
@@ -101,10 +102,10 @@ def reinitialise(
     reach = min(WALKING_SPEED * seconds, FARTHEST)
     covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
-    turned_on = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # no walk goes far beyond
-    drift = np.minimum(seconds * np.square(walks), np.square(turned_on))
+    turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk
+    drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))
     covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
-    # Where the track is hangs on the bias that led there.
+    # The position stays correlated with the biases that led there.
     covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
     yaw = yaw_twist(s.R_WB)
     turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))

@@ -1,4 +1,4 @@
-"""What became of an estimator's measurements, and its innovations."""
+"""Outcomes of an estimator's measurements, and its innovations."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from stario.fusion.state import Health, Innovations, NavState
 
 @dataclass(frozen=True)
 class UpdateCounts:
-    """Updates by what became of them; every one of `add_...` gives a new value.
+    """Counts of updates by outcome; each `add_...` method returns a new value.
 
     Attributes:
-        offered: network measurements.
-        gated: of these, outliers: left out or inflated.
-        refused: network measurements left out, by reason.
-        fixes: applied (of these gated), and left out by reason.
-        zero_velocity: likewise, of measurements at rest.
-        bearings: likewise, of the magnetic field's, and whether it told north.
-        nis_sum: of the network measurements that could be judged.
-        nis_count: how many these are.
+        offered: number of network measurements.
+        gated: number of these that were outliers, rejected or inflated.
+        refused: numbers of these that were invalid, by reason.
+        fixes: fixes applied (of these gated), and rejected by reason.
+        zero_velocity: measurements at rest, applied and rejected likewise.
+        bearings: bearings of the magnetic field likewise, and whether it determined north.
+        nis_sum: sum of the NIS of all valid network measurements.
+        nis_count: number of valid network measurements.
     """
 
     offered: int = 0
@@ -39,7 +39,7 @@ class UpdateCounts:
     nis_count: int = 0
 
     def add_displacement(self, result: UpdateResult) -> UpdateCounts:
-        """One more measurement of the network's."""
+        """Return the counts with one more network measurement."""
         offered = self.offered + 1
         if result.residual is None:
             return changed(self, offered=offered, refused=counted(self.refused, result.reason))
@@ -52,30 +52,30 @@ class UpdateCounts:
         )
 
     def add_fix(self, result: UpdateResult) -> UpdateCounts:
-        """One more fix."""
+        """Return the counts with one more fix."""
         fixes = counted(self.fixes, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
             fixes = counted(fixes, "gated")
         return changed(self, fixes=fixes)
 
     def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
-        """One more measurement at rest."""
+        """Return the counts with one more measurement at rest."""
         what = "applied" if result.accepted else result.reason
         return changed(self, zero_velocity=counted(self.zero_velocity, what))
 
     def add_bearing(self, result: UpdateResult) -> UpdateCounts:
-        """One more bearing of the magnetic field."""
+        """Return the counts with one more bearing of the magnetic field."""
         bearings = counted(self.bearings, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
             bearings = counted(bearings, "gated")
         return changed(self, bearings=bearings)
 
     def add_north(self) -> UpdateCounts:
-        """The magnetic field told where north is."""
+        """Return the counts with north determined by the magnetic field."""
         return changed(self, bearings=counted(self.bearings, "north"))
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
-        """The report: what became of the samples, of the updates, and the state's sigmas."""
+        """Return the report: outcomes of samples and updates, and the state's sigmas."""
         sigma = np.sqrt(np.diag(state.covariance))
         groups = {
             "tilt_rad": sigma[0:2],
@@ -100,14 +100,14 @@ class UpdateCounts:
 
 
 def innovation_row(time: float, result: UpdateResult) -> tuple[float, ...] | None:
-    """A row for `stacked`; None of a measurement that made no sense."""
+    """Return a row for `stacked`; None for an invalid measurement."""
     if result.residual is None or result.sigma is None:
         return None
     return time, *result.residual, *result.sigma, result.nis, float(is_gated(result))
 
 
 def stacked(rows: list[tuple[float, ...]]) -> Innovations:
-    """Innovations from their rows."""
+    """Return innovations from their rows."""
     table = np.array(rows).reshape(-1, 9)
     return Innovations(
         time=table[:, 0],
@@ -119,10 +119,10 @@ def stacked(rows: list[tuple[float, ...]]) -> Innovations:
 
 
 def is_gated(result: UpdateResult) -> bool:
-    """Whether a measurement counts as an outlier, left out or inflated."""
+    """Return whether a measurement counts as an outlier, rejected or inflated."""
     return result.reason == "gated" or result.scale > 1.0
 
 
 def counted(counts: Mapping[str, int], reason: str) -> dict[str, int]:
-    """The counts with one more of a reason."""
+    """Return the counts with one more of a reason."""
     return {**counts, reason: counts.get(reason, 0) + 1}

@@ -1,9 +1,9 @@
-"""The filter's right-invariant error: definition, propagation, Jacobians of measurements.
+"""The filter's right-invariant error: definition, propagation, measurement Jacobians.
 
     theta [rad], rho_v [m/s], rho_p [m], d_bg [rad/s], d_ba [m/s^2] | theta, rho_p of each clone
     R = (I + [theta]x) R^,  v = v^ + rho_v - [v^]x theta,  p = p^ + rho_p - [p^]x theta
 
-where ^ marks the estimate. A Jacobian is a list of blocks; what is in no block is zero.
+where ^ marks the estimate. A Jacobian is a list of blocks; columns in no block are zero.
 Derivations: README.md, "Error state" to "Fixes".
 """
 
@@ -26,7 +26,7 @@ CLONE = 6
 """Size of the error state of one cloned pose."""
 
 Block = tuple[int, FloatArray]
-"""First column of the error state a Jacobian block stands at, and the block (m, width)."""
+"""First column of a Jacobian block in the error state, and the block (m, width)."""
 
 _ACCEL_BIAS = 12
 _EYE = np.eye(3)
@@ -38,10 +38,10 @@ _LAST_EYE_CORE = np.eye(3, 9, k=6)
 def displacement_jacobian(
     p_i_W: FloatArray, p_j_W: FloatArray, slot_i: int, slot_j: int | None
 ) -> list[Block]:
-    """Jacobian of the residual of `StateCloningEkf.update_displacement`.
+    """Return the Jacobian of the residual of `StateCloningEkf.update_displacement`.
 
     theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
-    column of the first block equals that of [p_j]x; written so, H times yaw is zero to the bit.
+    column of the first block equals that of [p_j]x; written so, H times yaw is exactly zero.
     """
     P_i, P_j = skew(np.array((p_i_W, p_j_W)))
     H_i = _LAST_MINUS_EYE.copy()
@@ -53,21 +53,21 @@ def displacement_jacobian(
 
 
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
-    """Jacobian of the same residual by the network's turn: e3 x d, d (3,) the displacement [m]."""
+    """Return that residual's Jacobian for the network's turn: e3 x d, d (3,) displacement [m]."""
     return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
 
 
 def mean_velocity_jacobian(
     v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
 ) -> list[Block]:
-    """Jacobian of the residual of `StateCloningEkf.update_mean_velocity`.
+    """Return the Jacobian of the residual of `StateCloningEkf.update_mean_velocity`.
 
-    With the mean m = v - gain and the force's part F of the gain, its errors -[F]x theta and
-    -R T/2 d_ba: theta -[v]x + [F]x - (e3 x m) e3^T, rho_v I, d_ba R T/2. Gravity being vertical,
-    the column of yaw is zero.
+    With the mean m = v - gain and the force's part F of the gain, whose errors are -[F]x theta and
+    -R T/2 d_ba: theta -[v]x + [F]x - (e3 x m) e3^T, rho_v I, d_ba R T/2. Since gravity is vertical,
+    the yaw column is zero.
 
     Args:
-        v_W: (3,) velocity now [m/s].
+        v_W: (3,) current velocity [m/s].
         force_W: (3,) F [m/s].
         R_WB: (3, 3) attitude.
         seconds: length T of the window [s].
@@ -78,21 +78,21 @@ def mean_velocity_jacobian(
 
 
 def position_jacobian(p_W: FloatArray) -> list[Block]:
-    """Jacobian of a position: theta -[p]x, rho_p I."""
+    """Return the Jacobian of a position: theta -[p]x, rho_p I."""
     H = _LAST_EYE_CORE.copy()
     H[:, :3] = -skew(p_W)
     return [(0, H)]
 
 
 def velocity_jacobian(v_W: FloatArray) -> list[Block]:
-    """Jacobian of a velocity in the true W: theta -[v]x, rho_v I."""
+    """Return the Jacobian of a velocity in the true W: theta -[v]x, rho_v I."""
     H = _LAST_EYE.copy()
     H[:, :3] = -skew(v_W)
     return [(0, H)]
 
 
 def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
-    """Jacobian (1, 3) of `yaw_twist` by theta.
+    """Return the Jacobian (1, 3) of `yaw_twist` with respect to theta.
 
     With s = R10 - R01, c = R00 + R11 and R = (I + [theta]x) R^:
     d yaw = theta_z + (theta_x (s R21 - c R20) - theta_y (c R21 + s R20)) / (s^2 + c^2).
@@ -104,15 +104,15 @@ def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
 
 
 def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> list[Block]:
-    """Jacobian of the bearing's residual, measured minus azimuth.
+    """Return the Jacobian of the bearing's residual, measured minus azimuth.
 
     The true bearing is that of (I + [theta]x) (m - R d_h): it moves by theta_z
     - m_z (m_x theta_x + m_y theta_y) / n - (m_x R1 - m_y R0) d_h / n with n = m_x^2 + m_y^2, and
-    equals the true azimuth; turned with the azimuth, yaw leaves the residual as it is.
+    equals the true azimuth. A common turn of yaw and azimuth leaves the residual unchanged.
 
     Args:
         R_WB: (3, 3) attitude.
-        m_W: (3,) field in the estimated world, hard iron taken off [uT].
+        m_W: (3,) field in the estimated world, hard iron removed [uT].
         first_field: row of the azimuth's error.
     """
     x, y, z = m_W
@@ -123,18 +123,18 @@ def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> lis
 
 
 def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
-    """Covariance of plain errors from that of invariant ones: v - v^ = rho_v - [v^]x theta.
+    """Convert a covariance of invariant errors to plain ones: v - v^ = rho_v - [v^]x theta.
 
     Args:
-        P: (..., n, n) of theta, then a rho for each vector, then whatever does not change.
-        vectors_W: (..., k, 3) velocity and position, or one of them; negative ones turn it back.
+        P: (..., n, n) covariance of theta, a rho for each vector, and any errors left unchanged.
+        vectors_W: (..., k, 3) velocity and position, or one of them; negated, they convert back.
     """
     A = skew(vectors_W).reshape(*vectors_W.shape[:-2], -1, 3)
     stop = 3 + A.shape[-2]
     plain = P.copy()
     plain[..., 3:stop, :] -= A @ P[..., :3, :]
     plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
-    # Far from the origin the products' rounding would leave it asymmetric.
+    # Far from the origin, rounding in the products would make it asymmetric.
     return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
 
 
@@ -161,10 +161,10 @@ def propagated(
     b_g: FloatArray,
     b_a: FloatArray,
 ) -> Propagation:
-    """`Segment.predict` with the transition and the noise of the right-invariant error.
+    """Return `Segment.predict` with the transition and noise of the right-invariant error.
 
     gtsam's tangent is local, R exp(w), p + R dp, v + R dv, in the order rotation, position,
-    velocity, accelerometer bias, gyroscope bias; the adjoint of the end state turns it into the
+    velocity, accelerometer bias, gyroscope bias; the adjoint of the end state converts it to the
     right-invariant error.
     """
     start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
@@ -194,10 +194,10 @@ _BIAS_SWAP[12:15, 9:12] = np.eye(3)
 
 
 def _nav_transition(dt: float, gravity: float) -> FloatArray:
-    """Transition without its bias columns; gravity is (0, 0, -gravity) in W."""
+    """Transition without its bias columns, with gravity (0, 0, -gravity) in W."""
     transition = _IDENTITY.copy()
-    fall, drop = gravity * dt, 0.5 * gravity * dt * dt
-    transition[3, 1], transition[4, 0] = fall, -fall
-    transition[6, 1], transition[7, 0] = drop, -drop
+    g_dt, half_g_dt2 = gravity * dt, 0.5 * gravity * dt * dt
+    transition[3, 1], transition[4, 0] = g_dt, -g_dt
+    transition[6, 1], transition[7, 0] = half_g_dt2, -half_g_dt2
     transition[6, 3] = transition[7, 4] = transition[8, 5] = dt
     return transition

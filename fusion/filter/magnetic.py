@@ -1,18 +1,18 @@
-"""The magnetic field's bearing as a measurement of what yaw does, never of what it is.
+"""Bearing of the magnetic field as a measurement of changes in yaw, never of yaw itself.
 
-README.md, "Magnetometer". Where the field points in the world is unknown, and indoors it wanders:
+README.md, "Magnetometer". The field's direction in the world is unknown, and indoors it wanders:
 
     azimuth = c + g,   c constant and unknown at first, g Gauss-Markov over metres and seconds
 
-The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. Yaw and azimuth turn
-together unseen, so that yaw stays as unobservable as it was; its rate, the gyroscope's vertical
-bias, does not. Steel that turns the field changes its size and dip as well: how much these vary
-along the way says how far the azimuth wanders there. A field whose size or dip is not the place's
-usual counts for less, so does one that the device has carried on by its own gyroscope instead of
-measuring it, and one that contradicts the rest is an outlier as any other. Only where a declination
-is given it says once where north is, as a fix of yaw.
+The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A common turn of yaw and
+azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the gyroscope's
+vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
+much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
+or dip for the place has less weight, as does one that the device has propagated by its own
+gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. Only
+if a declination is given, the field determines north once, as a fix of yaw.
 
-The field is slow and its errors alike for metres: two bearings a second are all there is to learn.
+The field varies slowly and its errors are similar for metres: two bearings a second suffice.
 """
 
 from __future__ import annotations
@@ -33,71 +33,72 @@ from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 PERIOD = 0.5
-"""Between two bearings [s]."""
+"""Time between two bearings [s]."""
 
 WANDER_SIGMA = 0.4
-"""Of g, the field's azimuth about its mean, at most [rad]: buildings turn it by 5 to 30 degrees."""
+"""Maximum sigma of g, the azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees."""
 
-_LEAST_WANDER = 0.1
-"""The same in a field that hardly varies [rad]."""
+_MIN_WANDER_SIGMA = 0.1
+"""Minimum sigma of g, in a field that hardly varies [rad]."""
 
 _WANDER_PER_SPREAD = 2.0
-"""Radians of g per unit of `MagneticReference.spread`: 1 to 2 by the true attitude of OxIOD, RIDI,
-KIPD and tyrex."""
+"""Sigma of g per unit of `MagneticReference.spread` [rad]: 1 to 2 according to the true attitude of
+OxIOD, RIDI, KIPD and tyrex."""
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
-"""Over which g is forgotten: the reach of a beam or a radiator, and of what else changes."""
+"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and of
+other changes."""
 
 HARD_IRON_SIGMA = 10.0
-"""Of a phone's own field as its calibration leaves it, per axis [uT]."""
+"""Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad] where g wanders by `WANDER_SIGMA`, else in proportion: steel
-within a step, late samples while the device turns."""
+"""White noise of one bearing [rad] if the sigma of g is `WANDER_SIGMA`, else in proportion: steel
+within a step's length, late samples while the device turns."""
 
-_UNKNOWN = math.pi
-"""Standard deviation of c at first [rad]."""
+_FIRST_AZIMUTH_SIGMA = math.pi
+"""Initial standard deviation of c [rad]."""
 
 _GATE = 0.95
-"""Probability of the bearing's chi-square test: outliers are common, so they weigh down early."""
+"""Probability of the bearing's chi-square test: outliers are common, so the gate is narrow."""
 
-_LEAST_HORIZONTAL = 4.0
-"""Horizontal field [uT] below which its bearing means nothing."""
+_MIN_HORIZONTAL = 4.0
+"""Horizontal field [uT] below which its bearing is meaningless."""
 
-_USUAL_SIZE, _USUAL_DIP = 0.05, 0.05
-"""Deviations from the place's usual size (share) and dip [rad] that double the variance."""
+_SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
+"""Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
 
 NORTH_SIGMA = 0.1
-"""Of the direction that magnetic north has on the average where somebody walks [rad]."""
+"""Sigma of magnetic north's mean direction along a pedestrian's path [rad]."""
 
-_NORTH_AFTER = 20
-"""Bearings from which on north is told: those of ten seconds."""
+_MIN_NORTH_COUNT = 20
+"""Number of bearings before north is determined: those of ten seconds."""
 
-_MEMORY = 120
-"""Bearings that make the place's usual size, dip and spread: a minute of them."""
+_AVERAGING_COUNT = 120
+"""Number of bearings that determine the place's usual size, dip and spread: those of a minute."""
 
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
-"""Spread before anything is known, and as how many bearings it counts: as in a building."""
+"""Initial spread, as in a building, and the number of bearings it counts as."""
 
 _HELD_FACTOR = 10.0
-"""On the variance of a field that the device has carried on by its own gyroscope."""
+"""Factor on the variance of a field that the device has propagated by its own gyroscope."""
 
-_WALKING = 0.3
-"""Speed below which the spread is not looked at [m/s]: in one spot the field is always quiet."""
+_MIN_SPEED = 0.3
+"""Speed below which the spread is not updated [m/s]: in one spot the field is always quiet."""
 
 
 @dataclass(frozen=True)
 class MagneticReference:
-    """What the field usually is, and when it was last looked at.
+    """Usual properties of the field, and its last measurement.
 
     Attributes:
-        time: of the last bearing [s].
-        count: of bearings so far.
+        time: time of the last bearing [s].
+        count: number of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
-        spread: mean distance of size (as a share) and dip [rad] from the usual, where one walked.
-        walked: bearings that it is the mean of.
-        measured: size of the last field, hard iron and all [uT].
+        spread: mean distance of size (fraction) and dip [rad] from their usual values in motion.
+        moving_count: number of bearings averaged in `spread`.
+        measured: size of the last measured field, including hard iron [uT].
     """
 
     time: float = -math.inf
@@ -110,8 +111,8 @@ class MagneticReference:
 
     @property
     def wander_sigma(self) -> float:
-        """Of the azimuth about its mean, by how much size and dip vary [rad]."""
-        return min(max(_WANDER_PER_SPREAD * self.spread, _LEAST_WANDER), WANDER_SIGMA)
+        """Sigma of the azimuth about its mean [rad], from the variation of size and dip."""
+        return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
     @property
     def bearing_sigma(self) -> float:
@@ -119,53 +120,53 @@ class MagneticReference:
         return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
 
     def is_held(self, measured: float) -> bool:
-        """Whether a field of this size [uT] is the last one, carried on by the device itself."""
+        """Return whether a field of this size [uT] is the last one, propagated by the device."""
         return abs(measured - self.measured) < HELD_CHANGE * measured
 
     def is_due(self, time: float) -> bool:
-        """Whether a bearing may be taken in."""
+        """Return whether a bearing may be applied at a time [s]."""
         return time - self.time > PERIOD - 1e-6
 
     def updated(self, time: float, size: float, dip: float, new_place: bool) -> MagneticReference:
-        """With one more bearing: means of what is clipped to near them, as robust as medians.
+        """Return the reference after one more bearing: clipped means, as robust as medians.
 
         Args:
-            time: of the bearing [s].
-            size: of the field [uT].
+            time: time of the bearing [s].
+            size: size of the field [uT].
             dip: angle below the horizontal [rad].
-            new_place: whether the field was newly measured, and while moving.
+            new_place: whether the field was newly measured while moving.
         """
         count = self.count + 1
         if count == 1:
             return changed(self, time=time, count=1, size=size, dip=dip)
-        share = 1.0 / min(count, _MEMORY)
-        near = 2.0 * _USUAL_SIZE * self.size
-        usual_size = self.size + share * min(max(size - self.size, -near), near)
-        off = min(max(dip - self.dip, -2.0 * _USUAL_DIP), 2.0 * _USUAL_DIP)
-        usual_dip = self.dip + share * off
-        found = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
+        share = 1.0 / min(count, _AVERAGING_COUNT)
+        size_clip = 2.0 * _SIZE_TOLERANCE * self.size
+        usual_size = self.size + share * min(max(size - self.size, -size_clip), size_clip)
+        dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
+        usual_dip = self.dip + share * dip_change
+        means = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
         if not new_place:
-            return found
+            return means
         distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
         moving_count = self.moving_count + 1
-        late = 1.0 / min(moving_count + _FIRST_COUNT, _MEMORY)
+        gain = 1.0 / min(moving_count + _FIRST_COUNT, _AVERAGING_COUNT)
         return changed(
-            found, spread=self.spread + late * (distance - self.spread), moving_count=moving_count
+            means, spread=self.spread + gain * (distance - self.spread), moving_count=moving_count
         )
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
-    """The yaw of now in a frame with x east and y north; None where it is not known yet.
+    """Return the current yaw in a frame with x east and y north; None if it is not known yet.
 
     Magnetic north lies at pi/2 - declination there, and at c in the filter's world.
 
     Args:
         s: the filter's state.
-        reference: of the field so far.
-        declination: of magnetic from true north, positive east [rad].
+        reference: usual properties of the field.
+        declination: angle from true to magnetic north, positive east [rad].
     """
     yaw = yaw_twist(s.R_WB)
-    if s.field is None or reference.count < _NORTH_AFTER or not math.isfinite(yaw):
+    if s.field is None or reference.count < _MIN_NORTH_COUNT or not math.isfinite(yaw):
         return None
     c, P = s.first_field, s.P
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
@@ -175,9 +176,9 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
 
 
 def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
-    """The state with an azimuth that is as the first field (3,) [uT] points, and unknown."""
+    """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
-    variances = [_UNKNOWN**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
+    variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
     n = len(s.P)
     P = np.zeros((n + len(variances),) * 2)
     P[:n, :n], P[n:, n:] = s.P, np.diag(variances)
@@ -185,14 +186,14 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
 
 
 def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """The state after the azimuth has wandered for a time [s] at the speed of now.
+    """Return the state after the azimuth has wandered for a time at the current speed.
 
     Args:
-        s: before.
-        seconds: [s].
-        sigma: of the azimuth about its mean [rad].
+        s: state before.
+        seconds: duration [s].
+        sigma: standard deviation of the azimuth about its mean [rad].
     """
-    assert s.field is not None  # there is one since `first_field`
+    assert s.field is not None  # set by `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
     P = gauss_markov(s.P, s.first_field + 1, kept, sigma)
@@ -202,10 +203,10 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
 def update_bearing(
     ekf: StateCloningEkf, reference: MagneticReference, m_B: FloatArray
 ) -> tuple[UpdateResult, MagneticReference]:
-    """Take in the field (3,) [uT] in B at the filter's time.
+    """Update with the field (3,) [uT] in B at the filter's time.
 
     Returns:
-        what became of it, and what the field usually is with it.
+        The outcome, and the reference after this field.
     """
     now, measured = ekf.state.time, float(np.linalg.norm(m_B))
     if ekf.state.field is None:
@@ -217,15 +218,15 @@ def update_bearing(
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
-    if horizontal < _LEAST_HORIZONTAL:
+    if horizontal < _MIN_HORIZONTAL:
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
     held = reference.is_held(measured)
-    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _WALKING
+    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
-        (size / reference.size - 1.0) / _USUAL_SIZE, (dip - reference.dip) / _USUAL_DIP
+        (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
     variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * (_HELD_FACTOR if held else 1.0)
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -1,18 +1,17 @@
-"""The map frame: where the fixes' frame lies against the track's own, told by the fixes.
+"""The map frame: shift and turn of the track's own frame to the frame of the fixes.
 
-A track that starts without a pose calls its first position zero and its first yaw zero. The first
-position fix moves this frame so that the track passes through the fix; what is known of the
-absolute position is then the fix's covariance. The first fix that tells the direction turns it
-about that point: a second position far enough away, several nearer ones together, a velocity, or a
-yaw. Neither is a small correction, so neither goes through the filter's linearisation: the frame is
-transformed exactly (the right-invariant error turns with it), then the covariance is inflated as if
-nothing were known of this shift or turn, then the fix is an ordinary measurement (README.md,
-"Fixes").
+A track that starts without a pose sets its first position and first yaw to zero. The first position
+fix shifts this frame so that the track passes through the fix; the covariance of the absolute
+position is then that of the fix. The first fix that determines the direction turns the frame about
+that point: a second position far enough away, several nearer ones together, a velocity, or a yaw.
+Neither is a small correction, so neither goes through the filter's linearisation: the frame is
+transformed exactly (and the right-invariant error with it), then the covariance is inflated as if
+this shift or turn were unknown, then the fix is an ordinary measurement (README.md, "Fixes").
 
-Behind a gap in which the direction was lost the same holds of the track from there on: the next
-position places it, the next direction turns it, and what was before the gap stays where it is; if
-its own direction was never told, nobody knows it once the frame has one. A track that no fix has
-placed yet goes through the gap as one.
+After a gap in which the direction was lost, the same applies to the track from there on: the next
+position places it, the next direction turns it, and the track before the gap stays where it is. If
+the direction of that part was never determined, it is unknown once the frame has a direction. A
+track that no fix has placed yet stays in one piece across the gap.
 """
 
 from __future__ import annotations
@@ -39,51 +38,52 @@ from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
 KNOWN_YAW = 0.5
-"""A first yaw given to better than this [rad] is kept; a coarser one is left to the fixes."""
+"""A first yaw with a sigma up to this [rad] is kept; a coarser one is left to the fixes."""
 
 COARSEST_YAW = 1.0
-"""A yaw coarser than this [rad] tells no direction: believed, it makes a filter sure of a wrong
-one."""
+"""A yaw coarser than this [rad] does not determine the direction: it would make the filter
+overconfident in a wrong one."""
 
 FAR_ENOUGH = 0.3
-"""Two positions tell the yaw when it is then known to this [rad]; half its square, what the
-linearisation leaves out, is still far below it (NEES of yaw 1.0 to 1.2 over 40 walks)."""
+"""Two positions determine the yaw if its sigma is then at most this [rad]; half its square, which
+the linearisation neglects, is still far smaller (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
 _OUTLIERS_IN_A_ROW, _SAME_DIRECTION = 3, 0.8
-"""Positions in a row taken for outliers whose residuals point the same way (cosine above this) are
-right, and the track is not; so are those in a row that are not as far from the pivot as the track
-has led from it: then the pivot was wrong."""
+"""Outlier positions in a row whose residuals point the same way (cosine above this) are correct,
+and the track is wrong. So are positions in a row whose distance from the pivot differs from the
+track's: then the pivot was wrong."""
 
 _SIGMA_RATIO = 2.0
-"""A position that is so many times surer than the one that placed the track places it anew."""
+"""A position whose sigma is smaller by this factor than that of the one that placed the track
+places it again."""
 
 _LENGTH_TOLERANCE = 0.5
-"""Share of the shorter one by which a network's way and the true one may differ in length."""
+"""Fraction of the shorter distance by which the network's and the true distance may differ."""
 
-_MUCH_LARGER, _LARGEST = 1e3, 1e5
-"""An unknown shift is this many times what the measurement leaves of it, but at most so large [m]:
-beyond, the covariance keeps no digits for the fix."""
+_INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
+"""Sigma of an unknown shift: this many times the sigma that remains after the measurement, but no
+more than this [m], beyond which the covariance keeps no digits for the fix."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapFrameState:
-    """What is known of the map frame.
+    """What is known about the map frame.
 
     Attributes:
         placed: whether the track's position in it is known.
-        oriented: whether its yaw is.
-        transforms: of the states given out.
-        pivot: (3,) about which the track may be turned [m].
-        since: time from which on the track is placed and turned anew [s].
-        pivot_variance: of the position that placed it, over the plane's axes [m^2].
-        alignment: of the positions since it was placed, from the pivot, while its yaw is not known.
+        oriented: whether the track's yaw in it is known.
+        transforms: frame transforms so far, which bring earlier states to the current frame.
+        pivot: (3,) point about which the track may be turned [m].
+        since: time before which the next transforms leave the track as it is [s].
+        pivot_variance: variance of the position that placed it, summed over x and y [m^2].
+        alignment: positions since it was placed, relative to the pivot, while its yaw is unknown.
         distance_mismatches: number of latest positions in a row whose distance from the pivot
             differs from the track's.
-        outlier_residuals: (3,) residuals of the last positions, if they were outliers [m].
-        unoriented: uncertainty of stretches that were placed before a gap and never oriented,
+        outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
+        unoriented: yaw uncertainty of stretches that were placed before a gap and never oriented,
             applied once the frame is oriented.
-        jumps: how often positions have shown that the track was wrong, not they.
-        yaw_variance: of the track's own yaw when it was placed [rad^2].
+        jumps: number of times that the track, not the positions, proved to be wrong.
+        yaw_variance: variance of the track's own yaw when it was placed [rad^2].
     """
 
     placed: bool
@@ -101,17 +101,17 @@ class MapFrameState:
 
 
 class MapFrame:
-    """Applies fixes to a filter, and transforms the filter's frame where it must.
+    """Fix updates of a filter, with the transforms of its frame that they require.
 
     Args:
-        pivot: (3,) the first position [m], None where it was not given.
-        pivot_sigma: of it, per axis [m].
+        pivot: (3,) first position [m]; None if not given.
+        pivot_sigma: standard deviation of the first position, per axis [m].
         oriented: whether the first yaw was given.
         gate: probability of the chi-square test.
-        turn_sigma: of the network's turn, `FilterConfig.network_turn_sigma` [rad].
+        turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
 
     Attributes:
-        state: what is known of the frame.
+        state: what is known about the frame.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class MapFrame:
         self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
-        """Take in a fix at the filter's time."""
+        """Apply a fix at the filter's time."""
         if fix.kind == "position" and self._needs_placing(ekf, fix):
             transform: FrameTransform | None = self._place(ekf, fix)
         elif self.state.oriented:
@@ -147,36 +147,36 @@ class MapFrame:
         return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
-        """Behind a gap: leave it to the fixes where the track goes on, if its yaw is lost."""
+        """After a gap: if the yaw is lost, leave placing and turning the track to later fixes."""
         now, s = _nav_state(ekf), self.state
-        lost = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
-        if not (s.placed or s.oriented) or lost <= KNOWN_YAW**2:
+        variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
+        if not (s.placed or s.oriented) or variance <= KNOWN_YAW**2:
             return
-        since = now.time if s.placed else s.since  # what no fix has placed goes along
-        left = s.unoriented
+        since = now.time if s.placed else s.since  # an unplaced track stays in one piece
+        unoriented = s.unoriented
         if not s.oriented:
-            left = (*left, _unoriented_stretch(s.pivot, s.since, now.time))
+            unoriented = (*unoriented, _unoriented_stretch(s.pivot, s.since, now.time))
         self.state = MapFrameState(
-            False, False, s.transforms, now.p_W, since, unoriented=left, jumps=s.jumps
+            False, False, s.transforms, now.p_W, since, unoriented=unoriented, jumps=s.jumps
         )
 
     def _needs_placing(self, ekf: StateCloningEkf, fix: Fix) -> bool:
-        """Whether a position is to place the track: the first, and later a much better one.
+        """Whether a position should place the track: the first, and later a much better one.
 
-        While the yaw is not known a position further on says little of where the track is; but the
-        first may have been bad, which those behind it show.
+        While the yaw is unknown, a position further on hardly determines where the track is; but
+        the first may have been bad, which the ones after it reveal.
         """
         if not self.state.placed or self.state.oriented:
             return not self.state.placed
         if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
-        seen, ours = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-        apart = abs(seen - ours) > 3.0 * _plane_sigma(now, 6, fix) + _LENGTH_TOLERANCE * min(
-            seen, ours
-        )
+        fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
+        differs = abs(fix_distance - track_distance) > 3.0 * _plane_sigma(
+            now, 6, fix
+        ) + _LENGTH_TOLERANCE * min(fix_distance, track_distance)
         self.state = changed(
-            self.state, distance_mismatches=self.state.distance_mismatches + 1 if apart else 0
+            self.state, distance_mismatches=self.state.distance_mismatches + 1 if differs else 0
         )
         return self.state.distance_mismatches >= _OUTLIERS_IN_A_ROW
 
@@ -184,8 +184,8 @@ class MapFrame:
         now, since = _nav_state(ekf), self.state.since
         transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
         ekf.state = ekf.state.transformed(np.eye(3), transform.shift)
-        left = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
-        sigma = min(_MUCH_LARGER * math.sqrt(left), _LARGEST)
+        variance = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
+        sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
         ekf.state = ekf.state.with_position_inflated(sigma)
         self.state = changed(
             self.state,
@@ -196,15 +196,15 @@ class MapFrame:
             distance_mismatches=0,
             yaw_variance=float(now.covariance[2, 2]),
         )
-        self._remember(ekf, fix)
+        self._add_to_alignment(ekf, fix)
         return transform
 
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
-        """None where the fix does not tell the direction."""
+        """Turn the frame to a fix; return None if the fix does not determine the direction."""
         pivot, since = self.state.pivot, self.state.since
         now = _nav_state(ekf)
         turn, sigma = _turn_from_fix(now, pivot, fix)
-        inflation = UNKNOWN_YAW  # the fix itself is the measurement of it
+        inflation = UNKNOWN_YAW  # the fix itself then measures the turn
         if not (
             math.isfinite(turn) and sigma <= (COARSEST_YAW if fix.kind == "yaw" else FAR_ENOUGH)
         ):
@@ -212,15 +212,15 @@ class MapFrame:
                 return None
             turn, inflation = self.state.alignment.turn
             if inflation > FAR_ENOUGH:
-                self._remember(ekf, fix)
+                self._add_to_alignment(ekf, fix)
                 return None
         R = exp_so3(np.array([0.0, 0.0, turn]))
         drift = float(now.covariance[2, 2])
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
         moved = ekf.state.transformed(transform.R, transform.shift)
         ekf.state = moved.with_yaw_inflated(pivot, inflation)
-        left = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
-        transforms = (*self.state.transforms, *left)
+        stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
+        transforms = (*self.state.transforms, *stretches)
         self.state = changed(
             self.state,
             oriented=True,
@@ -230,17 +230,17 @@ class MapFrame:
         )
         return transform
 
-    def _remember(self, ekf: StateCloningEkf, fix: Fix) -> None:
-        """A position, for the direction that several tell together."""
+    def _add_to_alignment(self, ekf: StateCloningEkf, fix: Fix) -> None:
+        """Add a position to those that determine the direction together."""
         now, pivot = _nav_state(ekf), self.state.pivot
-        track, seen = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
+        track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
         drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
-        alignment = self.state.alignment.with_position(track, seen, variance, drift)
+        alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
-        """A transform with what is not known of it, by the state behind it."""
+        """Return a transform with its uncertainty, taken from the state after the fix."""
         P, oriented = state.covariance, self.state.oriented
         return changed(
             transform,
@@ -259,28 +259,28 @@ class MapFrame:
         return ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
 
     def _update_position(self, ekf: StateCloningEkf, fix: Fix, gate: float) -> UpdateResult:
-        """Outliers are inflated; some in a row that are off alike say that the track is."""
+        """Update with a position; inflate an outlier, but move the track after similar ones."""
         before = ekf.state
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
-        off = result.residual
-        if off is None or not is_gated(result):
+        residual = result.residual
+        if residual is None or not is_gated(result):
             self.state = changed(self.state, outlier_residuals=())
             return result
-        alike = tuple(
+        aligned = tuple(
             r
             for r in self.state.outlier_residuals
-            if r @ off > _SAME_DIRECTION * norm(r) * norm(off)
+            if r @ residual > _SAME_DIRECTION * norm(r) * norm(residual)
         )
-        self.state = changed(self.state, outlier_residuals=(*alike, off))
+        self.state = changed(self.state, outlier_residuals=(*aligned, residual))
         if len(self.state.outlier_residuals) < _OUTLIERS_IN_A_ROW:
             return result
         self.state = changed(self.state, outlier_residuals=(), jumps=self.state.jumps + 1)
-        ekf.state = before.with_position_inflated(float(norm(off)))
+        ekf.state = before.with_position_inflated(float(norm(residual)))
         return ekf.update_position_W(fix.value, fix.covariance, gate)
 
 
 def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
-    """Of a stretch about its pivot: stays where it is, its direction is not known."""
+    """Transform that leaves a stretch in place but marks its direction about a pivot as unknown."""
     zero = np.zeros(3)
     return FrameTransform(
         math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
@@ -292,25 +292,25 @@ def _nav_state(ekf: StateCloningEkf) -> NavState:
 
 
 def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
-    """Turn of the frame about a point that a fix asks for, and how well it tells it [rad]."""
+    """Turn of the frame about the pivot according to a fix, and its standard deviation [rad]."""
     if fix.kind == "yaw":
         turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
         return turn, math.sqrt(fix.covariance[0, 0])
-    first, seen, ours = 3, fix.value, state.v_W
+    first, measured, estimated = 3, fix.value, state.v_W
     if fix.kind == "position":
-        first, seen, ours = 6, fix.value - pivot, state.p_W - pivot
-    arm = min(math.hypot(seen[0], seen[1]), math.hypot(ours[0], ours[1]))
-    turn = math.atan2(seen[1], seen[0]) - math.atan2(ours[1], ours[0])
+        first, measured, estimated = 6, fix.value - pivot, state.p_W - pivot
+    arm = min(math.hypot(measured[0], measured[1]), math.hypot(estimated[0], estimated[1]))
+    turn = math.atan2(measured[1], measured[0]) - math.atan2(estimated[1], estimated[0])
     return turn, _plane_sigma(state, first, fix) / arm if arm > 0.0 else math.inf
 
 
 def _plane_sigma(state: NavState, first: int, fix: Fix) -> float:
-    """Largest deviation in the plane between a fix and two rows of the state, yaw's part apart."""
+    """Largest horizontal sigma between a fix and two rows of the state, without the yaw's part."""
     P = _without_yaw(state.covariance, first) + fix.covariance[:2, :2]
     return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
 
 
 def _without_yaw(P: FloatArray, first: int) -> FloatArray:
-    """Covariance (2, 2) of two rows, less what comes from the yaw: that is what fixes tell."""
+    """Covariance (2, 2) of two rows without the yaw's part, which the fixes determine."""
     by_yaw = P[first : first + 2, 2]
     return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])

@@ -1,10 +1,10 @@
-"""By how much the network's displacements are turned, where fixes can tell it.
+"""Yaw error (turn) of the network's displacements, estimated once fixes make it observable.
 
-README.md, "Fixes". How somebody carries the device turns all that the network says of a stretch by
-some degrees, alike for a minute or so. A filter that takes it for white noise soon claims to know
-the direction better than it does, once fixes tell it. So from the first fix on that is taken in
-with the direction known the turn is a Gauss-Markov state of its own. Without fixes nothing could
-tell turn and yaw apart, and a track in a frame of its own gains nothing from it: there it is zero.
+README.md, "Fixes". How the device is carried turns all displacements that the network predicts by
+some degrees, and by a similar angle for about a minute. A filter that treats this as white noise
+becomes overconfident in the direction once fixes determine it. From the first fix that is applied
+with the direction known, the turn is therefore a Gauss-Markov state of its own. Without fixes, turn
+and yaw cannot be distinguished, and a track in its own frame gains nothing: there the turn is zero.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.sequences.sequence import FloatArray
 
 SECONDS = 60.0
-"""After which a turn is forgotten."""
+"""Correlation time of the turn [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class TurnEstimate:
-    """What a filter knows of the turn, for a graph that begins from its state.
+    """A filter's estimate of the turn, for a graph that starts from its state.
 
     Attributes:
-        turn: [rad].
-        covariance: (16,) with the plain errors of the state (order of `NavState.covariance`), and
-            its variance.
+        turn: the network's turn [rad].
+        covariance: (16,) covariance with the plain errors of the state (order of
+            `NavState.covariance`), then the turn's variance.
     """
 
     turn: float
@@ -36,7 +36,7 @@ class TurnEstimate:
 
 
 def turn_estimate(s: EkfState) -> TurnEstimate | None:
-    """What a filter knows of it; None where no turn has begun."""
+    """Return a filter's estimate of the turn; None if it is not a state yet."""
     if not s.has_turn:
         return None
     rows = [*range(CORE), s.turn_row]
@@ -45,7 +45,7 @@ def turn_estimate(s: EkfState) -> TurnEstimate | None:
 
 
 def with_turn(s: EkfState, sigma: float) -> EkfState:
-    """The state with a turn of which no more is known than its deviation [rad]."""
+    """Return the state with its turn estimated from now on, with prior sigma [rad]."""
     if s.has_turn or sigma == 0.0:
         return s
     P = s.P.copy()
@@ -54,7 +54,7 @@ def with_turn(s: EkfState, sigma: float) -> EkfState:
 
 
 def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """The state after a time [s]; as it is where no turn has begun."""
+    """Return the state with its turn propagated over a time [s]; unchanged if it has none."""
     if not s.has_turn:
         return s
     kept = math.exp(-seconds / SECONDS)
