@@ -43,7 +43,7 @@ def test_two_phones_on_one_walk_validate_together(monkeypatch: pytest.MonkeyPatc
     ]
     held = [ListEntry(Path("ridi.h5:dan"), "ridi dan")]
     parts = {"all": [*phones, *held], "test": [], "holdout": held}
-    monkeypatch.setattr(sets, "listed", lambda name, data: parts[name])
+    monkeypatch.setattr(sets, "read_packaged_list", lambda name, data: parts[name])
     for seed in range(9):
         [together] = development_sets(Path(), seed, 2, [ALL])
         names = [path.name.removesuffix("S9").removesuffix("S20") for path in together.validation]
