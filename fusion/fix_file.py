@@ -23,7 +23,7 @@ from stario.fusion.fixes import KINDS, LARGEST_YAW, Fix, make_fix
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _NEEDED = (*_COLUMNS[:3], "sx")
@@ -77,7 +77,7 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
         InputError: none does, so that they belong to another clock.
     """
     counted = sequence.time[np.isfinite(sequence.time)]
-    counted = counted[advancing(counted)]
+    counted = counted[increasing_mask(counted)]
     times, start, stop = [fix.time for fix in fixes], counted[0], counted[-1]
     if times and not any(start <= t <= stop for t in times):
         found = f"times from {min(times):.6g} to {max(times):.6g} s"

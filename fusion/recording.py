@@ -86,8 +86,8 @@ def _displacements(
     progress: Progress,
 ) -> list[Displacement | None]:
     measurements: list[Displacement | None] = [None] * len(intervals)
-    for batch in _batches(intervals, unbroken=network.remembers):
-        if network.remembers and intervals[batch[0]].gap:
+    for batch in _batches(intervals, unbroken=network.is_recurrent):
+        if network.is_recurrent and intervals[batch[0]].gap:
             network.restart()
         known = [k for k in batch if intervals[k].window is not None]
         if known:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stario.network.known_motion import KnownMotion, known_from
+from stario.network.known_motion import KnownMotion, known_motion_from_dict
 from stario.sequences.errors import WeightsError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
@@ -150,7 +150,7 @@ def parse_card(text: str, path: Path) -> Card:
             raise ValueError(f"no {sorted(missing)[0]!r}")
         calibration = _calibration(content.pop("calibration"))
         known = content.pop("known_motion", None)
-        known = None if known is None else known_from(known)
+        known = None if known is None else known_motion_from_dict(known)
         unknown = set(content) - {f.name for f in fields(Card)}
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r}")

@@ -29,7 +29,7 @@ class DisplacementNetwork(nn.Module):
         self.register_buffer("gravity", gravity, persistent=False)
 
     @property
-    def remembers(self) -> bool:
+    def is_recurrent(self) -> bool:
         """Whether the network is recurrent: it carries a state from window to window."""
         return hasattr(self.network, "step")
 

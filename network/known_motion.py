@@ -63,9 +63,9 @@ class KnownMotion:
     limit: float
     ranges: dict[str, tuple[float, float]]
 
-    def strangeness(self, windows: NDArray[np.float32]) -> FloatArray:
+    def novelty(self, windows: NDArray[np.float32]) -> FloatArray:
         """Return the distance (B,) of windows (B, 6, 200) to known motion, 1 at the limit."""
-        distances, _ = self._tree.query(described(features(windows)))
+        distances, _ = self._tree.query(scaled_features(features(windows)))
         return np.asarray(distances / self.limit)
 
     @cached_property
@@ -76,7 +76,7 @@ class KnownMotion:
 
     def variance_factor(self, windows: NDArray[np.float32]) -> FloatArray:
         """Return factors (B,) on the variance of predictions: 1 inside, rising outside."""
-        return np.asarray(np.clip(2.0 * self.strangeness(windows) - 1.0, 1.0, OUTSIDE_VARIANCE))
+        return np.asarray(np.clip(2.0 * self.novelty(windows) - 1.0, 1.0, OUTSIDE_VARIANCE))
 
     def as_dict(self) -> dict[str, object]:
         """Return plain values for the card; each centre is a line of numbers."""
@@ -84,7 +84,7 @@ class KnownMotion:
         return {"limit": self.limit, "ranges": self.ranges, "centres": lines}
 
 
-def known_from(content: dict[str, Any]) -> KnownMotion:
+def known_motion_from_dict(content: dict[str, Any]) -> KnownMotion:
     """Rebuild known motion from the values of `as_dict`.
 
     Raises:
@@ -120,7 +120,7 @@ def features(windows: NDArray[np.float32]) -> FloatArray:
     )
 
 
-def described(values: FloatArray) -> FloatArray:
+def scaled_features(values: FloatArray) -> FloatArray:
     """Rescale features (B, 5) so that equal distances are equally significant.
 
     Magnitudes are compared by their ratio, above the sensors' noise.
@@ -180,7 +180,7 @@ def known_motion(
         "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
     most = min(_CENTRES, count // _WINDOWS_OF_CENTRE)
-    centres, limit = _centres(described(values), most, seed)
+    centres, limit = _centres(scaled_features(values), most, seed)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
 

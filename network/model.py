@@ -61,7 +61,7 @@ class DisplacementModel:
         Returns:
             The model itself, or a `StatefulModel` if the network is recurrent.
         """
-        return StatefulModel(self, updates) if self._engine.remembers else self
+        return StatefulModel(self, updates) if self._engine.is_recurrent else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.

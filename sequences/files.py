@@ -61,7 +61,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             there.
     """
     path = Path(path)
-    with _refusals_told(path):
+    with _os_errors_translated(path):
         if not path.parent.is_dir():
             raise InputError("path", str(path), "a file in an existing folder", "create the folder")
         if path.is_dir():
@@ -90,7 +90,7 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
             system refuses to write there.
     """
     path = Path(path)
-    with _refusals_told(path):
+    with _os_errors_translated(path):
         if not path.parent.is_dir():
             expected = "a folder in an existing folder"
             raise InputError("path", str(path), expected, "create the folder")
@@ -113,7 +113,7 @@ def _beside(path: Path) -> Path:
 
 
 @contextmanager
-def _refusals_told(path: Path) -> Iterator[None]:
+def _os_errors_translated(path: Path) -> Iterator[None]:
     """Turn an `OSError` about a path into an `InputError` with a remedy."""
     try:
         yield

@@ -115,7 +115,7 @@ def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStr
     return streams
 
 
-def broken_steps(time: FloatArray, position: FloatArray) -> BoolArray:
+def gaps_and_jumps(time: FloatArray, position: FloatArray) -> BoolArray:
     """Return which steps (N - 1,) of a position track are gaps, or jumps of the position source.
 
     Args:
@@ -152,7 +152,7 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         whole = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
     else:
         ends = _ticks(time)
-        breaks = np.concatenate([[0], np.cumsum(broken_steps(time, position))])
+        breaks = np.concatenate([[0], np.cumsum(gaps_and_jumps(time, position))])
         whole = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]
     displacement = np.diff(position[ends], axis=0)

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
 from stario.sequences.arrays import checked_array, checked_time, interpolated
-from stario.sequences.beside_imu import DeviceAttitude as DeviceAttitude
-from stario.sequences.beside_imu import Magnetometer as Magnetometer
-from stario.sequences.beside_imu import PositionTrack as PositionTrack
+from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
+from stario.sequences.auxiliary import Magnetometer as Magnetometer
+from stario.sequences.auxiliary import PositionTrack as PositionTrack
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ STANDARD_GRAVITY = 9.80665
 MAX_TRUTH_GAP = 0.1
 """Longest step [s] between two valid ground-truth samples that is interpolated across."""
 
-ABSURD = 1e5
+MAX_SENSOR_VALUE = 1e5
 """Larger than any sensor's values in any unit used here; also catches infinities."""
 
 MAX_IMU_GAP = 0.1
@@ -161,7 +161,7 @@ class Trajectory:
         if len(known) < 2:
             return 0.0
         t = self.time[known]
-        ticks = np.append(second_ticks(t), t[-1])
+        ticks = np.append(whole_seconds(t), t[-1])
         chords = np.diff(interpolated(ticks, t, self.position_W[known]), axis=0)
         return float(np.linalg.norm(chords, axis=1).sum())
 
@@ -245,9 +245,9 @@ class ImuSequence:
         told.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
         told.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
         told += [] if own is None else ["the device's own attitude"]
-        return f"{self.name}: {', '.join(told)}, truth: {self.truth_words()}"
+        return f"{self.name}: {', '.join(told)}, truth: {self.truth_summary()}"
 
-    def truth_words(self) -> str:
+    def truth_summary(self) -> str:
         """Return a description of the ground truth in a few words."""
         if self.truth is not None:
             return f"{int(self.truth.valid.sum())} poses"
@@ -289,7 +289,7 @@ def is_gap(steps: FloatArray, longest: float = MAX_TRUTH_GAP) -> BoolArray:
     return np.asarray(steps > longest + _ROUNDING_S)
 
 
-def too_slow(truth: Trajectory) -> str:
+def low_rate_message(truth: Trajectory) -> str:
     """Return a message if the ground truth's median step counts as a gap, else an empty text."""
     step = float(np.median(np.diff(truth.time[truth.valid]))) if truth.valid.sum() > 1 else 0.0
     if not is_gap(np.array(step)):
@@ -297,7 +297,7 @@ def too_slow(truth: Trajectory) -> str:
     return f"the truth is at {1.0 / step:.3g} Hz; at least {1.0 / MAX_TRUTH_GAP:.0f} Hz are needed"
 
 
-def second_ticks(time: FloatArray) -> FloatArray:
+def whole_seconds(time: FloatArray) -> FloatArray:
     """Return each second (M,) [s] from the first of increasing times (N,) until before the last.
 
     Seconds within a gap are skipped: the path there is straight, and a clock that jumps by decades

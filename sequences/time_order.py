@@ -19,7 +19,7 @@ CONFIRMED, CONFIRMED_FAR = 2, 20
 """Samples that confirm a jump ahead in time, and a far jump or one without earlier samples."""
 
 
-def advancing(time: FloatArray) -> BoolArray:
+def increasing_mask(time: FloatArray) -> BoolArray:
     """Return which of the finite times (N,) [s] to keep, so that kept times strictly increase.
 
     A time that is not later than all kept ones before it is dropped. So are a few that jump ahead

@@ -28,9 +28,15 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ABSURD, BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.sequence import MAX_IMU_GAP as MAX_IMU_GAP
-from stario.sequences.time_order import advancing
+from stario.sequences.sequence import (
+    MAX_SENSOR_VALUE,
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    Trajectory,
+)
+from stario.sequences.time_order import increasing_mask
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +124,7 @@ def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
     return np.asarray(np.arctan2(total[..., 1], total[..., 0]))
 
 
-def turned_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np.float32]:
+def rotated_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np.float32]:
     """Rotate windows (B, 6, 200) about the vertical by `yaw` (B,) [rad]."""
     R = about_z(yaw).as_matrix().astype(np.float32)
     vectors = windows.reshape(len(windows), 2, 3, WINDOW_SAMPLES)
@@ -247,10 +253,10 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     Raises:
         InputError: fewer than two samples are left, or their rate is not accepted.
     """
-    finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < ABSURD).all(axis=1)
-    finite &= (np.abs(sequence.accel) < ABSURD).all(axis=1)
+    finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < MAX_SENSOR_VALUE).all(axis=1)
+    finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
     index = np.flatnonzero(finite)
-    counts = advancing(sequence.time[index])
+    counts = increasing_mask(sequence.time[index])
     ahead = _ahead(sequence.time[index], counts)
     if ahead:
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)

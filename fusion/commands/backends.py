@@ -9,12 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import (
-    leave_with_skipped,
+    exit_if_skipped,
+    map_recordings,
     print_json,
     progress_bar,
-    result_of_each,
 )
-from stario.fusion.commands.options import Estimating, JsonOption, PathsArgument, Reading, grouped
+from stario.fusion.commands.options import (
+    EstimatorOptions,
+    JsonOption,
+    PathsArgument,
+    ReadingOptions,
+    expand_option_groups,
+)
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.checks.backends import Score
@@ -22,10 +28,10 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@grouped
+@expand_option_groups
 def backends(
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     paths: PathsArgument = None,
     walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
     seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
@@ -56,7 +62,7 @@ def backends(
             return score_recording(network, sequence, settings)
 
         recordings = paths or split_paths(data or Path(), split)
-        scores, skipped = result_of_each("backends", reading, recordings, scored)
+        scores, skipped = map_recordings("backends", reading, recordings, scored)
     else:
         with progress_bar("backends", walks) as progress:
             for seed in range(walks):
@@ -66,4 +72,4 @@ def backends(
         print_json({"summary": summary(scores), "scores": [asdict(score) for score in scores]})
     elif scores:
         typer.echo(score_table(scores))
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)

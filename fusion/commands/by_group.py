@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import leave_with_skipped, print_json, result_of_each
+from stario.fusion.commands.common import exit_if_skipped, map_recordings, print_json
 from stario.fusion.commands.options import (
     BackendOption,
     ByOption,
-    Estimating,
+    EstimatorOptions,
     JsonOption,
-    Reading,
-    grouped,
+    ReadingOptions,
+    expand_option_groups,
 )
 
 if TYPE_CHECKING:
@@ -32,34 +32,34 @@ RecordingsArgument = Annotated[
 ]
 
 
-@grouped
+@expand_option_groups
 def fusion(
     paths: RecordingsArgument,
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     by: ByOption = "set",
     graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the filter's error with its network's by group, with NIS and consistency of yaw."""
-    from stario.fusion.evaluation.checks.worth import worth_of, worth_table
+    from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
     _judge_each(
         "check fusion",
         (reading, paths, estimating, by, as_json),
         lambda model, recording, config, group: [
-            worth_of(model, recording, config, group, backends)
+            fusion_gain(model, recording, config, group, backends)
         ],
-        worth_table,
+        fusion_gain_table,
     )
 
 
-@grouped
+@expand_option_groups
 def fixes(
     paths: RecordingsArgument,
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     every: Annotated[float, typer.Option(min=0.1, help="Interval between fixes in s.")] = 5.0,
     sigma: Annotated[float, typer.Option(min=0.001, help="Fix sigma per axis \\[m].")] = 0.3,
     backend: BackendOption = "ekf",
@@ -67,35 +67,37 @@ def fixes(
     as_json: JsonOption = False,
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
-    from stario.fusion.evaluation.checks.fixed import fixed_table, fixed_track
+    from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
 
     _judge_each(
         "check fixes",
         (reading, paths, estimating, by, as_json),
         lambda model, recording, config, group: [
-            fixed_track(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
+            track_with_fixes(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
         ],
-        fixed_table,
+        fixes_table,
     )
 
 
-@grouped
+@expand_option_groups
 def gaps(
     paths: RecordingsArgument,
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
     """Remove 0.1 s at six instants, then 5 % of the samples; report how far the end moves."""
-    from stario.fusion.evaluation.checks.missing import moved_ends, moved_table
+    from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
-    _judge_each("check gaps", (reading, paths, estimating, by, as_json), moved_ends, moved_table)
+    _judge_each(
+        "check gaps", (reading, paths, estimating, by, as_json), end_shifts, end_shift_table
+    )
 
 
 def _judge_each(
     title: str,
-    given: tuple[Reading, Sequence[Path], Estimating, str, bool],
+    given: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
     judge: Judge,
     table: Callable[[Sequence[Any]], str],
 ) -> None:
@@ -109,10 +111,10 @@ def _judge_each(
     def judged(path: Path, sequence: ImuSequence) -> Sequence[Any]:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    results, skipped = result_of_each(title, reading, paths, judged)
+    results, skipped = map_recordings(title, reading, paths, judged)
     found = [one for several in results for one in several]
     if as_json:
         print_json([asdict(one) for one in found])
     elif found:
         typer.echo(table(found))
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)

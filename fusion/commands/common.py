@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from stario.fusion.commands.options import Reading
+from stario.fusion.commands.options import ReadingOptions
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 
-def collected(
+def collect_results(
     outcomes: Iterable[Result | Skipped],
     skipped: list[Skipped],
     progress: Callable[[int], None] = lambda done: None,
@@ -46,9 +46,9 @@ def collected(
     return results
 
 
-def result_of_each(
+def map_recordings(
     title: str,
-    reading: Reading,
+    reading: ReadingOptions,
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
@@ -69,12 +69,12 @@ def result_of_each(
 
     with progress_bar(title, len(files)) as progress:
         outcomes = each(done_with, files, jobs=1)
-        found = collected(outcomes, skipped, lambda done: progress(done / len(files)))
+        found = collect_results(outcomes, skipped, lambda done: progress(done / len(files)))
     return found, skipped
 
 
-def one_by_one(
-    reading: Reading,
+def process_each(
+    reading: ReadingOptions,
     paths: Sequence[Path],
     out: Path | None,
     work: Callable[[ImuSequence, Path], dict[str, object]],
@@ -104,13 +104,13 @@ def one_by_one(
         name = distinct_name(sequence.name, names)
         return work(sequence, out if out and len(files) == 1 else (out or Path("runs")) / name)
 
-    records = collected(each(recorded, files, jobs=1), skipped)
+    records = collect_results(each(recorded, files, jobs=1), skipped)
     if as_json and records:
         print_json(records[0] if len(files) == 1 else records)
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
 
 
-def leave_with_skipped(skipped: Sequence[Skipped]) -> None:
+def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
     """List what was skipped on stderr and exit with status 1 if there was any."""
     for one in skipped:
         where = "" if one.item in one.reason else f"{one.item}: "

@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands.common import (
-    collected,
-    leave_with_skipped,
+    collect_results,
+    exit_if_skipped,
     print_json,
     progress_bar,
     track_table,
 )
 from stario.fusion.commands.options import (
-    Estimating,
+    EstimatorOptions,
     FixesOption,
     JobsOption,
     JsonOption,
     OutOption,
     PathsArgument,
-    Reading,
+    ReadingOptions,
     ReportOption,
-    grouped,
+    expand_option_groups,
 )
 from stario.sequences.errors import InputError
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
 
 
-@grouped
+@expand_option_groups
 def compare(
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     paths: PathsArgument = None,
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
@@ -64,7 +64,7 @@ def compare(
             model = estimating.network()
             made = compare_tracks(model, demonstration(), settings, progress, known)
             comparisons.append(made)
-        comparisons += collected(
+        comparisons += collect_results(
             compare_recordings(
                 files, network, settings, reading.read, jobs, known, progress=progress
             ),
@@ -84,7 +84,7 @@ def compare(
         for comparison in comparisons:
             _print_comparison(comparison)
         typer.echo(f"{len(written)} files in {folder}")
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
 
 
 def _print_comparison(comparison: Comparison) -> None:
@@ -92,7 +92,7 @@ def _print_comparison(comparison: Comparison) -> None:
 
     sequence = comparison.sequence
     path = comparison.path_m
-    length = f"truth: {sequence.truth_words()}" if path is None else f"{path:.1f} m"
+    length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
     typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {length}")
     time = comparison.tracks["ekf"].time
     words = metric_words(comparison.alignment)

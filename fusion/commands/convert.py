@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import leave_with_skipped
-from stario.fusion.commands.options import Reading, grouped
+from stario.fusion.commands.common import exit_if_skipped
+from stario.fusion.commands.options import ReadingOptions, expand_option_groups
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@grouped
+@expand_option_groups
 def convert(
     paths: Annotated[
         list[Path],
@@ -27,7 +27,7 @@ def convert(
             "An archive (.h5) takes any number of recordings, the other layouts one.",
         ),
     ],
-    reading: Reading,
+    reading: ReadingOptions,
     to: Annotated[
         str | None,
         typer.Option(help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."),
@@ -55,7 +55,7 @@ def convert(
         return
     names = convert_all(_read(reading, files, skipped), target)
     typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
 
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
@@ -73,14 +73,16 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
 
 def _only(files: list[Path], skipped: list[Skipped]) -> Path:
     """Return the only recording found."""
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
     if len(files) != 1:
         expected = "one recording, or an archive (.h5) as OUT"
         raise InputError("convert", f"{len(files)} recordings", expected)
     return files[0]
 
 
-def _read(reading: Reading, files: list[Path], skipped: list[Skipped]) -> Iterator[ImuSequence]:
+def _read(
+    reading: ReadingOptions, files: list[Path], skipped: list[Skipped]
+) -> Iterator[ImuSequence]:
     """Yield one recording after the other; add those that cannot be converted to `skipped`."""
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.convert import check_content

@@ -7,29 +7,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import leave_with_skipped, print_json, progress_bar
-from stario.fusion.commands.judging import judge_by_groups
+from stario.fusion.commands.common import exit_if_skipped, print_json, progress_bar
+from stario.fusion.commands.judging import evaluate_by_group
 from stario.fusion.commands.options import (
-    Estimating,
+    EstimatorOptions,
     JobsOption,
     JsonOption,
     OutOption,
     PathsArgument,
-    Reading,
-    grouped,
+    ReadingOptions,
+    expand_option_groups,
 )
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.datasets.splits import Listed
+    from stario.sequences.datasets.splits import ListEntry
 
 
-@grouped
+@expand_option_groups
 def evaluate(
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     paths: PathsArgument = None,
     data: Annotated[
         Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
@@ -87,10 +87,10 @@ def evaluate(
 
     if by is not None:
         listed, skipped = _listed(reading, paths or [], data, split)
-        skipped += judge_by_groups(
+        skipped += evaluate_by_group(
             listed, reading, by, estimating.model, against, ekf, jobs, out, as_json
         )
-        leave_with_skipped(skipped)
+        exit_if_skipped(skipped)
         return
     if against is not None:
         raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
@@ -100,7 +100,7 @@ def evaluate(
         named, settings = [name.strip() for name in models.split(",")], estimating.settings()
         averaged = convention or "rms"
         skipped += _networks(named, runs, files, settings, reading, averaged, jobs, out, as_json)
-        leave_with_skipped(skipped)
+        exit_if_skipped(skipped)
         return
     if convention is not None:
         raise InputError(
@@ -124,26 +124,26 @@ def evaluate(
         print_json(summary(recordings))
     elif recordings:
         typer.echo(summary_table(recordings))
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
 
 
 def _listed(
-    reading: Reading, paths: list[Path], data: Path | None, split: str
-) -> tuple[list[Listed], list[Skipped]]:
+    reading: ReadingOptions, paths: list[Path], data: Path | None, split: str
+) -> tuple[list[ListEntry], list[Skipped]]:
     """Return the named recordings, or else those of the split, and the skipped paths."""
-    from stario.network.training.splits import listed
-    from stario.sequences.datasets.splits import Listed
+    from stario.network.training.splits import read_packaged_list
+    from stario.sequences.datasets.splits import ListEntry
 
     if paths:
         files, skipped = reading.recordings(paths)
-        return [Listed(path, "") for path in files], skipped
+        return [ListEntry(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
     if reading.where:
         raise InputError(
             "--where", "use with --data", "use with PATH", "name the archive instead of --data"
         )
-    return listed(split, data), []
+    return read_packaged_list(split, data), []
 
 
 def _networks(
@@ -151,7 +151,7 @@ def _networks(
     runs: Path,
     files: list[Path],
     settings: NavigatorConfig,
-    reading: Reading,
+    reading: ReadingOptions,
     convention: str,
     jobs: int,
     out: Path | None,

@@ -9,13 +9,18 @@ from typing import Annotated
 import typer
 
 from stario.fusion.commands.common import print_json
-from stario.fusion.commands.options import Estimating, JsonOption, Reading, grouped
+from stario.fusion.commands.options import (
+    EstimatorOptions,
+    JsonOption,
+    ReadingOptions,
+    expand_option_groups,
+)
 
 
-@grouped
+@expand_option_groups
 def faults(
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     path: Annotated[
         Path | None,
         typer.Argument(help="Recording with truth. Default: a walk with a known sensor."),

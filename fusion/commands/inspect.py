@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import one_by_one
-from stario.fusion.commands.options import JsonOption, OutOption, Reading, grouped
+from stario.fusion.commands.common import process_each
+from stario.fusion.commands.options import (
+    JsonOption,
+    OutOption,
+    ReadingOptions,
+    expand_option_groups,
+)
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.familiarity import Familiarity
@@ -17,12 +22,12 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@grouped
+@expand_option_groups
 def inspect(
     paths: Annotated[
         list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
     ],
-    reading: Reading,
+    reading: ReadingOptions,
     model: Annotated[
         str, typer.Option("--model", help="Compare the motion with these weights' training.")
     ] = "default",
@@ -33,7 +38,7 @@ def inspect(
     from stario.network.model import load_model
 
     work = partial(_inspect, network=load_model(model), told=not as_json)
-    one_by_one(reading, paths, out, work, as_json)
+    process_each(reading, paths, out, work, as_json)
 
 
 def _inspect(

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands.common import print_json, progress_bar
-from stario.fusion.commands.options import Reading
+from stario.fusion.commands.options import ReadingOptions
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.datasets.splits import Listed
+    from stario.sequences.datasets.splits import ListEntry
 
 
-def judge_by_groups(
-    recordings: list[Listed],
-    reading: Reading,
+def evaluate_by_group(
+    recordings: list[ListEntry],
+    reading: ReadingOptions,
     by: str,
     ours: str,
     theirs: str | None,
@@ -33,7 +33,7 @@ def judge_by_groups(
     from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
     from stario.fusion.evaluation.judging.prepared import prepared_recordings
     from stario.fusion.evaluation.judging.table import (
-        Judgement,
+        JudgingResult,
         judgement_dict,
         judgement_text,
         write_judgement,
@@ -62,7 +62,7 @@ def judge_by_groups(
         )
     if not judged:
         return skipped
-    found = Judgement(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
+    found = JudgingResult(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
     if out is not None:
         write_judgement(out, found)
     if as_json:

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import Estimating, grouped
+from stario.fusion.commands.options import EstimatorOptions, expand_option_groups
 
 
-@grouped
+@expand_option_groups
 def live(
-    estimating: Estimating,
+    estimating: EstimatorOptions,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
     host: Annotated[
         str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")

@@ -48,7 +48,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as J
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadingOptions:
     """Options for reading a recording."""
 
     format: Annotated[
@@ -134,7 +134,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Estimating:
+class EstimatorOptions:
     """Options of the estimator."""
 
     config: Annotated[
@@ -188,13 +188,15 @@ class Estimating:
         return network if jobs == 1 else self.model
 
 
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
+def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's `Reading` and `Estimating` parameters into one typer option per field.
 
     The options are thus defined once, and any command that takes `reading: Reading` has them.
     """
     hints = typing.get_type_hints(command, include_extras=True)
-    groups = {name: kind for name, kind in hints.items() if kind in (Reading, Estimating)}
+    groups = {
+        name: kind for name, kind in hints.items() if kind in (ReadingOptions, EstimatorOptions)
+    }
     options: dict[str, inspect.Parameter] = {}
     members: dict[str, list[str]] = {}
     for parameter in inspect.signature(command).parameters.values():

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import one_by_one, progress_bar, track_table
+from stario.fusion.commands.common import process_each, progress_bar, track_table
 from stario.fusion.commands.options import (
     BackendOption,
-    Estimating,
+    EstimatorOptions,
     FixesOption,
     JsonOption,
     OutOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
-    grouped,
+    expand_option_groups,
 )
 
 if TYPE_CHECKING:
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@grouped
+@expand_option_groups
 def run(
     paths: Annotated[
         list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
     ],
-    reading: Reading,
-    estimating: Estimating,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
     fixes: FixesOption = None,
     backend: BackendOption = "ekf",
     out: OutOption = None,
@@ -57,7 +57,7 @@ def run(
     known = [] if fixes is None else read_fixes(fixes)
     shown = Shown(report, view, figures=not as_json)
     work = partial(_run, navigator=navigator, fixes=known, shown=shown)
-    one_by_one(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
+    process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _run(
     from stario.fusion.evaluation.known_positions import position_error_words, shown_positions
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
-    from stario.fusion.report.health import told
+    from stario.fusion.report.health import health_lines
     from stario.sequences.accuracy.metrics import align
 
     check_within(fixes, sequence)
@@ -125,6 +125,6 @@ def _run(
     elif sequence.positions is not None:
         typer.echo(position_error_words(track, sequence.positions))
     if track.health is not None:
-        typer.echo("\n".join([*track.health.lines(), *told(track.health)]))
+        typer.echo("\n".join([*track.health.lines(), *health_lines(track.health)]))
     typer.echo(f"{len(written)} files in {folder}")
     return record

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import leave_with_skipped
-from stario.fusion.commands.options import Reading as ReadingOptions
-from stario.fusion.commands.options import recipe_values
+from stario.fusion.commands.common import exit_if_skipped
+from stario.fusion.commands.options import ReadingOptions, recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def table(
     from stario.fusion.table.filling import backend as on_backend
     from stario.fusion.table.filling import fill, table_cells
     from stario.fusion.table.sets import learned_from
-    from stario.fusion.table.training import Reading
+    from stario.fusion.table.training import ReaderConfig
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import cache_folder
 
@@ -84,7 +83,7 @@ def table(
     costs = known_costs(_trained(cells), out)
     learned = {} if data is None else learned_from(data)
     options = ReadingOptions()
-    reading = Reading(options.read, options.as_read(), cache or cache_folder())
+    reading = ReaderConfig(options.read, options.as_read(), cache or cache_folder())
     skipped = []
     with on_backend(backend):
         if jobs is None and backend != "loky":
@@ -97,7 +96,7 @@ def table(
             typer.echo(f"{done} of {len(cells)}: {named}: {words}", err=True)
             write_results(cells, out, costs, learned, drawn=False)
     typer.echo(write_results(cells, out, costs, learned), nl=False)
-    leave_with_skipped(skipped)
+    exit_if_skipped(skipped)
 
 
 def _data_sets(

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import leave_with_skipped, progress_bar
+from stario.fusion.commands.common import exit_if_skipped, progress_bar
 from stario.fusion.commands.options import (
     JobsOption,
     PathsArgument,
-    Reading,
-    grouped,
+    ReadingOptions,
+    expand_option_groups,
     recipe_values,
 )
 from stario.sequences.errors import InputError
@@ -22,7 +22,7 @@ from stario.sequences.errors import InputError
 if TYPE_CHECKING:
     from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
-    from stario.network.training.data import Recorded
+    from stario.network.training.data import RecordingStreams
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.windows import Attitude
 
@@ -31,9 +31,9 @@ _GENERATED = 150
 """Default number of simulated walks."""
 
 
-@grouped
+@expand_option_groups
 def train(
-    reading: Reading,
+    reading: ReadingOptions,
     paths: PathsArgument = None,
     model: Annotated[
         str | None,
@@ -109,8 +109,8 @@ def train(
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import cached_walks, gather
-    from stario.network.training.parallel import leads
+    from stario.network.training.data import cached_walks, mix_sources
+    from stario.network.training.parallel import is_leader
     from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
 
@@ -128,13 +128,13 @@ def train(
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
-    material = gather(
+    material = mix_sources(
         recorded + held_out if last_stage is not None else recorded,
         cached_walks(walks, recipe.seed, folder, recipe.attitude),
         recipe.shares,
         recipe.reach,
     )
-    kept = gather(held_out, [])
+    kept = mix_sources(held_out, [])
     if recorded and not (kept.streams or kept.legs):
         raise InputError(
             "recordings",
@@ -145,10 +145,10 @@ def train(
     calibrated_by = last_stage or (None if kept.streams else start_from)
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = kept.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
-    if leads():
+    if is_leader():
         for words in material.words:
             typer.echo(words, err=True)
-    with progress_bar("train", total=recipe.steps, shown=leads()) as progress:
+    with progress_bar("train", total=recipe.steps, shown=is_leader()) as progress:
         path = train_network(
             recipe,
             material.streams,
@@ -170,9 +170,9 @@ def train(
             validation_legs=kept.legs,
             chosen_by_legs=not kept.streams,
         )
-    if leads():
+    if is_leader():
         typer.echo(str(path))
-        leave_with_skipped(skipped)
+        exit_if_skipped(skipped)
 
 
 def _recipe(
@@ -195,8 +195,8 @@ def _recipe(
 
 def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
     """Return the training and held-out recordings from the lists in the package."""
-    from stario.network.training.splits import listed
-    from stario.sequences.datasets.splits import leave_out
+    from stario.network.training.splits import read_packaged_list
+    from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
         for option, given in (("--leave-out", group is not None), ("--learn-from", name != "all")):
@@ -206,44 +206,44 @@ def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path],
     if name not in ("all", "open", "few"):
         raise InputError("--learn-from", repr(name), "all, open or few")
     everything = (
-        listed("training", data) + listed("validation", data)
+        read_packaged_list("training", data) + read_packaged_list("validation", data)
         if name == "few"
-        else listed(name, data)
+        else read_packaged_list(name, data)
     )
     if group is not None:
-        outside, inside = leave_out(everything, group)
+        outside, inside = hold_out_group(everything, group)
     else:
-        held = {one.path for one in listed("holdout", data)}
+        held = {one.path for one in read_packaged_list("holdout", data)}
         outside = [one for one in everything if one.path not in held]
         inside = [one for one in everything if one.path in held]
     return [one.path for one in outside], [one.path for one in inside]
 
 
 def _recorded(
-    reading: Reading,
+    reading: ReadingOptions,
     paths: list[Path],
     validation: list[Path],
     lists: tuple[list[Path], list[Path]],
-    streams_of: Callable[[list[Path]], tuple[list[Recorded], list[Skipped]]],
-) -> tuple[list[Recorded], list[Recorded], list[Skipped]]:
+    streams_of: Callable[[list[Path]], tuple[list[RecordingStreams], list[Skipped]]],
+) -> tuple[list[RecordingStreams], list[RecordingStreams], list[Skipped]]:
     """Return training, held-out and skipped recordings; exit at once if too few are usable."""
     from stario.network.training.data import split_off
 
     files, missing = reading.recordings(paths)
     held_files, held_missing = reading.recordings(validation)
     files, held_files = files + lists[0], held_files + lists[1]
-    _check_apart(files, held_files)
+    _check_disjoint(files, held_files)
     recordings, failed = streams_of(files)
     held_out, held_failed = streams_of(held_files)
     skipped = missing + failed + held_missing + held_failed
     if skipped and not (recordings and (held_out or not validation)):
-        leave_with_skipped(skipped)
+        exit_if_skipped(skipped)
     if held_files or not files:
         return recordings, held_out, skipped
     return *split_off(recordings), skipped
 
 
-def _check_apart(files: list[Path], held_files: list[Path]) -> None:
+def _check_disjoint(files: list[Path], held_files: list[Path]) -> None:
     """Refuse a recording used for both training and validation: it would hide overfitting."""
     kept = {path.resolve() for path in held_files}
     both = [path for path in files if path.resolve() in kept]
@@ -255,14 +255,14 @@ def _check_apart(files: list[Path], held_files: list[Path]) -> None:
 
 
 def _streams_of(
-    reading: Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
-) -> tuple[list[Recorded], list[Skipped]]:
-    from stario.network.training.data import Recorded
+    reading: ReadingOptions, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
+) -> tuple[list[RecordingStreams], list[Skipped]]:
+    from stario.network.training.data import RecordingStreams
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import recorded
     from stario.sequences.readers.archive import archive_attributes
 
-    recordings: list[Recorded] = []
+    recordings: list[RecordingStreams] = []
     skipped: list[Skipped] = []
     with progress_bar("read", len(files)) as progress:
         outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
@@ -271,6 +271,6 @@ def _streams_of(
                 skipped.append(outcome)
             else:
                 licence = str(archive_attributes(path).get("licence", ""))
-                recordings.append(Recorded(path, outcome, licence))
+                recordings.append(RecordingStreams(path, outcome, licence))
             progress(done / len(files))
     return recordings, skipped

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
-from stario.fusion.evaluation.judging.network_alone import along
+from stario.fusion.evaluation.judging.network_alone import predict_stream
 from stario.fusion.imu.intervals import UNFAMILIAR_SHARE
 from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel
@@ -47,7 +47,7 @@ class Familiarity:
     direction: Direction
 
     @property
-    def strange(self) -> bool:
+    def is_unfamiliar(self) -> bool:
         """Whether so much of the recording lies outside that the track deserves less trust."""
         return self.outside is not None and self.outside > UNFAMILIAR_SHARE
 
@@ -80,13 +80,13 @@ class Familiarity:
     def _motion_lines(self) -> list[str]:
         if not self.medians:
             return ["motion: no unbroken stretch is long enough to assess it"]
-        told = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
+        text = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
                          self.medians.items())  # fmt: skip
-        lines = [f"motion: {told}"]
+        lines = [f"motion: {text}"]
         if self.outside is None:
             return [*lines, "  the weights' card does not describe the motion they were trained on"]
         share = f"{self.outside:.0%} of the windows lie outside the weights' training data"
-        if not self.strange:
+        if not self.is_unfamiliar:
             return [*lines, f"  {share}"]
         beyond = [
             f"{_WORDS[name][0]} {value:.2f} (known {low:.2f} to {high:.2f})"
@@ -109,9 +109,12 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     if not streams or not any(stream.window_count for stream in streams):
         return Familiarity(None, {}, {}, Direction())
     windows = np.concatenate([stream.windows()[::2] for stream in streams])
-    told = [along(model, s).displacement_N if s.window_count else np.empty((0, 3)) for s in streams]
-    towards = sum(map(direction, streams, told), Direction())
-    speeds = np.linalg.norm(np.concatenate(told)[:, :2], axis=1) / WINDOW_SECONDS
+    predicted = [
+        predict_stream(model, s).displacement_N if s.window_count else np.empty((0, 3))
+        for s in streams
+    ]
+    observed = sum(map(direction, streams, predicted), Direction())
+    speeds = np.linalg.norm(np.concatenate(predicted)[:, :2], axis=1) / WINDOW_SECONDS
     found = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
     rates = np.concatenate([step_rates(stream.imu_N) for stream in streams])
     if len(rates):
@@ -119,6 +122,6 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     found["speed"] = float(np.median(speeds))
     known = model.card.known_motion
     if known is None:
-        return Familiarity(None, found, {}, towards)
-    outside = float(np.mean(known.strangeness(windows) > 1.0))
-    return Familiarity(outside, found, dict(known.ranges), towards)
+        return Familiarity(None, found, {}, observed)
+    outside = float(np.mean(known.novelty(windows) > 1.0))
+    return Familiarity(outside, found, dict(known.ranges), observed)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
-from stario.sequences.drawing.figures import INK, dress, new_figure, save_figure
+from stario.sequences.drawing.figures import INK, apply_style, new_figure, save_figure
 from stario.sequences.files import write_json, write_rows
 from stario.sequences.sequence import FloatArray
 
@@ -73,7 +73,7 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     axes.set_ylim(bottom=0.0)
     # Next to the axes, not at the points: half of the networks have similar sizes and errors.
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    dress(axes)
+    apply_style(axes)
     return fig
 
 
@@ -90,7 +90,7 @@ def _distributions(table: NetworkTable) -> Figure:
             )  # fmt: skip
         axes.set(xlabel=title, ylim=(0.0, 1.02))
         axes.set_xlim(left=0.0)
-        dress(axes)
+        apply_style(axes)
     panels[0].set_ylabel("share of tracks [1]")
     panels[1].legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return fig
@@ -112,7 +112,7 @@ def _pde_boxes(table: NetworkTable) -> Figure:
         axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
         axes.set_title(words, loc="left", fontsize=10)
         axes.set_ylim(bottom=0.0)
-        dress(axes)
+        apply_style(axes)
     panels[0].set_ylabel("PDE [% of the path]")
     return fig
 
@@ -151,7 +151,7 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
-    dress(axes)
+    apply_style(axes)
 
 
 def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -91,7 +91,7 @@ def _compare(
     sequence = read(path)
     if truth_needed and sequence.truth is None:
         raise InputError(
-            f"{sequence.name}: truth", sequence.truth_words(), "a recording with true poses"
+            f"{sequence.name}: truth", sequence.truth_summary(), "a recording with true poses"
         )
     network = _loaded(model) if isinstance(model, str) else model
     return compare(network, sequence, config, progress, fixes)

@@ -21,7 +21,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.judging.network_alone import UPDATES, Answers
+from stario.fusion.evaluation.judging.network_alone import UPDATES, Predictions
 from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
@@ -77,7 +77,7 @@ class Steps:
 class PedestrianDeadReckoning:
     """Baseline judged like a network: predicts the displacement over the second from each tick."""
 
-    def answers(self, prepared: Prepared) -> list[Answers]:
+    def predictions(self, prepared: Prepared) -> list[Predictions]:
         """Return predictions for each piece of a recording, in N."""
         return [_answers(piece.stream) for piece in prepared.pieces]
 
@@ -147,14 +147,14 @@ def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> C
     return np.asarray(np.where((np.conj(axis) * lagging).real < 0.0, -axis, axis))
 
 
-def _answers(stream: LevelledStream) -> Answers:
+def _answers(stream: LevelledStream) -> Predictions:
     track = pedestrian_path(stream)
     # The window that begins at the last tick ends one sample after the stretch.
     at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
     count = stream.window_count
     moved = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
     displacement = np.stack([moved.real, moved.imag, np.zeros(count)], axis=1)
-    return Answers(displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
+    return Predictions(displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
 
 
 def _mean(values: Complex, samples: int) -> Complex:

@@ -125,7 +125,7 @@ def _along(
 ) -> FloatArray:
     """Predict displacements (M, 3) of windows from `time` (M,) on; memory is reset at each gap."""
     network = StatefulInference(model, updates)
-    if not network.remembers:
+    if not network.is_recurrent:
         return network.predict(windows, heading)[0]
     displacements = []
     gaps = np.flatnonzero(np.diff(time) * updates > 1.5) + 1

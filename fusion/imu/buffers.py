@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.sequences.sequence import ABSURD, FloatArray
+from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SECONDS,
@@ -134,7 +134,11 @@ class FieldBuffer:
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         newest = max(newest, self._asked - _LATE)
-        right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD
+        right = (
+            math.isfinite(time)
+            and time > newest
+            and float(np.abs(field_B).sum()) < MAX_SENSOR_VALUE
+        )
         if right:
             self._fields.append((time, field_B))
         return right

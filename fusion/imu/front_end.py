@@ -34,7 +34,7 @@ from stario.fusion.imu.stream_checks import (
 )
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ABSURD, FloatArray, ImuSequence
+from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import MAX_IMU_GAP
 
@@ -88,7 +88,7 @@ class FrontEnd:
             ClockSetBackError: this one and those before it are of a clock that was set back.
         """
         time = sample[0]
-        if not (math.isfinite(time) and sum(map(abs, sample[1:])) < ABSURD):
+        if not (math.isfinite(time) and sum(map(abs, sample[1:])) < MAX_SENSOR_VALUE):
             self.counts.not_finite += 1
             return []
         if self._frozen.is_frozen(sample):

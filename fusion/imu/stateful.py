@@ -14,7 +14,7 @@ from stario.sequences.attitude.levelling import STILL_ACCEL
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import turned_windows
+from stario.sequences.windows import rotated_windows
 
 LEAST_SIGMA = 5e-3
 """No network knows a second's displacement better than this [m], whatever it says."""
@@ -54,7 +54,7 @@ class StatefulInference:
         self.restart()
 
     @property
-    def remembers(self) -> bool:
+    def is_recurrent(self) -> bool:
         """Whether earlier windows matter, so that a gap does."""
         return self._stretch is not self._model
 
@@ -75,7 +75,7 @@ class StatefulInference:
         Returns:
             displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
         """
-        mean_H, covariance_H = self._stretch.predict(turned_windows(windows_N, -heading))
+        mean_H, covariance_H = self._stretch.predict(rotated_windows(windows_N, -heading))
         R_NH = about_z(heading).as_matrix()
         with np.errstate(invalid="ignore"):  # the estimator refuses what is not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
@@ -87,7 +87,7 @@ class StatefulInference:
         if known is None:
             return 0
         moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
-        return int((moves & (known.strangeness(windows) > 1.0)).sum())
+        return int((moves & (known.novelty(windows) > 1.0)).sum())
 
     @property
     def memory(self) -> Any:
@@ -96,14 +96,14 @@ class StatefulInference:
         Raises:
             InputError: a memory is put back into a network that has none, or the reverse.
         """
-        return self._stretch.memory if self.remembers else None
+        return self._stretch.memory if self.is_recurrent else None
 
     @memory.setter
     def memory(self, memory: Any) -> None:
         self.restart()
-        if (memory is not None) != self.remembers:
+        if (memory is not None) != self.is_recurrent:
             raise InputError("snapshot: network", "another kind of memory", "the same network's")
-        if self.remembers:
+        if self.is_recurrent:
             self._stretch.memory = memory
 
 

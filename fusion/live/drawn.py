@@ -25,7 +25,7 @@ _GAP_SECONDS = 0.5
 
 
 @dataclass
-class Drawn:
+class DisplayedTrack:
     """Displayed track of one device.
 
     Attributes:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.payload import Batch, joined, json_from, parse_line
-from stario.fusion.live.server import same
+from stario.fusion.live.server import tokens_match
 from stario.sequences.errors import InputError
 
 LONGEST_LINE = 64 * 1024
@@ -151,7 +151,7 @@ class LineServer:
         except InputError:
             return False
         shown = message.get("token") if isinstance(message, dict) else None
-        return isinstance(shown, str) and same(shown, self._token)
+        return isinstance(shown, str) and tokens_match(shown, self._token)
 
 
 class _Packets(asyncio.DatagramProtocol):

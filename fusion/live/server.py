@@ -104,7 +104,7 @@ class TokenMiddleware:
         named = request.query_params.get("token", "")
         bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
         shown = (named, bearer, request.cookies.get(_COOKIE, ""))
-        if not any(same(one, self._token) for one in shown):
+        if not any(tokens_match(one, self._token) for one in shown):
             reason = (
                 "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
@@ -112,7 +112,7 @@ class TokenMiddleware:
             return
 
         async def with_cookie(message: Any) -> None:
-            if message["type"] == "http.response.start" and same(named, self._token):
+            if message["type"] == "http.response.start" and tokens_match(named, self._token):
                 cookie = f"{_COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                 message["headers"] = [*message["headers"], (b"set-cookie", cookie.encode())]
             await send(message)
@@ -120,7 +120,7 @@ class TokenMiddleware:
         await self._app(scope, receive, with_cookie)
 
 
-def same(shown: str, token: str) -> bool:
+def tokens_match(shown: str, token: str) -> bool:
     """Compare a token with the right one in constant time."""
     return hmac.compare_digest(*(one.encode("utf-8", "surrogatepass") for one in (shown, token)))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.fixes import position_fix
-from stario.fusion.live.drawn import Drawn
+from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import Field, Merger, Sample
 from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
@@ -42,7 +42,7 @@ class Session:
         self.device = device
         self._folder, self._new_navigator = folder, new_navigator
         self.running = True
-        self.drawn = Drawn()
+        self.drawn = DisplayedTrack()
         self.problem = ""
         self.words: list[dict[str, str]] = []
         self.samples = self.ignored = self.fixes = 0
@@ -56,7 +56,7 @@ class Session:
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
         self._words_at = -math.inf
-        self.drawn = Drawn(revision=self.drawn.revision + 1)
+        self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
         self.problem, self.words = "", []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
         self.samples = self.fixes = 0
@@ -149,7 +149,7 @@ class Session:
         if after.map_frame != self.drawn.map_frame:
             self.drawn.move(before, after)
         self.drawn.add(after)
-        self._tell_health(after.time)
+        self._update_health(after.time)
 
     def close(self) -> None:
         """Close the recording."""
@@ -204,9 +204,9 @@ class Session:
             return
         self.problem = ""
         self.drawn.add(state)
-        self._tell_health(state.time)
+        self._update_health(state.time)
 
-    def _tell_health(self, time: float) -> None:
+    def _update_health(self, time: float) -> None:
         if time - self._words_at < _HEALTH_SECONDS:
             return
         self._words_at = time

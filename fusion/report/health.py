@@ -51,8 +51,8 @@ class Finding:
 
 def findings(health: Health) -> list[Finding]:
     """Return what stands out in a run so far, warnings first; never empty."""
-    if _is_shaken(health):
-        reasons = [_shaken(health), *_samples(health), *_gaps(health)]
+    if _is_invalid(health):
+        reasons = [_invalid_data(health), *_samples(health), *_gaps(health)]
         notes = [note for note in health.notes if not _is_unfamiliar(note)]
     else:
         reasons = [*_samples(health), *_flagged(health), *_gaps(health), *_updates(health)]
@@ -64,7 +64,7 @@ def findings(health: Health) -> list[Finding]:
     return sorted(found, key=lambda finding: order[finding.level])
 
 
-def told(health: Health) -> list[str]:
+def health_lines(health: Health) -> list[str]:
     """Return one line of text per finding; those to act on begin with "!"."""
     return [
         f"{'! ' if finding.level == 'warning' else '  '}{finding.text} {finding.advice}".rstrip()
@@ -72,7 +72,7 @@ def told(health: Health) -> list[str]:
     ]
 
 
-def _is_shaken(health: Health) -> bool:
+def _is_invalid(health: Health) -> bool:
     """Return whether sensor, weights and filter all disagree: then the data are at fault."""
     return (
         _has_flagged(health)
@@ -81,7 +81,7 @@ def _is_shaken(health: Health) -> bool:
     )
 
 
-def _shaken(health: Health) -> Finding:
+def _invalid_data(health: Health) -> Finding:
     text = (
         "This track cannot be trusted: the device was shaken or struck, not carried ("
         f"{_counted(health.flagged)} samples; most of the motion is unlike a pedestrian's; "

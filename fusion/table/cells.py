@@ -18,7 +18,7 @@ from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.fusion.table.errors import Model, Shown, test_errors
 from stario.fusion.table.sets import ALL, DataSet
-from stario.fusion.table.training import SPARE, Reading, recipe_digest, train_cell
+from stario.fusion.table.training import TEMPORARY_FILES, ReaderConfig, recipe_digest, train_cell
 from stario.network.architectures import ARCHITECTURES
 from stario.network.model import load_model
 from stario.network.training.config import TrainingConfig
@@ -72,7 +72,7 @@ def reference_rows(dataset: DataSet) -> tuple[str, ...]:
     return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
 
 
-def fill_cell(cell: Cell, out: Path, reading: Reading) -> Cell:
+def fill_cell(cell: Cell, out: Path, reading: ReaderConfig) -> Cell:
     """Train and evaluate a cell, except for what is already done.
 
     Raises:
@@ -114,14 +114,14 @@ def read_tracks(cell: Cell, out: Path) -> dict[str, Shown]:
 _PARTS = ("time", "position_W", "truth_W")
 
 
-def _train(cell: Cell, recipe: TrainingConfig, folder: Path, reading: Reading) -> None:
+def _train(cell: Cell, recipe: TrainingConfig, folder: Path, reading: ReaderConfig) -> None:
     content = train_cell(cell.dataset, recipe, folder, reading)
     write_json(folder / "trained.json", {"cell": cell.digest, **content})
-    for spare in SPARE:
+    for spare in TEMPORARY_FILES:
         (folder / spare).unlink(missing_ok=True)
 
 
-def _evaluate(cell: Cell, folder: Path, reading: Reading) -> None:
+def _evaluate(cell: Cell, folder: Path, reading: ReaderConfig) -> None:
     began = process_time()
     model = _model(cell, folder)
     found, shown, skipped = test_errors(model, cell.dataset.test, reading)

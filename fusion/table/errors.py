@@ -13,16 +13,16 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.judging.displacement_error import BLOCK_SECONDS, recording_errors
-from stario.fusion.evaluation.judging.network_alone import answers
+from stario.fusion.evaluation.judging.network_alone import predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepared_recordings
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
 from stario.fusion.navigator import Navigator
-from stario.fusion.table.training import Reading
+from stario.fusion.table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention, align, evaluate_track, pose_errors
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.splits import Listed
+from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import StarioError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -49,7 +49,7 @@ Model = DisplacementModel | PedestrianDeadReckoning
 
 
 def test_errors(
-    model: Model, test: Sequence[Listed], reading: Reading
+    model: Model, test: Sequence[ListEntry], reading: ReaderConfig
 ) -> tuple[list[dict[str, object]], dict[str, Shown], list[Skipped]]:
     """Return the errors on every recording, tracks of the first ones, and skipped recordings.
 
@@ -80,9 +80,9 @@ def test_errors(
 
 
 def _recording(
-    model: Model, prepared: Prepared, reading: Reading
+    model: Model, prepared: Prepared, reading: ReaderConfig
 ) -> tuple[dict[str, object], Shown | None]:
-    alone = recording_errors(prepared, answers(model, prepared))
+    alone = recording_errors(prepared, predictions(model, prepared))
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
         "recording": prepared.name,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
 from stario.fusion.table.sets import FIRST, DataSet
-from stario.fusion.table.training import Reading, cell_recipe
+from stario.fusion.table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES, architecture
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import ConfigError, InputError
@@ -60,7 +60,7 @@ def table_cells(
 
 
 def fill(
-    cells: Sequence[Cell], out: Path, reading: Reading, jobs: int | None = 1
+    cells: Sequence[Cell], out: Path, reading: ReaderConfig, jobs: int | None = 1
 ) -> Iterator[Cell | Skipped]:
     """Fill what is missing; yield each cell once it is filled, or the reason why it is not.
 

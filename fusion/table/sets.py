@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from stario.network.training.splits import listed
-from stario.sequences.datasets.splits import Listed, random_split
+from stario.network.training.splits import read_packaged_list
+from stario.sequences.datasets.splits import ListEntry, random_split
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings
 
@@ -61,7 +61,7 @@ class DataSet:
     name: str
     training: tuple[Path, ...]
     validation: tuple[Path, ...]
-    test: tuple[Listed, ...]
+    test: tuple[ListEntry, ...]
     words: str
 
     @property
@@ -88,7 +88,7 @@ def development_sets(
     for name in chosen or ():
         if name not in known:
             raise InputError("--sets", repr(name), f"one of {', '.join(known)}")
-    recordings = listed("all", data) + listed("test", data)
+    recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
         _together(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
         for name in known
@@ -103,40 +103,40 @@ def folder_set(name: str, folder: Path, seed: int) -> DataSet:
         InputError: it has fewer than three recordings.
         ReadError: it cannot be read.
     """
-    return _split(name, [Listed(path, name) for path in find_recordings(folder)], seed)
+    return _split(name, [ListEntry(path, name) for path in find_recordings(folder)], seed)
 
 
-def _single(name: str, recordings: Iterable[Listed], seed: int) -> DataSet:
+def _single(name: str, recordings: Iterable[ListEntry], seed: int) -> DataSet:
     return _split(name, [one for one in recordings if _set_of(one) in _MEMBERS[name]], seed)
 
 
-def _split(name: str, recordings: Sequence[Listed], seed: int) -> DataSet:
+def _split(name: str, recordings: Sequence[ListEntry], seed: int) -> DataSet:
     """Apply the paper's split, by walks: two phones on one walk stay together."""
     walks = _by(recordings, _walk)
     split = random_split(walks, seed)
 
-    def members(part: tuple[Path, ...]) -> list[Listed]:
+    def members(part: tuple[Path, ...]) -> list[ListEntry]:
         return [one for walk in part for one in walks[walk]]
 
     return DataSet(
         name,
         tuple(one.path for one in members(split.training)),
         tuple(one.path for one in members(split.validation)),
-        tuple(Listed(one.path, _set_of(one)) for one in members(split.test)),
+        tuple(ListEntry(one.path, _set_of(one)) for one in members(split.test)),
         f"random 8:1:1 split by recording, seed {seed}",
     )
 
 
-def _walk(one: Listed) -> Path:
+def _walk(one: ListEntry) -> Path:
     """Return the walk: KIPD's S9 and S20 recordings of one name are two phones on one walk."""
     return one.path.with_name(re.sub(r"(?<=\w)S(9|20)$", "", one.path.name))
 
 
 def _together(data: Path, seed: int, per_group: int) -> DataSet:
     """Combine all sets, tested on people, devices and places unseen in training."""
-    held_out = listed("holdout", data)
+    held_out = read_packaged_list("holdout", data)
     held = {one.path for one in held_out}
-    outside = [one for one in listed("all", data) if one.path not in held]
+    outside = [one for one in read_packaged_list("all", data) if one.path not in held]
     rng = np.random.default_rng(seed)
     validation = {
         one.path
@@ -145,7 +145,7 @@ def _together(data: Path, seed: int, per_group: int) -> DataSet:
         for one in walk
     }
     test = [
-        Listed(one.path, name)
+        ListEntry(one.path, name)
         for name, members in _by(held_out, lambda one: one.group).items()
         for one in _spread(members, per_group)
     ]
@@ -153,31 +153,33 @@ def _together(data: Path, seed: int, per_group: int) -> DataSet:
         ALL,
         tuple(one.path for one in outside if one.path not in validation),
         tuple(one.path for one in outside if one.path in validation),
-        tuple(Listed(one.path, _set_of(one)) for one in test),
+        tuple(ListEntry(one.path, _set_of(one)) for one in test),
         f"tested on people, devices and places of the list `holdout`, at most {per_group} "
         f"recordings of each; validated on a random {_VALIDATION_SHARE:.0%} of each set's other "
         f"walks, seed {seed}",
     )
 
 
-def _set_of(one: Listed) -> str:
+def _set_of(one: ListEntry) -> str:
     return one.group.split(" ")[0]
 
 
-def _some(walks: list[list[Listed]], rng: np.random.Generator) -> list[list[Listed]]:
+def _some(walks: list[list[ListEntry]], rng: np.random.Generator) -> list[list[ListEntry]]:
     """Return those used for validation."""
     count = max(1, round(_VALIDATION_SHARE * len(walks)))
     return [walks[k] for k in rng.permutation(len(walks))[:count]]
 
 
-def _by(recordings: Iterable[Listed], key: Callable[[Listed], Key]) -> dict[Key, list[Listed]]:
-    parts: dict[Key, list[Listed]] = {}
+def _by(
+    recordings: Iterable[ListEntry], key: Callable[[ListEntry], Key]
+) -> dict[Key, list[ListEntry]]:
+    parts: dict[Key, list[ListEntry]] = {}
     for one in recordings:
         parts.setdefault(key(one), []).append(one)
     return parts
 
 
-def _spread(members: Sequence[Listed], most: int) -> list[Listed]:
+def _spread(members: Sequence[ListEntry], most: int) -> list[ListEntry]:
     """Return up to `most` of them, evenly spaced from the first to the last."""
     count = min(most, len(members))
     at = np.linspace(0, len(members) - 1, count).round().astype(int)
@@ -190,6 +192,6 @@ def learned_from(data: Path) -> dict[str, frozenset[Path]]:
     Raises:
         InputError: a recording of the packaged lists is missing.
     """
-    known = frozenset(one.path for one in listed("all", data))
-    held = frozenset(one.path for one in listed("holdout", data))
+    known = frozenset(one.path for one in read_packaged_list("all", data))
+    held = frozenset(one.path for one in read_packaged_list("holdout", data))
     return {"default": known, "first-stage": known - held}

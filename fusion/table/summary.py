@@ -16,7 +16,7 @@ from stario.fusion.table.ranks import Rank, Recordings, ranks
 from stario.fusion.table.sets import DataSet
 from stario.network.architectures import ARCHITECTURES
 
-AGAINST = "StarIO"
+REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
 
 Content = Mapping[str, Any]
@@ -152,7 +152,7 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
     poses = all(one["kind"] == "poses" for c in _contents(filled) for one in c["recordings"])
     measure = "ate" if poses else "10"
     blocks = {name: _blocks(seeds, measure) for name, seeds in filled.items()}
-    placed = ranks({name: runs for name, runs in blocks.items() if all(runs)}, AGAINST)
+    placed = ranks({name: runs for name, runs in blocks.items() if all(runs)}, REFERENCE_NETWORK)
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
     test = {one.path for one in dataset.test}

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.table.published import published
 from stario.fusion.table.ranks import Rank
-from stario.fusion.table.summary import AGAINST, COLUMNS, Mean, Row, SetTable
+from stario.fusion.table.summary import COLUMNS, REFERENCE_NETWORK, Mean, Row, SetTable
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow
 from stario.network.training.config import TrainingConfig
@@ -87,7 +87,7 @@ def _set_text(table: SetTable) -> str:
     keys = [key for key in COLUMNS if any(key in row.figures for row in table.rows)]
     paper = any(published(dataset.name, row.network) for row in table.rows)
     titles = ["network", "seeds", *(COLUMNS[key].title for key in keys)]
-    titles += ["rank", f"error / {AGAINST}'s", "training error", "validation error"]
+    titles += ["rank", f"error / {REFERENCE_NETWORK}'s", "training error", "validation error"]
     titles += ["paper: ATE, RTE [m]"] if paper else []
     lines += _markdown_head(titles)
     for row in table.rows:

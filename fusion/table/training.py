@@ -13,7 +13,7 @@ from time import process_time
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
-from stario.network.training.data import Recorded, cached_walks, gather
+from stario.network.training.data import RecordingStreams, cached_walks, mix_sources
 from stario.network.training.run import EpochReport
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
@@ -28,7 +28,7 @@ _EPOCH_STEPS = 250
 _VALIDATION_SAMPLES = 60 * WINDOW_SAMPLES
 """Maximum samples of each validation stretch: all are evaluated after every epoch."""
 
-SPARE = ("checkpoint.safetensors", "clock.json")
+TEMPORARY_FILES = ("checkpoint.safetensors", "clock.json")
 """Files of a training run that are not needed once its result is recorded."""
 
 _WALKS, _VALIDATION_WALKS = 40, 8
@@ -37,7 +37,7 @@ every cell, so that only the networks differ."""
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReaderConfig:
     """How recordings are read, on any machine that fills a cell.
 
     Attributes:
@@ -74,7 +74,7 @@ def cell_recipe(
 
 
 def train_cell(
-    dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: Reading
+    dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
 ) -> dict[str, object]:
     """Train a cell's network, resuming from its checkpoint; write the model and `SPARE`.
 
@@ -89,9 +89,9 @@ def train_cell(
     held_out, missing = _streams(dataset.validation, recipe, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for one in streams for s in one.streams)
-    material = gather(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
-    kept = gather(held_out, [])
-    clock = _Clock(folder / SPARE[1])
+    material = mix_sources(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
+    kept = mix_sources(held_out, [])
+    clock = _Clock(folder / TEMPORARY_FILES[1])
 
     def finished(report: EpochReport) -> None:
         clock.keep()
@@ -134,14 +134,14 @@ def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
 
 
 def _streams(
-    files: Sequence[Path], recipe: TrainingConfig, reading: Reading
-) -> tuple[list[Recorded], list[Skipped]]:
+    files: Sequence[Path], recipe: TrainingConfig, reading: ReaderConfig
+) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of each recording; later cells of the same set reuse them."""
     key = (tuple(files), recipe.attitude, reading.cache)
     if key not in _open:
         outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, recipe.attitude)
         found = list(zip(files, outcomes, strict=True))
-        known = [Recorded(path, one) for path, one in found if not isinstance(one, Skipped)]
+        known = [RecordingStreams(path, one) for path, one in found if not isinstance(one, Skipped)]
         skipped = [one for _, one in found if isinstance(one, Skipped)]
         while len(_open) >= _MOST_OPEN:
             _open.pop(next(iter(_open)))
@@ -152,7 +152,7 @@ def _streams(
 _MOST_OPEN = 2
 """Maximum parts of sets whose streams a process keeps open: the two of one cell."""
 
-_open: dict[object, tuple[list[Recorded], list[Skipped]]] = {}
+_open: dict[object, tuple[list[RecordingStreams], list[Skipped]]] = {}
 
 
 def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:

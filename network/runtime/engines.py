@@ -28,7 +28,7 @@ class Engine(Protocol):
     """Interface that a model requires of an engine."""
 
     @property
-    def remembers(self) -> bool:
+    def is_recurrent(self) -> bool:
         """Whether the network is recurrent: it carries a state from window to window."""
         ...
 
@@ -65,9 +65,9 @@ class TorchEngine:
         return self._training_form
 
     @property
-    def remembers(self) -> bool:
+    def is_recurrent(self) -> bool:
         """Whether the network is recurrent: it carries a state from window to window."""
-        return self._network.remembers
+        return self._network.is_recurrent
 
     def first_state(self) -> Float32Array:
         """Return the state (2, 1, H) of a recurrent network before the first window."""
@@ -100,7 +100,7 @@ class OnnxEngine:
         self._state_size = int(shapes["state"][2]) if "state" in shapes else 0
 
     @property
-    def remembers(self) -> bool:
+    def is_recurrent(self) -> bool:
         """Whether the network is recurrent: it carries a state from window to window."""
         return self._state_size > 0
 
@@ -125,7 +125,7 @@ class OnnxEngine:
         parts = []
         for begin in range(0, len(windows), _BATCH):
             feed = {"windows": windows[begin : begin + _BATCH]}
-            if self.remembers:
+            if self.is_recurrent:
                 shape = (2, len(feed["windows"]), self._state_size)
                 feed["state"] = np.zeros(shape, np.float32)
             parts.append(self._session.run(["displacement", "log_sigma"], feed))

@@ -49,13 +49,13 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
     network = model.training_form
     with _quiet():
         program = torch.onnx.export(
-            _Step(network) if network.remembers else network,
+            _Step(network) if network.is_recurrent else network,
             _examples(network),
             dynamo=True,
             external_data=False,
             verbose=False,
-            input_names=["windows", "state"][: 1 + network.remembers],
-            output_names=["displacement", "log_sigma", "next_state"][: 2 + network.remembers],
+            input_names=["windows", "state"][: 1 + network.is_recurrent],
+            output_names=["displacement", "log_sigma", "next_state"][: 2 + network.is_recurrent],
             dynamic_shapes=_shapes(network),
         )
     assert program is not None
@@ -80,12 +80,12 @@ class _Step(nn.Module):
 
 def _examples(network: DisplacementNetwork) -> tuple[Tensor, ...]:
     windows = torch.zeros(2, 6, WINDOW_SAMPLES)
-    return (windows, network.first_state(2)) if network.remembers else (windows,)
+    return (windows, network.first_state(2)) if network.is_recurrent else (windows,)
 
 
 def _shapes(network: DisplacementNetwork) -> tuple[dict[int, Any], ...]:
     batch = torch.export.Dim("batch")
-    return ({0: batch}, {1: batch}) if network.remembers else ({0: batch},)
+    return ({0: batch}, {1: batch}) if network.is_recurrent else ({0: batch},)
 
 
 @contextmanager

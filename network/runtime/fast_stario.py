@@ -173,7 +173,7 @@ class Stage:
 
     def _add(self, layer: Star | Gate) -> None:
         self.layers.append(layer)
-        self.offset = self.offset + layer.left_out
+        self.offset = self.offset + layer.omitted_bias
 
     def record(self, recording: Recording, x: Tensor) -> Tensor:
         """Record the stage on a buffer that is already padded; return the result's (B, L, C)."""

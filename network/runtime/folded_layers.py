@@ -115,7 +115,7 @@ class Star:
         self.wings = Wings(block, length)
         weight = block.project.weight.squeeze(2).double() * self.wings.factor
         self.project = Product(weight)
-        self.left_out = bias_of(block.project).double()
+        self.omitted_bias = bias_of(block.project).double()
 
     def record(self, recording: Recording, x: Tensor, scratch: Scratch) -> None:
         """Record the in-place update of x (B, L, C)."""
@@ -215,7 +215,7 @@ class Gate:
         size = length * channels
         self.epsilon = torch.full((1,), size * EPSILON)
         self.project = Product(unit.project.weight.squeeze(2).double() * size**0.5)
-        self.left_out = bias_of(unit.project).double()
+        self.omitted_bias = bias_of(unit.project).double()
 
     def record(self, recording: Recording, x: Tensor, scratch: Scratch) -> None:
         """Record the in-place update of x (B, L, C)."""

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stario.network.training.lever_arm import Swing, draw_swing, swung
+from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, WorldStream
@@ -164,11 +164,11 @@ class WindowSampler:
             facing: (B, 10 K, 2) direction in which the device faces in W.
         """
         a, size, seconds = self.augmentation, len(imu), self._successive
-        swings = draw_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
-        imu, displacement = swung(imu, displacement, swings)
+        swings = sample_swing(size, a.swung, a.swing_rate, a.lever, self.generator)
+        imu, displacement = apply_swing(imu, displacement, swings)
         heading = heading_of(facing.view(size, seconds, -1, 2), swings)
         imu = imu.reshape(size * seconds, WINDOW_SAMPLES, 6)
-        seen = show(imu, heading.flatten(), a, self.generator, seconds)
+        seen = augmented(imu, heading.flatten(), a, self.generator, seconds)
         displacement = displacement.reshape(-1, 1, 3) @ seen.R_HW.mT
         displacement = displacement * seen.mirror[:, None, 3:]
         return seen.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
@@ -186,7 +186,7 @@ def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class AugmentedWindows:
     """Windows as presented to the network.
 
     Attributes:
@@ -200,13 +200,13 @@ class Shown:
     mirror: Tensor
 
 
-def show(
+def augmented(
     imu: Tensor,
     heading: Tensor,
     augmentation: Augmentation,
     generator: torch.Generator,
     together: int = 1,
-) -> Shown:
+) -> AugmentedWindows:
     """Turn windows (B, 200, 6) from W into the frame H, as an imperfect device would measure them.
 
     They are turned by minus the heading (B,) plus an error; mirrored left to right, which in H is
@@ -245,7 +245,7 @@ def show(
     imu = tilted.reshape(imu.shape) + of_each(symmetric(groups, 6) * limits).unsqueeze(1)
     white = torch.randn(imu.shape, generator=generator)
     imu = imu + white * of_each(uniform(groups)[:, None, None] ** 2 * deviations)
-    return Shown(imu, R_HW, mirror)
+    return AugmentedWindows(imu, R_HW, mirror)
 
 
 def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:

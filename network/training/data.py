@@ -33,7 +33,7 @@ _SHORTEST = 400
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingStreams:
     """Streams of a recording, and the licence named in its file."""
 
     path: Path
@@ -42,7 +42,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Material:
+class TrainingData:
     """Streams to learn from and how often each is drawn.
 
     Attributes:
@@ -58,12 +58,12 @@ class Material:
     words: list[str]
 
 
-def gather(
-    recorded: Sequence[Recorded],
+def mix_sources(
+    recorded: Sequence[RecordingStreams],
     generated: Sequence[WorldStream],
     shares: Mapping[str, float] = MappingProxyType({}),
     reach: int = 1,
-) -> Material:
+) -> TrainingData:
     """Mix recordings and simulated walks so that each source makes up its share of the windows.
 
     Args:
@@ -100,12 +100,12 @@ def gather(
     legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
-    return Material(streams, weights, legs, words + _licences(recorded))
+    return TrainingData(streams, weights, legs, words + _licences(recorded))
 
 
-def _licences(recorded: Sequence[Recorded]) -> list[str]:
+def _licences(recorded: Sequence[RecordingStreams]) -> list[str]:
     """Describe each archive's licences and how much training data is under each."""
-    known: dict[str, list[Recorded]] = {}
+    known: dict[str, list[RecordingStreams]] = {}
     for one in recorded:
         if one.licence:
             file = split_name(one.path)[0].name
@@ -118,7 +118,7 @@ def _licences(recorded: Sequence[Recorded]) -> list[str]:
 
 
 def _sources(
-    recorded: Sequence[Recorded], shares: Mapping[str, float]
+    recorded: Sequence[RecordingStreams], shares: Mapping[str, float]
 ) -> list[tuple[str, float, list[WorldStream]]]:
     """Return name, share and streams of each source of recordings with full truth."""
     shares = {name: share for name, share in shares.items() if name != SIMULATED}
@@ -144,7 +144,9 @@ def _liveliness(stream: WorldStream) -> float:
     return float(np.sqrt(np.square(linear).sum(axis=1).mean()))
 
 
-def split_off(recordings: Sequence[Recorded]) -> tuple[list[Recorded], list[Recorded]]:
+def split_off(
+    recordings: Sequence[RecordingStreams],
+) -> tuple[list[RecordingStreams], list[RecordingStreams]]:
     """Split the last fifth off each recording; drop parts that are too short to learn from."""
     first, last = [], []
     for one in recordings:

@@ -61,7 +61,7 @@ class Swing:
     angle: Sines
 
 
-def draw_swing(
+def sample_swing(
     size: int, share: float, rate: float, lever: float, generator: torch.Generator
 ) -> Swing:
     """Draw swings about axes near the vertical, like those of arms and hips.
@@ -88,7 +88,7 @@ def draw_swing(
     return Swing(axis, arm * (swings * lever * uniform(size))[:, None], angle)
 
 
-def swung(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
+def apply_swing(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
     """Add a swing to the IMU (B, 200 K, 6) in W and to displacements (B, K, 3) [m]."""
     length = imu.shape[1]
     time = torch.arange(length + 1) / WINDOW_RATE

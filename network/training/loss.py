@@ -11,7 +11,7 @@ from stario.network.training.config import loss_with_sigma
 from stario.network.training.weak_truth import LegBatch, leg_loss
 
 
-def loss_of_all(
+def step_loss(
     answers: Callable[[Tensor], tuple[Tensor, Tensor]],
     windows: Tensor,
     target: Tensor,
@@ -35,7 +35,7 @@ def loss_of_all(
     means, log_sigmas = torch.split(mean, sizes), torch.split(log_sigma, sizes)
     squared = (means[0] - target.flatten(0, -2)) ** 2
     loss = loss_with_sigma(squared, log_sigmas[0]) if with_sigma else squared.sum(1).mean()
-    for part, told, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
+    for part, predicted, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
         shape = (len(part.known), -1, 3)
-        loss = loss + leg_loss(told.view(shape), sigma.view(shape), part)[0]
+        loss = loss + leg_loss(predicted.view(shape), sigma.view(shape), part)[0]
     return loss, float(squared.detach().sum(1).mean())

@@ -36,7 +36,7 @@ class Workers:
     device: torch.device
 
     @property
-    def leads(self) -> bool:
+    def is_leader(self) -> bool:
         """Whether this is the process that writes and reports."""
         return self.rank == 0
 
@@ -65,16 +65,16 @@ class Workers:
         torch.distributed.all_reduce(total)
         return float(total) / self.count
 
-    def agreed(self, value: float) -> float:
+    def broadcast(self, value: float) -> float:
         """Return the leading process's number in all processes."""
         if self.count == 1:
             return value
-        told = torch.tensor(value, dtype=torch.float64, device=self.device)
-        torch.distributed.broadcast(told, 0)
-        return float(told)
+        tensor = torch.tensor(value, dtype=torch.float64, device=self.device)
+        torch.distributed.broadcast(tensor, 0)
+        return float(tensor)
 
 
-def leads() -> bool:
+def is_leader() -> bool:
     """Return whether this process is the only one or the launcher's first one."""
     return os.environ.get("RANK", "0") == "0"
 

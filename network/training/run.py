@@ -27,7 +27,7 @@ from stario.network.training.augment import WindowSampler
 from stario.network.training.calibrate import calibrate
 from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate
-from stario.network.training.loss import loss_of_all
+from stario.network.training.loss import step_loss
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import LegSampler
@@ -96,7 +96,7 @@ class TrainingRun:
         shared = workers.wrapped(self.network, idle=idle)
         self._shared: Any = torch.compile(shared) if config.compiled else shared
         self._mixed = config.precision == "bfloat16"
-        if not workers.leads:
+        if not workers.is_leader:
             torch.manual_seed(config.seed + workers.rank)  # independent dropout
         self.step = 0
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
@@ -137,7 +137,7 @@ class TrainingRun:
         legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
         with_sigma = self.step >= self.config.likelihood_from * self.config.steps
-        loss, error = loss_of_all(self._answers, windows, target, legs, with_sigma)
+        loss, error = step_loss(self._answers, windows, target, legs, with_sigma)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -157,7 +157,7 @@ class TrainingRun:
         A recurrent network receives them as rows of `config.successive` windows.
         """
         successive = self.config.successive
-        if self.network.remembers:
+        if self.network.is_recurrent:
             windows = windows.view(-1, successive, *windows.shape[1:])
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
             mean, log_sigma = self._shared(windows)
@@ -200,7 +200,7 @@ class TrainingRun:
             errors = errors[first - 1 :]
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
 
-    def has_settled(self) -> bool:
+    def should_stop(self) -> bool:
         """Whether validation stopped improving; False until sigma is learned: models need it."""
         learned = len(self.history) >= self._first_with_sigma
         return learned and self.epochs_since_best() >= self.config.patience
@@ -213,11 +213,11 @@ class TrainingRun:
 
     def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch in the leading process and share the error with the others."""
-        errors = held_out.errors(self.averaged) if self.workers.leads else {}
+        errors = held_out.errors(self.averaged) if self.workers.is_leader else {}
         return EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
             training_error=training_error,
-            validation_error=self.workers.agreed(held_out.deciding(errors)),
+            validation_error=self.workers.broadcast(held_out.selection_error(errors)),
             validation_by_recording=errors,
             windows_per_second=self._windows / (self._drawing_s + self._learning_s),
             drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
@@ -228,7 +228,7 @@ class TrainingRun:
         self.history.append(report)
         if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-        if not self.workers.leads:
+        if not self.workers.is_leader:
             return
         self._write_checkpoint()
         with atomic_write(self.folder / "log.json") as file:
@@ -252,7 +252,7 @@ class TrainingRun:
             ConfigError: it belongs to another recipe, or to other recordings or initial weights.
             ReadError: it cannot be read.
         """
-        if self.workers.leads:
+        if self.workers.is_leader:
             for left in self.folder.glob(".*.tmp"):  # from an interrupted write
                 left.unlink(missing_ok=True)
         if not self._checkpoint.exists():
@@ -276,7 +276,7 @@ class TrainingRun:
         whole = self.optimiser.state_dict()
         self.optimiser.load_state_dict({**whole, "state": state})
         self.sampler.generator.set_state(tensors["random.sampler"])
-        if self.workers.leads:
+        if self.workers.is_leader:
             torch.set_rng_state(tensors["random.torch"])
         else:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
@@ -290,7 +290,7 @@ class TrainingRun:
     ) -> Path:
         """Calibrate the best weights, unless a calibration is given, and write the model."""
         path = self.folder / "model.safetensors"
-        if not self.workers.leads:
+        if not self.workers.is_leader:
             return path
         self.averaged.load_state_dict(self.best)
         residuals, log_sigma = held_out.residuals(self.averaged)

@@ -82,12 +82,17 @@ def train(
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
         held_out = ValidationSet(
-            validation, run.device, validation_legs, config, chosen_by_legs, run.network.remembers
+            validation,
+            run.device,
+            validation_legs,
+            config,
+            chosen_by_legs,
+            run.network.is_recurrent,
         )
-        while run.step < config.steps and not run.has_settled():
+        while run.step < config.steps and not run.should_stop():
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)
-            if these.leads:
+            if these.is_leader:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 

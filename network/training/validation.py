@@ -23,7 +23,7 @@ from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
     headings_at,
-    turned_windows,
+    rotated_windows,
     window_starts,
     windows_at,
 )
@@ -68,14 +68,14 @@ class ValidationSet:
         legs: Sequence[LegStream] = (),
         config: TrainingConfig | None = None,
         chosen_by_legs: bool = False,
-        remembers: bool = False,
+        is_recurrent: bool = False,
     ) -> None:
         self.device, self._chosen_by_legs = device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
         # Hours of data are cut sparsely: what matters is the variety of motion.
         length = sum(len(stream) for stream in streams)
         self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
-        if remembers:
+        if is_recurrent:
             thinned = max(s for s in _STRIDES if s <= self.stride)
             every, self.stride = self.stride // thinned, thinned
             streams = _minutes(streams, every) if every > 1 else streams
@@ -116,7 +116,7 @@ class ValidationSet:
         for first in range(0, len(starts), batch):
             windows, target = windows_at(stream, starts[first : first + batch])
             heading = headings_at(stream.facing_W, starts[first : first + batch])
-            windows = turned_windows(windows, -heading)
+            windows = rotated_windows(windows, -heading)
             yield windows, about_z(-heading).apply(target).astype(np.float32)
 
     def errors(
@@ -133,7 +133,7 @@ class ValidationSet:
         means = {str(n): float(squared[self.names == n].mean()) for n in dict.fromkeys(self.names)}
         return means | {kind: self._leg_error(network, batch) for kind, batch in self.legs.items()}
 
-    def deciding(self, errors: Mapping[str, float]) -> float:
+    def selection_error(self, errors: Mapping[str, float]) -> float:
         """Return the mean of the `errors` that select the weights; 0 if there are none."""
         by_legs = [errors[kind] for kind in self.legs if kind in errors]
         chosen = by_legs if self._chosen_by_legs and by_legs else list(errors.values())
@@ -142,7 +142,7 @@ class ValidationSet:
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
         batch = batch.to(self.device)
-        windows = batch.windows if network.remembers else batch.windows.flatten(0, 1)
+        windows = batch.windows if network.is_recurrent else batch.windows.flatten(0, 1)
         mean, log_sigma = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
@@ -186,8 +186,8 @@ class _Answers:
     def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
         # Windows that begin within the same second belong to separate series, as in use.
-        self.batch = max(1, WINDOW_SAMPLES // stride) if network.remembers else _AT_ONCE
-        self._state = network.first_state(self.batch) if network.remembers else None
+        self.batch = max(1, WINDOW_SAMPLES // stride) if network.is_recurrent else _AT_ONCE
+        self._state = network.first_state(self.batch) if network.is_recurrent else None
 
     def __call__(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         if self._state is None:

@@ -45,7 +45,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stario.network.training.augment import Augmentation, WindowSampler, heading_of, show
+from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
 from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
 from stario.network.training.parallel import Workers
 from stario.sequences.errors import ConfigError, InputError
@@ -164,11 +164,11 @@ class LegSampler:
         heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
-        shown = show(imu_N, heading, self.augmentation, self._generator, self._seconds)
+        shown = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
         R_NH = shown.R_HW.mT * shown.mirror[:, None, 3:]
         windows = shown.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        told = [*_padded(drawn, self._seconds), change]
-        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *told)
+        predicted = [*_padded(drawn, self._seconds), change]
+        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *predicted)
 
     def _draw(self) -> tuple[LegStream, int]:
         uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
@@ -300,17 +300,17 @@ def velocity_change(accel_N: Tensor) -> Tensor:
 
 def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     """Return residuals (S, M, 3) [m] of displacements (S, K, 3) in N after a fit of the yaw."""
-    told = torch.einsum("smk,skc->smc", legs.share, displacement_N)
-    a, b = told.detach(), legs.displacement
+    predicted = torch.einsum("smk,skc->smc", legs.share, displacement_N)
+    a, b = predicted.detach(), legs.displacement
     weight = legs.known / legs.seconds
     real = (weight * (a * b)[..., :2].sum(-1)).sum(1)
     imaginary = (weight * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(1)
     psi = torch.atan2(imaginary, real)[:, None]
     turned = torch.stack(
         [
-            psi.cos() * told[..., 0] - psi.sin() * told[..., 1],
-            psi.sin() * told[..., 0] + psi.cos() * told[..., 1],
-            told[..., 2],
+            psi.cos() * predicted[..., 0] - psi.sin() * predicted[..., 1],
+            psi.sin() * predicted[..., 0] + psi.cos() * predicted[..., 1],
+            predicted[..., 2],
         ],
         dim=-1,
     )

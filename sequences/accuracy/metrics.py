@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, Trajectory, too_slow
+from stario.sequences.sequence import FloatArray, Trajectory, low_rate_message
 
 Alignment = Literal["none", "first", "yaw"]
 Convention = Literal["rms", "ronin", "mean"]
@@ -102,7 +102,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
             "estimate",
             f"no overlap: {_span(estimate)} against truth {_span(truth)}",
             "a pose at a time when the truth is known",
-            too_slow(truth),
+            low_rate_message(truth),
         )
     ours, theirs = _select(estimate, common), _select(at_estimate, common)
     return PoseErrors(

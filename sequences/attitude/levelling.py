@@ -35,7 +35,7 @@ STILL_ACCEL = 0.3
 STILL_GYRO = 0.1
 """Root mean square rate [rad/s], likewise; not a test of rest, since a hand may tremble."""
 
-LEAST_FORCE = 1.0
+MIN_GRAVITY_FORCE = 1.0
 """Mean specific force [m/s^2] below which it gives no vertical: free fall, a dead sensor."""
 
 _TILT_SIGMA = 0.05
@@ -86,7 +86,7 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     )
     up = force_0.mean(axis=0)
     force = float(np.linalg.norm(up))
-    R_WB = tilt_aligning(up).as_matrix() if force > LEAST_FORCE else np.eye(3)
+    R_WB = tilt_aligning(up).as_matrix() if force > MIN_GRAVITY_FORCE else np.eye(3)
     return GravityStart(R_WB, still, force)
 
 
@@ -169,7 +169,7 @@ class LevelledAttitude:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
         up = (0.5 * (time[1:] - time[:-1])) @ (force_N[1:] + force_N[:-1]) / dt
-        up /= max(float(np.linalg.norm(up)), LEAST_FORCE)
+        up /= max(float(np.linalg.norm(up)), MIN_GRAVITY_FORCE)
         P = self._propagated(attitudes, dt)
         gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
         P = P - gain @ P[:2]

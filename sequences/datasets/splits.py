@@ -16,7 +16,7 @@ _PAPER_SHARES = (8, 1, 1)
 
 
 @dataclass(frozen=True)
-class Listed:
+class ListEntry:
     """A recording of a list and the group that it belongs to.
 
     Attributes:
@@ -32,7 +32,7 @@ class Listed:
         return f"{self.group} ".startswith(f"{group} ")
 
 
-def read_list(file: Path, data: Path) -> list[Listed]:
+def read_list(file: Path, data: Path) -> list[ListEntry]:
     """Read a list of recordings whose names are relative to a data folder.
 
     Each line is `name` or `name, group`; a name may be that of a recording in an archive,
@@ -52,11 +52,13 @@ def read_list(file: Path, data: Path) -> list[Listed]:
             raise InputError(
                 str(path), "nothing", f"a recording of {file.name}", "set the data folder: --data"
             )
-        listed.append(Listed(path, group))
+        listed.append(ListEntry(path, group))
     return listed
 
 
-def leave_out(recordings: Iterable[Listed], group: str) -> tuple[list[Listed], list[Listed]]:
+def hold_out_group(
+    recordings: Iterable[ListEntry], group: str
+) -> tuple[list[ListEntry], list[ListEntry]]:
     """Return the recordings outside a group, for training, and those within it, for evaluation.
 
     Raises:

@@ -37,7 +37,7 @@ from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.published.oxiod import capture_file
-from stario.sequences.sequence import ImuSequence, too_slow
+from stario.sequences.sequence import ImuSequence, low_rate_message
 from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
@@ -180,7 +180,7 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     if not streams:
         raise InputError(
             f"{sequence.name}: truth", "no unbroken stretch of 2 s", "a trajectory to train on",
-            "" if sequence.truth is None else too_slow(sequence.truth),
+            "" if sequence.truth is None else low_rate_message(sequence.truth),
         )  # fmt: skip
     return streams
 
@@ -209,13 +209,13 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     if not streams:
         return False
     tables = [_tables(stream) for stream in streams]
-    told = [
+    metadata = [
         {"name": s.name, "kind": getattr(s, "kind", "poses"), "rows": [len(v) for v in t.values()]}
         for s, t in zip(streams, tables, strict=True)
     ]
     content = safetensors.numpy.save(
         {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
-        metadata={"streams": json.dumps(told)},
+        metadata={"streams": json.dumps(metadata)},
     )
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -266,7 +266,7 @@ def _opened(file: Path) -> list[Stream] | None:
         with file.open("rb") as source:
             length = int.from_bytes(source.read(8), "little")
             header = json.loads(source.read(min(length, size)))
-        told = json.loads(header.pop("__metadata__")["streams"])
+        metadata = json.loads(header.pop("__metadata__")["streams"])
         if size != 8 + length + max(tensor["data_offsets"][1] for tensor in header.values()):
             raise ValueError(f"{size} bytes")
         whole = {name: _mapped(file, 8 + length, tensor) for name, tensor in header.items()}
@@ -275,10 +275,10 @@ def _opened(file: Path) -> list[Stream] | None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.warning("%s: incomplete, will be rebuilt: %s", file, error)
         return None
-    names = list(_TABLES["poses" if told[0]["kind"] == "poses" else "legs"])
+    names = list(_TABLES["poses" if metadata[0]["kind"] == "poses" else "legs"])
     first = dict.fromkeys(names, 0)
     streams = []
-    for one in told:
+    for one in metadata:
         rows = dict(zip(names, one["rows"], strict=True))
         tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
         first = {name: first[name] + rows[name] for name in names}

@@ -22,7 +22,7 @@ def excess(box: FloatArray, home: FloatArray) -> float:
     return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
 
 
-def rounds(path: FloatArray, box: FloatArray) -> float:
+def revisit_count(path: FloatArray, box: FloatArray) -> float:
     """Return a path's length over the size of its box: how often it revisits the same place."""
     return float(np.nansum(np.linalg.norm(np.diff(path, axis=0), axis=1))) / size_of(box)
 

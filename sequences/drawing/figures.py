@@ -61,12 +61,12 @@ def panels_of(fig: Figure, *heights: float) -> list[Axes]:
     ratios = heights or (1,)
     panels = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     for axes in panels:
-        dress(axes)
+        apply_style(axes)
         axes.margins(x=0.01)
     return list(panels)
 
 
-def dress(axes: Axes) -> None:
+def apply_style(axes: Axes) -> None:
     """Style axes as in all figures."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
@@ -80,7 +80,7 @@ def style_of(name: str, index: int) -> tuple[str, str]:
     return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
 
 
-def broken(
+def split_at_gaps(
     time: FloatArray,
     values: FloatArray,
     valid: BoolArray | None = None,
@@ -92,14 +92,14 @@ def broken(
     """
     if valid is not None:
         time, values = time[valid], values[valid]
-    gaps = behind_gaps(time, max_gap)
+    gaps = indices_after_gaps(time, max_gap)
     return (
         np.insert(time, gaps, 0.5 * (time[gaps] + time[gaps - 1])),
         np.insert(values, gaps, np.nan, axis=0),
     )
 
 
-def behind_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
+def indices_after_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
     """Return the indices of the times (N,) [s] that follow a gap.
 
     A gap is longer than `max_gap` [s] and than three median steps.
@@ -138,7 +138,7 @@ def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, co
     starts = np.arange(0, len(time), block)
     mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
     extremes = [ufunc.reduceat(value, starts) for ufunc in (np.minimum, np.maximum)]
-    ticks, curves = broken(time[starts], np.column_stack([mean, *extremes]))
+    ticks, curves = split_at_gaps(time[starts], np.column_stack([mean, *extremes]))
     axes.plot(ticks, curves[:, 0], color=colour, lw=0.8, label=label)
     if block > 1:
         axes.fill_between(ticks, curves[:, 1], curves[:, 2], color=colour, alpha=0.3, lw=0.4)

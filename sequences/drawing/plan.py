@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.sequences.drawing.boxes import box_of, excess, frame_around, rounds, size_of
+from stario.sequences.drawing.boxes import box_of, excess, frame_around, revisit_count, size_of
 from stario.sequences.drawing.figures import (
     INK,
     LEGEND,
     RED,
-    behind_gaps,
-    broken,
     distance,
     draw_path,
+    indices_after_gaps,
     new_figure,
     panels_of,
+    split_at_gaps,
     style_of,
 )
 from stario.sequences.errors import InputError
@@ -56,8 +56,12 @@ def plan_view(
     Raises:
         InputError: there is nothing to draw.
     """
-    paths = {name: broken(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()}
-    path_truth = None if truth is None else broken(truth.time, truth.position_W[:, :2], truth.valid)
+    paths = {
+        name: split_at_gaps(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()
+    }
+    path_truth = (
+        None if truth is None else split_at_gaps(truth.time, truth.position_W[:, :2], truth.valid)
+    )
     boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
     if path_truth is not None and np.isfinite(path_truth[1]).any():
         typical = path_truth[1]
@@ -75,7 +79,7 @@ def plan_view(
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = panels_of(fig)
-    fine = 0.6 if rounds(typical, home) > _CROWDED else 1.0
+    fine = 0.6 if revisit_count(typical, home) > _CROWDED else 1.0
     if path_truth is not None:
         draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
     for k, (name, box) in enumerate(boxes.items()):
@@ -103,7 +107,7 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
     for name, track in tracks.items():
         if name == "pdr":  # it has no poses while the person stands
             continue
-        behind = behind_gaps(track.time, _MARKED_GAP)
+        behind = indices_after_gaps(track.time, _MARKED_GAP)
         if len(behind):
             x, y = track.position_W[behind, :2].T
             axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)

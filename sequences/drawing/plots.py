@@ -25,13 +25,13 @@ from stario.sequences.drawing.figures import (
     ORANGE,
     RED,
     SKY,
-    broken,
     distance,
     draw_dots,
     draw_samples,
     new_figure,
     panels_of,
     reach_of,
+    split_at_gaps,
     style_of,
 )
 from stario.sequences.errors import InputError
@@ -41,7 +41,7 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     Trajectory,
-    second_ticks,
+    whole_seconds,
 )
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def error_over_time(
         label, colour = style_of(name, k)
         if name not in good:
             label += f" (leaves the figure, up to {distance(largest[name])})"
-        time, norm = broken(errors[name].estimate.time, norms[name][:, None])
+        time, norm = split_at_gaps(errors[name].estimate.time, norms[name][:, None])
         panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
     panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
     panels[0].set_ylabel("horizontal error [m]")
@@ -127,7 +127,7 @@ def innovations(
     fig = new_figure(9.0, 9.0, title)
     panels = panels_of(fig, 1, 1, 1, 1.3)
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
-        band_time, band = broken(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
+        band_time, band = split_at_gaps(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
         axes.fill_between(band_time, -band[:, 0], band[:, 0], color=BLUE, alpha=0.15, lw=0)
         reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
         # A gated residual can be huge: drawn at the edge, it leaves room for the others.
@@ -199,7 +199,7 @@ def imu_overview(
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     """Return times [s] and speed [m/s] along 1 s chords, from which path length is measured."""
     step = 1.0
-    ticks = second_ticks(truth.time)
+    ticks = whole_seconds(truth.time)
     if len(ticks) < 2 or truth.valid.sum() < 2:
         return np.empty(0), np.empty(0)
     at = truth.at(ticks)
@@ -211,10 +211,12 @@ def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
 def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
     time = errors.estimate.time
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
-        axes.plot(*broken(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label)
+        axes.plot(
+            *split_at_gaps(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label
+        )
         if errors.estimate.position_covariance_W is not None:
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
-            band_time, band = broken(time, 3 * sigma[:, None])
+            band_time, band = split_at_gaps(time, 3 * sigma[:, None])
             axes.fill_between(
                 band_time,
                 -band[:, 0],

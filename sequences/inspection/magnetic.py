@@ -161,7 +161,7 @@ class MagneticFindings:
         return ", hard iron " + ", ".join(f"{b:+.1f}" + f" ± {s:.1f}" for b, s in pairs) + " uT"
 
 
-def judge_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
+def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     """Assess up to ten minutes of the magnetometer; None if there is none or too little.
 
     Raises:

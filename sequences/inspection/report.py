@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.magnetic import MagneticFindings, judge_magnetometer
+from stario.sequences.inspection.magnetic import MagneticFindings, assess_magnetometer
 from stario.sequences.inspection.samples import sample_problems, usable
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
@@ -18,7 +18,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
     is_gap,
-    too_slow,
+    low_rate_message,
 )
 from stario.sequences.truth.findings import fit_as_dict, fit_lines, fit_problems
 from stario.sequences.truth.fit import TruthFit, fit_truth
@@ -220,7 +220,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         problems.append(str(error))
     fit: TruthFit | None = None
     coverage = None if sequence.truth is None else _coverage(sequence, sequence.truth)
-    slow = "" if sequence.truth is None else too_slow(sequence.truth)
+    slow = "" if sequence.truth is None else low_rate_message(sequence.truth)
     if slow:
         problems.append(f"{sequence.name}: truth: {slow}")
     elif coverage is not None and coverage.share > 0.0:
@@ -243,7 +243,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         coverage=coverage,
         fit=fit,
         problems=tuple(problems),
-        truth=sequence.truth_words(),
+        truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
         yaw=yaw,
@@ -259,7 +259,7 @@ def _rest(sequence: ImuSequence) -> Rest | None:
 
 def _magnetic(sequence: ImuSequence) -> MagneticFindings | None:
     try:
-        return judge_magnetometer(sequence)
+        return assess_magnetometer(sequence)
     except InputError:  # an invalid rate, which `check_units` reports
         return None
 

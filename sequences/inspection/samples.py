@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.sequence import ABSURD, MAX_IMU_GAP, BoolArray, FloatArray, ImuSequence
+from stario.sequences.sequence import (
+    MAX_IMU_GAP,
+    MAX_SENSOR_VALUE,
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+)
 from stario.sequences.windows import MIN_RATE, runs
 
 _log = logging.getLogger(__name__)
@@ -152,7 +158,7 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
 
 def usable(sequence: ImuSequence) -> BoolArray:
     """Return which samples (n,) are numbers that a sensor can measure."""
-    return np.asarray((np.abs(_values(sequence)) < ABSURD).all(axis=1))
+    return np.asarray((np.abs(_values(sequence)) < MAX_SENSOR_VALUE).all(axis=1))
 
 
 def _values(sequence: ImuSequence) -> FloatArray:

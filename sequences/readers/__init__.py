@@ -10,7 +10,7 @@ from pathlib import Path
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
-    Where,
+    AttributeFilter,
     archive_members,
     is_archive,
     is_archive_member,
@@ -20,11 +20,11 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
 from stario.sequences.readers.lists import is_list, list_entries
-from stario.sequences.readers.own_csv import is_own_csv, read_own_csv
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.files import lone_sensors
-from stario.sequences.readers.phones.json_export import is_json_export, laid_out
+from stario.sequences.readers.phones.files import incomplete_sensors
+from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.published.advio import is_advio, read_advio
@@ -35,7 +35,7 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.text import first_line, magic
+from stario.sequences.readers.text import first_bytes, first_line
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
@@ -77,7 +77,7 @@ def _read_zip(path: Path) -> ImuSequence:
 
 
 def _read_json(path: Path) -> ImuSequence:
-    with laid_out(path) as folder:
+    with unpack_json(path) as folder:
         return _read_unpacked(path, folder, folder)
 
 
@@ -109,7 +109,7 @@ FORMATS: dict[str, Format] = {
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
     "zip": Format(is_zip, _read_zip, "zip"),
     "json": Format(is_json_export, _read_json, "Sensor Logger"),
-    "csv": Format(is_own_csv, read_own_csv, "generic CSV"),
+    "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings."""
@@ -164,7 +164,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
 def find_recordings(
     path: str | Path,
     on_error: Callable[[ReadError], None] | None = None,
-    where: Where | None = None,
+    where: AttributeFilter | None = None,
 ) -> list[Path]:
     """Return the recordings at a path: the path itself, those that it lists, or all below it.
 
@@ -196,13 +196,13 @@ def find_recordings(
         return _with_attributes([path], where)
     found = sorted(_below(path))
     if not found:
-        if pose_files(path) or lone_sensors(path):
+        if pose_files(path) or incomplete_sensors(path):
             raise _unknown(path)
         raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
     return _with_attributes(found, where)
 
 
-def _with_attributes(found: list[Path], where: Where | None) -> list[Path]:
+def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[Path]:
     """Return the recordings whose attributes match; only those in archives have any."""
     if not where or not found:
         return found
@@ -247,7 +247,7 @@ def _below(path: Path) -> list[Path]:
 
 
 def _listed(
-    path: Path, on_error: Callable[[ReadError], None] | None, where: Where | None
+    path: Path, on_error: Callable[[ReadError], None] | None, where: AttributeFilter | None
 ) -> list[Path]:
     """Return what a list names, each once; a list in a list is an error: it could be a cycle."""
     found: list[Path] = []
@@ -289,7 +289,7 @@ def _unknown(path: Path) -> ReadError:
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif lone := lone_sensors(path):
+    elif lone := incomplete_sensors(path):
         expected = "a gyroscope and an accelerometer"
         return ReadError(path, "sensors", f"only {' and '.join(lone)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
@@ -298,9 +298,11 @@ def _unknown(path: Path) -> ReadError:
         there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
-    elif kind := next((words for start, words in _CONTAINERS if magic(path).startswith(start)), ""):
+    elif kind := next(
+        (words for start, words in _CONTAINERS if first_bytes(path).startswith(start)), ""
+    ):
         found, fix = kind, "export as CSV, or as the zip or folder that the app writes"
-    elif magic(path, 2)[:1] == b"\x80":
+    elif first_bytes(path, 2)[:1] == b"\x80":
         found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     elif (line := first_line(path)) is None:
         found, fix = "no line of text", "is it empty or compressed?"

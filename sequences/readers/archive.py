@@ -18,7 +18,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError, StarioError
 from stario.sequences.readers.checked import checked, optional_package, rotations
-from stario.sequences.readers.text import magic
+from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import (
     BoolArray,
     DeviceAttitude,
@@ -28,11 +28,11 @@ from stario.sequences.sequence import (
     PositionTrack,
     Trajectory,
 )
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 SUFFIXES = (".h5", ".hdf5")
 
-Where = Mapping[str, Sequence[str]]
+AttributeFilter = Mapping[str, Sequence[str]]
 """Filter of recordings: patterns for each attribute, one of which must match."""
 
 _HDF5_MAGIC = b"\x89HDF"
@@ -69,7 +69,7 @@ def is_archive(path: Path) -> bool:
     A file that cannot be opened counts as one unless it is named like RoNIN's: reading it then
     raises an error that names the damage.
     """
-    if path.suffix.lower() not in SUFFIXES or magic(path, 4) != _HDF5_MAGIC:
+    if path.suffix.lower() not in SUFFIXES or first_bytes(path, 4) != _HDF5_MAGIC:
         return False
     h5py = optional_package("h5py", "readers")
     try:
@@ -80,7 +80,7 @@ def is_archive(path: Path) -> bool:
         return path.name != _RONIN
 
 
-def archive_members(path: Path, where: Where | None = None) -> list[Path]:
+def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Path]:
     """Return `file.h5:name` for each recording in an archive with IMU data, reading no samples.
 
     Args:
@@ -113,7 +113,7 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
         return {key: _plain(value) for key, value in file[name].attrs.items()}
 
 
-def matches(name: str, attributes: Mapping[str, str | float], where: Where) -> bool:
+def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
     """Whether a recording's attributes, its `name` among them, match the filter."""
     told = {"name": name, **attributes}
     return all(
@@ -123,7 +123,7 @@ def matches(name: str, attributes: Mapping[str, str | float], where: Where) -> b
 
 
 def _none_chosen(
-    path: Path, known: Mapping[str, Mapping[str, str | float]], where: Where
+    path: Path, known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter
 ) -> ReadError:
     asked = ", ".join(f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns)
     key = next(
@@ -135,7 +135,7 @@ def _none_chosen(
     return ReadError(path, f"recordings with {asked}", "none", expected)
 
 
-def _any(known: Mapping[str, Mapping[str, str | float]], where: Where) -> bool:
+def _any(known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter) -> bool:
     return any(matches(name, attributes, where) for name, attributes in known.items())
 
 
@@ -189,7 +189,7 @@ def _magnetometer(path: Path, group: Any) -> Magnetometer | None:
     if "mag" not in group:
         return None
     time, field = _column(path, group, "mag/t"), _column(path, group, "mag/field")
-    keep = advancing(time)
+    keep = increasing_mask(time)
     return Magnetometer(time[keep], field[keep])
 
 
@@ -198,7 +198,7 @@ def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
         return None
     time = _column(path, group, "attitude/t")
     quat = _column(path, group, "attitude/quat_xyzw")
-    keep = advancing(time)
+    keep = increasing_mask(time)
     return DeviceAttitude(time[keep], rotations(path, "attitude/quat_xyzw", quat[keep], "xyzw"))
 
 
@@ -213,7 +213,7 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
     if "truth/quat_xyzw" not in group:
         return None, _positions(path, group, "positions", "truth/p")
     time = _column(path, group, "truth/t")
-    keep = advancing(time)
+    keep = increasing_mask(time)
     valid = _valid(path, group, "truth", time)[keep]
     quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
     # Invalid rows may hold anything, but each must become a rotation.
@@ -233,7 +233,7 @@ def _positions(
 ) -> PositionTrack:
     stem = field.split("/")[0]
     time = _column(path, group, f"{stem}/t")
-    keep = advancing(time)
+    keep = increasing_mask(time)
     position_W = _column(path, group, field, finite=False)
     return PositionTrack(time[keep], position_W[keep], kind, _valid(path, group, stem, time)[keep])
 

@@ -26,7 +26,7 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
-from stario.sequences.readers.text import IntArray, magic, seconds
+from stario.sequences.readers.text import IntArray, first_bytes, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 
@@ -83,8 +83,8 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
     if path.is_dir():
-        return b"rosbag2_bagfile_information" in magic(path / "metadata.yaml", 200)
-    head = magic(path)
+        return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 200)
+    head = first_bytes(path)
     return head.startswith((b"#ROSBAG V2", b"\x89MCAP0\r\n")) or (
         path.suffix == ".db3" and head.startswith(b"SQLite format 3")
     )
@@ -101,7 +101,7 @@ class _Messages:
 
 def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messages]:
     """Return the messages of the IMU and, if present, ground truth and magnetic field, by type."""
-    version = "1" if magic(path).startswith(b"#ROSBAG") else "2"
+    version = "1" if first_bytes(path).startswith(b"#ROSBAG") else "2"
     reader_type: Any = optional_package(f"rosbags.rosbag{version}", "bags").Reader
     try:
         with reader_type(path) as reader:

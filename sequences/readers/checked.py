@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 _HELD_SHARE = 1.0 / 3.0
 
@@ -75,7 +75,7 @@ def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magn
     """
     known = np.isfinite(field).all(axis=1) & np.isfinite(time) & field.any(axis=1)
     time, field = time[known], field[known]
-    keep = advancing(time)
+    keep = increasing_mask(time)
     if held and len(field) > 1:
         fresh = np.append(True, np.diff(field, axis=0).any(axis=1))
         if fresh.mean() < 1.0 - _HELD_SHARE:
@@ -90,7 +90,7 @@ def trajectory(
     velocity_W: FloatArray | None = None,
 ) -> Trajectory:
     """Return a trajectory of the poses whose times advance; files may repeat rows."""
-    keep = advancing(time)
+    keep = increasing_mask(time)
     return Trajectory(
         time=time[keep],
         position_W=position_W[keep],

@@ -18,7 +18,7 @@ _RATES = (9.0, 1.05 * MAX_RATE)
 the factor between two units, so that only one unit fits."""
 
 
-def on_one_clock(
+def resample_to_gyro(
     path: Path, gyro_ns: IntArray, gyro: FloatArray, accel_ns: IntArray, accel: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Interpolate the accelerometer to the gyroscope's samples in their common time span.

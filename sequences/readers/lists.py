@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.archive import Where, split_name
+from stario.sequences.readers.archive import AttributeFilter, split_name
 from stario.sequences.readers.text import first_line, first_lines, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
@@ -39,7 +39,7 @@ class Entry:
     """An entry of a list: a path and the filter of its recordings."""
 
     path: Path
-    where: Where
+    where: AttributeFilter
 
 
 def list_entries(path: Path) -> Iterator[Entry | ReadError]:
@@ -76,7 +76,7 @@ def list_entries(path: Path) -> Iterator[Entry | ReadError]:
             yield Entry(found, where)
 
 
-def _chosen(text: str) -> tuple[str, Where]:
+def _chosen(text: str) -> tuple[str, AttributeFilter]:
     """Split the `key=value` filters off the end of a line."""
     where: dict[str, list[str]] = {}
     while match := _CHOICE.search(text):

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated
-from stario.sequences.attitude.levelling import LEAST_FORCE
+from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
@@ -27,7 +27,7 @@ from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
 from stario.sequences.readers.text import IntArray, head_lines, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 from stario.sequences.truth.accel_axes import accel_axes
 from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
@@ -56,7 +56,7 @@ _SAME_CLOCK_S = 0.1
 
 
 @dataclass(frozen=True)
-class PoseRows:
+class PoseCandidate:
     """A pose file's rows in one of the possible interpretations.
 
     Attributes:
@@ -117,11 +117,11 @@ def with_pose(
     best = max(fit.aligned.correlation for _, fit in fits)
     near = [(way, fit) for way, fit in fits if fit.aligned.correlation > best - _ALIKE]
     way, fit = min(near, key=lambda item: item[1].turn)
-    _say(sequence, fits, way, fit)
+    _log_choice(sequence, fits, way, fit)
     return _posed(sequence, way, fit)
 
 
-def pose_rows(file: Path) -> list[PoseRows]:
+def pose_rows(file: Path) -> list[PoseCandidate]:
     """Return a file's poses in each possible interpretation; none if it holds no poses.
 
     Raises:
@@ -144,7 +144,7 @@ def pose_rows(file: Path) -> list[PoseRows]:
         good = np.abs(np.linalg.det(matrices[:, :, :3]) - 1.0) < NORM_TOLERANCE
         good &= np.isfinite(numbers[:, :12]).all(axis=1)
         return [
-            PoseRows(
+            PoseCandidate(
                 file, stamps[good], matrices[good, :, 3],
                 Rotation.from_matrix(matrices[good, :, :3]), "matrix",
             )
@@ -154,7 +154,7 @@ def pose_rows(file: Path) -> list[PoseRows]:
     good &= np.isfinite(numbers[:, :7]).all(axis=1)
     orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
     return [
-        PoseRows(
+        PoseCandidate(
             file, stamps[good], numbers[good, :3],
             Rotation.from_quat(quaternion[good][:, order]), name,
         )
@@ -178,11 +178,11 @@ class _Fit:
         return float(self.mount.magnitude())
 
 
-def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseRows) -> _Fit | None:
+def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseCandidate) -> _Fit | None:
     time, gyro, accel = clean_samples(sequence)
     order = np.argsort(way.stamps_ns, kind="stable")
     pose_time = seconds(way.stamps_ns[order], start_ns)
-    kept = advancing(pose_time)
+    kept = increasing_mask(pose_time)
     rows, pose_time = order[kept], pose_time[kept]
     attitude = way.attitude[rows]
     valid = np.ones(len(pose_time), dtype=np.bool_)
@@ -209,8 +209,8 @@ def _squared(mount: Rotation) -> Rotation:
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
 
 
-def _say(
-    sequence: ImuSequence, fits: list[tuple[PoseRows, _Fit]], way: PoseRows, fit: _Fit
+def _log_choice(
+    sequence: ImuSequence, fits: list[tuple[PoseCandidate, _Fit]], way: PoseCandidate, fit: _Fit
 ) -> None:
     _log.info(
         "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
@@ -224,7 +224,7 @@ def _say(
             )  # fmt: skip
 
 
-def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
+def _posed(sequence: ImuSequence, way: PoseCandidate, fit: _Fit) -> ImuSequence:
     aligned = fit.aligned
     attitude_PB = way.attitude[fit.rows] * fit.mount
     time = fit.time + aligned.lag
@@ -234,7 +234,7 @@ def _posed(sequence: ImuSequence, way: PoseRows, fit: _Fit) -> ImuSequence:
     pose = truth.at(np.unique(sequence.time[inside]))
     force = interpolated(pose.time, sequence.time, sequence.accel)
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
-    if np.linalg.norm(up) < LEAST_FORCE:
+    if np.linalg.norm(up) < MIN_GRAVITY_FORCE:
         _log.warning("%s: rejected %s: no gravity to level its poses", sequence.name, way.file.name)
         return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up

@@ -86,7 +86,7 @@ def head_lines(path: Path) -> list[str]:
     return _decoded(head[:end]).splitlines() + _decoded(head[end:].lstrip(b"\r\n")).splitlines()
 
 
-def magic(path: Path, count: int = 16) -> bytes:
+def first_bytes(path: Path, count: int = 16) -> bytes:
     """Return the first bytes of a file, empty if it does not exist; never raises."""
     try:
         with path.open("rb") as file:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, interpolated
-from stario.sequences.attitude.levelling import LEAST_FORCE
+from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import cumulative_rotations, tilt_aligning
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -141,7 +141,7 @@ def _level(
 ) -> tuple[Rotation, Rotation]:
     """Return the attitude in a world whose mean force points up, and the rotation to it."""
     up = attitude_WB[kept].apply(force_B[kept]).mean(axis=0)
-    if not np.linalg.norm(up) > LEAST_FORCE:
+    if not np.linalg.norm(up) > MIN_GRAVITY_FORCE:
         found = f"a mean force of {np.linalg.norm(up):.3g} m/s^2"
         raise InputError("accelerometer", found, "gravity, to level the truth with")
     leveling = tilt_aligning(up)

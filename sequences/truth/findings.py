@@ -30,7 +30,7 @@ def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
         "agreeing": fit.agreeing,
         "jumps": fit.jumps,
         "axes": fit.axes(),
-        "yaw": yaw and {"scale": yaw.scale, "bias_rad_s": yaw.bias, "left_rad": yaw.left},
+        "yaw": yaw and {"scale": yaw.scale, "bias_rad_s": yaw.bias, "left_rad": yaw.residual_rms},
     }
 
 
@@ -45,7 +45,8 @@ def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
     if yaw is not None:
         lines.append(
             f"  yaw: the gyroscope {_scale_words(yaw)} and drifts by "
-            f"{math.degrees(yaw.bias):+.3f} deg/s; residual {math.degrees(yaw.left):.1f} deg"
+            f"{math.degrees(yaw.bias):+.3f} deg/s; "
+            f"residual {math.degrees(yaw.residual_rms):.1f} deg"
         )
     return lines
 
@@ -57,7 +58,7 @@ def _scale_words(yaw: YawDrift) -> str:
 def fit_problems(name: str, fit: TruthFit, yaw: YawDrift | None, known: str) -> list[str]:
     """Return problems found by comparing truth and gyroscope, unless the text `known` has them."""
     field = f"{name}: truth"
-    if not fit.alike:
+    if not fit.consistent:
         return [
             f"{field}: its attitude and the gyroscope disagree (correlation {fit.correlation:.2f}, "
             f"{fit.agreeing:.0%} of the poses agree): clocks more than {MAX_OFFSET_S:.0f} s apart, "

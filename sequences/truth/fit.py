@@ -73,7 +73,7 @@ class TruthFit:
         return float(self.R_TB.magnitude())
 
     @property
-    def alike(self) -> bool:
+    def consistent(self) -> bool:
         """Whether both measured the same rotations, so that offset and axes are meaningful."""
         inside = abs(self.time_offset) < MAX_OFFSET_S - _EDGE_S
         return inside and self.correlation > _ALIKE and self.agreeing > _AGREEING
@@ -82,7 +82,7 @@ class TruthFit:
         """Return `--axes` to rotate the IMU to the truth's axes; None if none is needed or fits."""
         text = axes_named(self.R_TB.as_matrix())
         left = Rotation.from_matrix(axes_matrix(text)).inv() * self.R_TB
-        near = self.alike and left.magnitude() < _NEAR_RAD
+        near = self.consistent and left.magnitude() < _NEAR_RAD
         return text if near and text != SAME_AXES else None
 
 
@@ -94,7 +94,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     """
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
-    time, gyro, accel = clean_samples(middle(sequence))
+    time, gyro, accel = clean_samples(middle_part(sequence))
     truth = sequence.truth
     coarse = _coarse_offset(time, gyro, truth)
     truth = replace(truth, time=truth.time + coarse)
@@ -133,7 +133,7 @@ def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -
     return (upright - turned) / max(float(np.linalg.norm(force_B, axis=1).mean()), 1e-9)
 
 
-def middle(sequence: ImuSequence) -> ImuSequence:
+def middle_part(sequence: ImuSequence) -> ImuSequence:
     """Return the part of a recording that is used, at most `LONGEST_S` from its middle."""
     if sequence.duration <= LONGEST_S:
         return sequence

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.truth.fit import TruthFit, middle
+from stario.sequences.truth.fit import TruthFit, middle_part
 from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
@@ -39,7 +39,7 @@ class YawDrift:
 
     scale: float
     bias: float
-    left: float
+    residual_rms: float
 
 
 def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
@@ -56,7 +56,7 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
         InputError: as for `clean_samples`.
     """
     assert sequence.truth is not None  # a fit of it exists
-    time, gyro, accel = clean_samples(middle(sequence))
+    time, gyro, accel = clean_samples(middle_part(sequence))
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
     part = slice(start, stop)
@@ -78,6 +78,6 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
         return None
     columns = np.column_stack([even, yaw])
     fitted, *_ = np.linalg.lstsq(columns, off, rcond=None)
-    left = math.sqrt(float(np.square(off - columns @ fitted).mean()))
+    residual_rms = math.sqrt(float(np.square(off - columns @ fitted).mean()))
     _, rate, share = fitted.tolist()
-    return YawDrift(-share / (1.0 + share), -rate, left)
+    return YawDrift(-share / (1.0 + share), -rate, residual_rms)

@@ -16,7 +16,7 @@ from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.windows import WINDOW_SECONDS, turned_windows
+from stario.sequences.windows import WINDOW_SECONDS, rotated_windows
 
 
 class Oracle:
@@ -47,7 +47,7 @@ class Oracle:
         displacement += noise * rng.standard_normal(displacement.shape)
         heading = np.array([e.heading for e in known])
         displacement = about_z(-heading).apply(displacement)
-        seen = turned_windows(np.stack([e.window for e in known]), -heading)
+        seen = rotated_windows(np.stack([e.window for e in known]), -heading)
         keys = [window.tobytes() for window in seen]
         self._known = dict(zip(keys, displacement, strict=True))
         self._covariance = sigma**2 * np.eye(3)

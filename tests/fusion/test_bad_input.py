@@ -195,7 +195,7 @@ def test_a_stream_in_degrees_is_refused_once_the_device_turns(
     navigator, expected = Navigator(still_model), Navigator(still_model)
     for row in zip(right.time[:300], right.gyro[:300], right.accel[:300], strict=True):
         navigator.push(*row)
-    with pytest.raises(InputError, match=r"gyro: found turns .*, expected rad/s; .*deg/s"):
+    with pytest.raises(InputError, match=r"gyro: found rotations .*, expected rad/s; .*deg/s"):
         stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
     assert navigator.state is None
     # The stream has begun anew, and in rad/s it is never refused.

@@ -14,8 +14,8 @@ from stario.network.known_motion import (
     OUTSIDE_VARIANCE,
     KnownMotion,
     features,
-    known_from,
     known_motion,
+    known_motion_from_dict,
     step_rates,
 )
 from stario.network.model import DisplacementModel, load_model
@@ -58,14 +58,14 @@ def test_a_short_walk_knows_its_own_gait_and_a_scrap_nothing() -> None:
     walk = walked(0, seconds=140.0)
     known = known_of(walk.part(0, 70 * 200))
     assert len(known.centres) == 3
-    assert np.mean(known.strangeness(windows(walk.part(70 * 200, len(walk)))) > 1.0) < 0.2
-    assert np.mean(known.strangeness(windows(walked(1, size=4.0))) > 1.0) > 0.9
+    assert np.mean(known.novelty(windows(walk.part(70 * 200, len(walk)))) > 1.0) < 0.2
+    assert np.mean(known.novelty(windows(walked(1, size=4.0))) > 1.0) > 0.9
     assert known_motion([walk.part(0, 50 * 200)]) is None
 
 
 def test_of_familiar_motion_about_one_window_in_twenty_lies_outside(known: KnownMotion) -> None:
-    strangeness = known.strangeness(windows(walked(99, rate=1.8)))
-    assert np.mean(strangeness > 1.0) < 0.25
+    novelty = known.novelty(windows(walked(99, rate=1.8)))
+    assert np.mean(novelty > 1.0) < 0.25
     assert known.variance_factor(windows(walked(99))).mean() < 1.2
 
 
@@ -74,7 +74,7 @@ def test_another_gait_lies_outside_and_widens_the_variance(
     known: KnownMotion, other: dict[str, float]
 ) -> None:
     strange = windows(walked(1, **other))
-    assert np.mean(known.strangeness(strange) > 1.0) > 0.9
+    assert np.mean(known.novelty(strange) > 1.0) > 0.9
     factors = known.variance_factor(strange)
     assert factors.mean() > 0.75 * OUTSIDE_VARIANCE
     assert factors.max() <= OUTSIDE_VARIANCE
@@ -86,7 +86,7 @@ def test_what_is_known_does_not_depend_on_the_windows_yaw(known: KnownMotion) ->
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     turned = np.concatenate([turn @ ours[:, :3], turn @ ours[:, 3:]], axis=1)
     np.testing.assert_allclose(features(turned), features(ours), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(known.strangeness(turned), known.strangeness(ours), rtol=1e-3)
+    np.testing.assert_allclose(known.novelty(turned), known.novelty(ours), rtol=1e-3)
 
 
 @pytest.mark.parametrize("rate", [1.5, 2.3])
@@ -113,7 +113,7 @@ def test_it_travels_on_the_card(known: KnownMotion) -> None:
     with pytest.raises(WeightsError, match="known_motion"):
         parse_card(json.dumps(content), Path("a.json"))
     with pytest.raises(KeyError):
-        known_from({})
+        known_motion_from_dict({})
 
 
 def test_a_model_says_less_of_motion_that_it_does_not_know(known: KnownMotion) -> None:

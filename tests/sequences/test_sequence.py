@@ -8,8 +8,8 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     Trajectory,
-    second_ticks,
-    too_slow,
+    low_rate_message,
+    whole_seconds,
 )
 
 
@@ -82,8 +82,8 @@ def test_truth_at_the_slowest_rate_is_whole_whatever_rounding_does(start: float)
     """0.3 - 0.2 > 0.1 in floating point."""
     track = screw(start + np.round(np.arange(201) * 0.1, 1))
     assert track.covers(start + np.linspace(0.05, 19.95, 400)).all()
-    assert not too_slow(track)
-    assert "at 5 Hz; at least 10 Hz are needed" in too_slow(screw(track.time[::2]))
+    assert not low_rate_message(track)
+    assert "at 5 Hz; at least 10 Hz are needed" in low_rate_message(screw(track.time[::2]))
 
 
 def test_gaps_are_not_bridged_at_times_since_1970() -> None:
@@ -122,7 +122,7 @@ def test_a_clock_that_jumps_by_decades_costs_no_memory() -> None:
     position = np.outer(np.append(0.0, np.arange(1001) / 100.0), [1.0, 0.0, 0.0])
     track = Trajectory(time, position, Rotation.identity(len(time)))
     assert track.path_length() == pytest.approx(10.0)
-    assert len(second_ticks(time)) < 20
+    assert len(whole_seconds(time)) < 20
 
 
 def test_a_trajectory_is_checked_at_the_edge() -> None:

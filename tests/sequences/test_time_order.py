@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stario.sequences.sequence import FloatArray
-from stario.sequences.time_order import CONFIRMED_FAR, advancing
+from stario.sequences.time_order import CONFIRMED_FAR, increasing_mask
 
 TIME = np.arange(400) / 100.0
 
@@ -16,7 +16,7 @@ def moved(rows: slice, by: float) -> FloatArray:
 
 
 def left_out(time: FloatArray) -> list[int]:
-    counts = advancing(time)
+    counts = increasing_mask(time)
     assert (np.diff(time[counts]) > 0.0).all()
     return np.flatnonzero(~counts).tolist()
 
@@ -24,7 +24,7 @@ def left_out(time: FloatArray) -> list[int]:
 def test_times_in_order_all_count_whatever_the_gaps() -> None:
     gaps = np.concatenate([TIME[:100], 5.0 + TIME[:1], 1e9 + TIME])
     assert left_out(TIME) == left_out(gaps) == []
-    assert advancing(np.empty(0)).tolist() == []
+    assert increasing_mask(np.empty(0)).tolist() == []
 
 
 def test_repeated_and_late_times_do_not_count() -> None:

@@ -19,7 +19,7 @@ from stario.sequences.windows import (
     imu_in_world,
     mean_heading,
     resample,
-    turned_windows,
+    rotated_windows,
     world_streams,
 )
 
@@ -153,11 +153,11 @@ def test_turning_the_world_turns_window_and_target_alike(walk: ImuSequence) -> N
     )
     (stream,), (other,) = world_streams(walk), world_streams(turned)
     windows, targets = windows_of(stream, 100)
-    turned_windows, turned_targets = windows_of(other, 100)
+    rotated_windows, turned_targets = windows_of(other, 100)
     assert np.abs(turn.apply(targets) - turned_targets).max() < 1e-5
     for k in (slice(0, 3), slice(3, 6)):
         rows = turn.apply(windows[:, k].transpose(0, 2, 1).reshape(-1, 3))
-        assert np.abs(rows - turned_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
+        assert np.abs(rows - rotated_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
 
 
 def test_a_truth_that_is_mounted_askew_does_not_show_in_levelled_windows() -> None:
@@ -278,7 +278,7 @@ def test_turning_a_window_turns_its_vectors() -> None:
     rng = np.random.default_rng(0)
     windows = rng.normal(size=(3, 6, 200)).astype(np.float32)
     yaw = np.array([0.3, -1.0, 2.0])
-    turned = turned_windows(windows, yaw)
+    turned = rotated_windows(windows, yaw)
     for window, result, angle in zip(windows, turned, yaw, strict=True):
         R = Rotation.from_rotvec([0.0, 0.0, angle])
         np.testing.assert_allclose(result[:3].T, R.apply(window[:3].T), atol=1e-6)

@@ -10,7 +10,7 @@ from time import process_time
 import numpy as np
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.checks.faults import Silent, with_true_displacements
+from stario.fusion.evaluation.checks.faults import DummyPredictor, with_true_displacements
 from stario.fusion.filter.innovations import stacked
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
@@ -75,7 +75,7 @@ def score_walk(seed: int, seconds: float) -> Score:
     config = NavigatorConfig(noise=errors.noise, filter=known)
     walk = generate_walk(seed, seconds)
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
-    preprocessed = Navigator(Silent(), config).observe(sequence)
+    preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
     preprocessed = with_true_displacements(preprocessed, walk, config, seed, DISPLACEMENT_NOISE)
     return _scored(sequence.name, preprocessed, walk, config)
 
@@ -147,7 +147,7 @@ def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _scored(
     name: str, preprocessed: PreprocessedRecording, truth: Trajectory, config: NavigatorConfig
 ) -> Score:
-    model = Silent()
+    model = DummyPredictor()
     tracks: dict[str, Track] = {}
     seconds: dict[str, float] = {}
     began = process_time()

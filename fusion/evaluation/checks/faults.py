@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.checks.spoiling import Corrupt, Fault, faults
+from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
@@ -139,17 +139,17 @@ def _run(
     backend: BackendName,
 ) -> Track:
     rng = np.random.default_rng(seed)
-    spoilt = sequence if fault.spoil is None else fault.spoil(sequence, rng)
-    navigator = Navigator(model or Silent(), config, backend=backend)
+    spoilt = sequence if fault.modify_samples is None else fault.modify_samples(sequence, rng)
+    navigator = Navigator(model or DummyPredictor(), config, backend=backend)
     preprocessed = navigator.observe(spoilt)
     if model is None and sequence.truth is not None:
         preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
-    if fault.corrupt is not None:
-        preprocessed = _corrupted(preprocessed, fault.corrupt, rng)
+    if fault.modify_predictions is not None:
+        preprocessed = _corrupted(preprocessed, fault.modify_predictions, rng)
     return navigator.track(preprocessed)
 
 
-class Silent:
+class DummyPredictor:
     """Placeholder for a network."""
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -195,7 +195,9 @@ def with_true_displacements(
 
 
 def _corrupted(
-    preprocessed: PreprocessedRecording, corrupt: Corrupt, rng: np.random.Generator
+    preprocessed: PreprocessedRecording,
+    modify: ModifyPredictions,
+    rng: np.random.Generator,
 ) -> PreprocessedRecording:
     """Apply a fault to all measurements at once."""
     known = [
@@ -203,7 +205,7 @@ def _corrupted(
     ]
     pairs = [measurement for measurement in preprocessed.measurements if measurement is not None]
     mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
-    corrupt((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
+    modify((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
     measurements = list(preprocessed.measurements)
     for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
         measurements[k] = (d_N, cov_N)

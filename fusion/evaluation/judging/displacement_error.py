@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
-from stario.fusion.evaluation.judging.network_alone import Answers
+from stario.fusion.evaluation.judging.network_alone import Predictions
 from stario.fusion.evaluation.judging.prepared import Kind, Prepared, PreparedPiece
 from stario.sequences.levelled_stream import TICK_SECONDS
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -112,7 +112,7 @@ class _Sums:
         self.blocks.setdefault(measure, []).append(sums[sums[:, 1] > 0])
 
 
-def recording_errors(prepared: Prepared, found: Sequence[Answers]) -> RecordingErrors:
+def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> RecordingErrors:
     """Compute the errors of a network's predictions on a recording.
 
     Args:
@@ -141,7 +141,7 @@ def recording_errors(prepared: Prepared, found: Sequence[Answers]) -> RecordingE
     return RecordingErrors(prepared.name, prepared.kind, sums.path, figures, blocks)
 
 
-def _poses(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+def _poses(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, answer)
     turn = np.exp(1j * piece.yaw_WN[: len(track)])
     known = np.isfinite(truth)
@@ -165,7 +165,7 @@ def _poses(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
     _nis(answer, start, np.conj(turn[start]) * true, sums)
 
 
-def _positions(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+def _positions(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, answer)
     _lengths(track, truth, breaks, sums)
     for horizon in HORIZONS:
@@ -182,7 +182,7 @@ def _positions(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
     _stretches(track, truth, breaks, sums)
 
 
-def _waypoints(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
+def _waypoints(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
     track = answer.track()[: len(piece.position_W)]
     ticks = piece.stream.ticks[: len(track)]
     inside = piece.waypoint_time <= ticks[-1]
@@ -200,7 +200,7 @@ def _waypoints(piece: PreparedPiece, answer: Answers, sums: _Sums) -> None:
     sums.blocks.setdefault("10", []).append(rows[rows[:, 1] > 0])
 
 
-def _at_ticks(piece: PreparedPiece, answer: Answers) -> tuple[Complex, Complex, np.ndarray]:
+def _at_ticks(piece: PreparedPiece, answer: Predictions) -> tuple[Complex, Complex, np.ndarray]:
     """Return track, truth and its breaks at the ticks common to all."""
     track = answer.track()
     count = min(len(track), len(piece.position_W))
@@ -269,7 +269,7 @@ def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) 
         sums.add("stretch", errors / path)
 
 
-def _nis(answer: Answers, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
+def _nis(answer: Predictions, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
     """Add the NIS of the horizontal error, scaled from two axes to three."""
     error = _windows_xy(answer)[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
@@ -278,7 +278,7 @@ def _nis(answer: Answers, start: np.ndarray, true_N: Complex, sums: _Sums) -> No
     sums.add("nis", np.sqrt(1.5 * nis))
 
 
-def _windows_xy(answer: Answers) -> Complex:
+def _windows_xy(answer: Predictions) -> Complex:
     return np.asarray(answer.displacement_N[:, 0] + 1j * answer.displacement_N[:, 1])
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.fusion.evaluation.judging.judge import Row
-from stario.sequences.drawing.figures import dress
+from stario.sequences.drawing.figures import apply_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +63,7 @@ def _medians(
         axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
                       ha="center", fontsize=8, color=_AFTER)  # fmt: skip
     axes.margins(x=0.12)
-    dress(axes)
+    apply_style(axes)
 
 
 def _ratios(axes: Axes, rows: Sequence[Row]) -> None:
@@ -81,7 +81,7 @@ def _ratios(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_xticks([], minor=True)
     title = "error over 10 s, after / before, 95 % interval\n(waypoints: residuals)"
     axes.set_title(title, loc="left", fontsize=10)
-    dress(axes)
+    apply_style(axes)
 
 
 def _first(row: Row, weights: str, keys: tuple[str, ...]) -> float:

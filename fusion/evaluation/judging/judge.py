@@ -20,7 +20,7 @@ from stario.fusion.evaluation.judging.displacement_error import (
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.judging.network_alone import Answering, answers
+from stario.fusion.evaluation.judging.network_alone import RecordingPredictor, predictions
 from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -36,7 +36,7 @@ POOLED = "all"
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class RecordingResult:
     """Errors of one recording for every set of weights.
 
     Attributes:
@@ -85,11 +85,11 @@ def check_by(name: str) -> By:
 
 def judge(
     recordings: Iterable[Prepared | Skipped],
-    models: Mapping[str, Callable[[str], Predictor | Answering]],
+    models: Mapping[str, Callable[[str], Predictor | RecordingPredictor]],
     groups: Mapping[Path, str],
     read: Callable[[Path], ImuSequence] | None = None,
     progress: Callable[[int], None] = lambda done: None,
-) -> tuple[list[Judged], list[Skipped]]:
+) -> tuple[list[RecordingResult], list[Skipped]]:
     """Run every recording through every network.
 
     Args:
@@ -100,7 +100,7 @@ def judge(
         read: function that reads a path; if given, the EKF is run for its mean NIS, which is slow.
         progress: called with the number of recordings done.
     """
-    judged: list[Judged] = []
+    judged: list[RecordingResult] = []
     skipped: list[Skipped] = []
     for done, prepared in enumerate(recordings, 1):
         if isinstance(prepared, Skipped):
@@ -111,25 +111,25 @@ def judge(
                 name: _errors(model(named["group"]), prepared, read)
                 for name, model in models.items()
             }
-            judged.append(Judged(prepared.path, named, errors))
+            judged.append(RecordingResult(prepared.path, named, errors))
         progress(done)
     return judged, skipped
 
 
 def _errors(
-    model: Predictor | Answering,
+    model: Predictor | RecordingPredictor,
     prepared: Prepared,
     read: Callable[[Path], ImuSequence] | None,
 ) -> RecordingErrors:
-    found = recording_errors(prepared, answers(model, prepared))
-    if read is None or isinstance(model, Answering):
+    found = recording_errors(prepared, predictions(model, prepared))
+    if read is None or isinstance(model, RecordingPredictor):
         return found
     health = Navigator(model).run(read(prepared.path)).health
     nis = float("nan") if health is None else health.mean_nis
     return replace(found, figures=found.figures | {"nis_ekf": nis})
 
 
-def rows_of(judged: Sequence[Judged], by: By, ours: str, theirs: str | None) -> list[Row]:
+def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | None) -> list[Row]:
     """Return a row for each group, sorted, and one over all if there are several.
 
     Args:
@@ -146,7 +146,7 @@ def rows_of(judged: Sequence[Judged], by: By, ours: str, theirs: str | None) -> 
     return rows
 
 
-def _row(name: str, part: Sequence[Judged], ours: str, theirs: str | None) -> Row:
+def _row(name: str, part: Sequence[RecordingResult], ours: str, theirs: str | None) -> Row:
     weights = [ours] if theirs is None else [ours, theirs]
     medians = {
         one: {figure: _median([j.errors[one].figures[figure] for j in part]) for figure in FIGURES}
@@ -163,7 +163,7 @@ def _row(name: str, part: Sequence[Judged], ours: str, theirs: str | None) -> Ro
 
 
 def _strata(
-    part: Sequence[Judged], measure: str, ours: str, theirs: str
+    part: Sequence[RecordingResult], measure: str, ours: str, theirs: str
 ) -> dict[str, dict[str, list[Blocks]]]:
     strata: dict[str, dict[str, list[Blocks]]] = {}
     for one in part:

@@ -24,7 +24,7 @@ _BATCH = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
+class Predictions:
     """Predictions of a network for the M windows of a piece.
 
     Attributes:
@@ -47,27 +47,27 @@ class Answers:
 
 
 @runtime_checkable
-class Answering(Protocol):
+class RecordingPredictor(Protocol):
     """Predictor of a whole recording that needs no network."""
 
-    def answers(self, prepared: Prepared) -> list[Answers]:
+    def predictions(self, prepared: Prepared) -> list[Predictions]:
         """Return predictions for every piece, in frame N."""
         ...
 
 
-def answers(model: Predictor | Answering, prepared: Prepared) -> list[Answers]:
+def predictions(model: Predictor | RecordingPredictor, prepared: Prepared) -> list[Predictions]:
     """Return a network's predictions for every piece of a recording, in frame N.
 
     Args:
         model: network, its memory reset at every piece; or another predictor.
         prepared: the recording.
     """
-    if isinstance(model, Answering):
-        return model.answers(prepared)
-    return [along(model, piece.stream) for piece in prepared.pieces]
+    if isinstance(model, RecordingPredictor):
+        return model.predictions(prepared)
+    return [predict_stream(model, piece.stream) for piece in prepared.pieces]
 
 
-def along(model: Predictor, stream: LevelledStream) -> Answers:
+def predict_stream(model: Predictor, stream: LevelledStream) -> Predictions:
     """Return a network's predictions along an unbroken stretch, in frame N."""
     network = StatefulInference(model, UPDATES)
     windows, heading = stream.windows(), stream.headings
@@ -76,4 +76,4 @@ def along(model: Predictor, stream: LevelledStream) -> Answers:
         for first in range(0, len(windows), _BATCH)
     ]
     displacement, covariance = zip(*parts, strict=True)
-    return Answers(np.concatenate(displacement), np.concatenate(covariance))
+    return Predictions(np.concatenate(displacement), np.concatenate(covariance))

@@ -26,7 +26,7 @@ from stario.sequences.datasets.stream_cache import recording_key
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.legs import broken_steps
+from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.sequence import (
     BoolArray,
@@ -166,7 +166,7 @@ def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
 
 def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
     time, position_W = track.time[track.valid], track.position_W[track.valid]
-    return _with_known(stream, time, position_W, broken_steps(time, position_W))
+    return _with_known(stream, time, position_W, gaps_and_jumps(time, position_W))
 
 
 def _with_known(

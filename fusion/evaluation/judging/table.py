@@ -9,7 +9,7 @@ from pathlib import Path
 from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.judging.displacement_error import FIGURES
 from stario.fusion.evaluation.judging.figure import groups_figure
-from stario.fusion.evaluation.judging.judge import Judged, Row
+from stario.fusion.evaluation.judging.judge import RecordingResult, Row
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.files import write_json, write_rows
@@ -42,7 +42,7 @@ WORDS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class JudgingResult:
     """Result of judging a set of weights.
 
     Attributes:
@@ -55,10 +55,10 @@ class Judgement:
     ours: str
     theirs: str | None
     rows: list[Row]
-    judged: list[Judged]
+    judged: list[RecordingResult]
 
 
-def judgement_text(found: Judgement) -> str:
+def judgement_text(found: JudgingResult) -> str:
     """Return the table as text: theirs, ours and the ratio below each other for every group."""
     known = {"theirs": found.theirs, "ours": found.ours}
     labels = {label: name for label, name in known.items() if name is not None}
@@ -104,7 +104,7 @@ def verdict(rows: Sequence[Row]) -> str:
     return f"{'accepted' if taken else 'not accepted'}: {words}"
 
 
-def judgement_dict(found: Judgement) -> dict[str, object]:
+def judgement_dict(found: JudgingResult) -> dict[str, object]:
     """Return the result as plain values, including the recordings."""
     return {
         "ours": found.ours,
@@ -116,7 +116,7 @@ def judgement_dict(found: Judgement) -> dict[str, object]:
     }
 
 
-def write_judgement(folder: Path, found: Judgement) -> list[Path]:
+def write_judgement(folder: Path, found: JudgingResult) -> list[Path]:
     """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
     rows = [
         {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
@@ -139,7 +139,7 @@ def write_judgement(folder: Path, found: Judgement) -> list[Path]:
     return [*written, folder / "groups.png"]
 
 
-def _recording(one: Judged) -> dict[str, object]:
+def _recording(one: RecordingResult) -> dict[str, object]:
     figures = {name: errors.figures for name, errors in one.errors.items()}
     kind, path_m = next((e.kind, e.path_m) for e in one.errors.values())
     return {"recording": str(one.path), **one.labels, "truth": kind, "path_m": path_m} | {

@@ -10,13 +10,13 @@ from __future__ import annotations
 import importlib.resources
 from pathlib import Path
 
-from stario.sequences.datasets.splits import Listed, read_list
+from stario.sequences.datasets.splits import ListEntry, read_list
 from stario.sequences.errors import InputError
 
 NAMES = ("test", "validation", "training", "holdout", "all", "open")
 
 
-def listed(name: str, data: Path) -> list[Listed]:
+def read_packaged_list(name: str, data: Path) -> list[ListEntry]:
     """Return the recordings of a packaged list or of a list file.
 
     Args:
@@ -35,5 +35,5 @@ def listed(name: str, data: Path) -> list[Listed]:
 
 
 def split_paths(data: Path, split: str) -> list[Path]:
-    """Return the paths of the recordings of a list; arguments and errors as for `listed`."""
-    return [one.path for one in listed(split, data)]
+    """Return the paths of the recordings of a list; arguments and errors as for `read_packaged_list`."""
+    return [one.path for one in read_packaged_list(split, data)]

@@ -17,7 +17,7 @@ from stario.sequences.readers.phones.files import PhoneFiles
 from stario.sequences.readers.phones.sensor_table import Samples, read_quaternion
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 _ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
 """Possible places of x, y, z and w in rows without a header."""
@@ -56,7 +56,9 @@ def agreeing_attitude(
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]
-    kept = advancing(stamps.astype(np.float64)) if len(stamps) else np.empty(0, dtype=np.int64)
+    kept = (
+        increasing_mask(stamps.astype(np.float64)) if len(stamps) else np.empty(0, dtype=np.int64)
+    )
     if len(kept) < 2:
         return None
     stamps, quaternion = stamps[kept], quaternion[kept]

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer
-from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.phones.attitude import agreeing_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
 from stario.sequences.readers.text import IntArray, head_lines, read_lines, seconds
@@ -33,7 +33,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     PositionTrack,
 )
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def read_event_lines(path: Path) -> ImuSequence:
         if name not in sensors:
             seen = ", ".join(sensors) or "no sensor"
             raise ReadError(path, "events", f"those of {seen}", "those of gyro and accel")
-    stamps, gyro, accel = on_one_clock(path, *sensors["gyro"], *sensors["accel"])
+    stamps, gyro, accel = resample_to_gyro(path, *sensors["gyro"], *sensors["accel"])
     field = sensors.get("mag")
     attitude = _attitude(sensors)
     return ImuSequence(
@@ -115,7 +115,7 @@ def _attitude(sensors: dict[str, Rows]) -> tuple[IntArray, Rotation] | None:
 def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
     order = np.argsort(points[0], kind="stable")
     time = seconds(points[0][order], start_ns)
-    keep = advancing(time)
+    keep = increasing_mask(time)
     return PositionTrack(time[keep], points[1][order][keep], "waypoints") if keep.any() else None
 
 

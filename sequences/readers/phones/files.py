@@ -55,14 +55,14 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
         group.tables.setdefault(sensor, []).append(table)
-    whole = [group for group in groups.values() if _is_whole(group)]
+    whole = [group for group in groups.values() if _is_complete(group)]
     if whole:
         return whole
-    lone = _united(list(groups.values()))
-    return [lone] if _is_whole(lone) else []
+    lone = _merged_groups(list(groups.values()))
+    return [lone] if _is_complete(lone) else []
 
 
-def lone_sensors(path: Path) -> list[Sensor]:
+def incomplete_sensors(path: Path) -> list[Sensor]:
     """Return the sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
 
     Empty if it holds both, or no sensor at all.
@@ -98,11 +98,11 @@ def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
     return is_uncalibrated(words), "total" not in words, not calibrated, file
 
 
-def _is_whole(group: PhoneFiles) -> bool:
+def _is_complete(group: PhoneFiles) -> bool:
     return "gyro" in group.tables and any(sensor in group.tables for sensor in _NEEDED)
 
 
-def _united(groups: list[PhoneFiles]) -> PhoneFiles:
+def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
     """Merge groups into one recording, which is empty if a sensor occurs in several of them."""
     lone = PhoneFiles("")
     for group in groups:

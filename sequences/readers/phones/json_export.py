@@ -31,7 +31,7 @@ def is_json_export(path: Path) -> bool:
 
 
 @contextmanager
-def laid_out(path: Path) -> Iterator[Path]:
+def unpack_json(path: Path) -> Iterator[Path]:
     """Write a file for each sensor into a temporary folder, which is deleted after the block.
 
     Raises:

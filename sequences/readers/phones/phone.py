@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import on_one_clock
-from stario.sequences.readers.own_csv import is_own_csv
+from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.generic_csv import is_generic_csv
 from stario.sequences.readers.phones.apps import app_of
 from stario.sequences.readers.phones.attitude import logged_attitude
 from stario.sequences.readers.phones.files import SUFFIXES, PhoneFiles, phone_recordings
@@ -73,7 +73,7 @@ def read_phone(path: Path) -> ImuSequence:
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
     name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
-    return assembled(folder, name, files, pose_files(folder, files.key))
+    return assemble_recording(folder, name, files, pose_files(folder, files.key))
 
 
 def read_wide(path: Path) -> ImuSequence:
@@ -88,7 +88,7 @@ def read_wide(path: Path) -> ImuSequence:
         found = repr(lines[0].strip()[:60]) if lines else "no lines"
         expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
-    return assembled(path.parent, path.stem, files, _wide_poses(path, files))
+    return assemble_recording(path.parent, path.stem, files, _wide_poses(path, files))
 
 
 def is_wide(path: Path) -> bool:
@@ -103,7 +103,7 @@ def is_wide(path: Path) -> bool:
         return False
     axes = files.tables["gyro"][0].axes
     more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx and ax
-    return not is_own_csv(path) or bool(_wide_poses(path, files)) or more
+    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or more
 
 
 def _wide(path: Path) -> PhoneFiles | None:
@@ -124,7 +124,7 @@ def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
     return pose_files(path.parent, files.key) if "imu" in words_of(path.stem) else []
 
 
-def assembled(
+def assemble_recording(
     folder: Path,
     name: str,
     files: PhoneFiles,
@@ -148,7 +148,7 @@ def assembled(
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted = _force(files, gyro, attitude, core_motion)
-    stamps, rate, force = on_one_clock(
+    stamps, rate, force = resample_to_gyro(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
     if gyro.unit not in ("", "rad/s"):
@@ -223,7 +223,7 @@ def _force(
     apart = whole is None and gravity is not None
     if apart and gravity is not None:
         folder = gyro_folder(files)
-        stamps, force, gravity_B = on_one_clock(
+        stamps, force, gravity_B = resample_to_gyro(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)

@@ -11,7 +11,7 @@ from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
 from stario.sequences.readers.text import head_lines, read_table, seconds
 from stario.sequences.sequence import PositionTrack
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS
 
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
@@ -55,6 +55,6 @@ def reference_points(
         if not fitting[unit]:
             raise ReadError(file, "time", "other times", "times of the recording")
         time = seconds(table.stamps_ns(0, unit), start_ns)
-        kept = advancing(time)
+        kept = increasing_mask(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
     return None

@@ -31,7 +31,7 @@ _SAME_PACE = 0.02
 
 
 @dataclass(frozen=True)
-class Place:
+class ColumnRef:
     """A column: its index, its title and the unit named in the title."""
 
     index: int
@@ -51,13 +51,13 @@ class Layout:
         clocks: a sensor's own clock, by the key of its axes, if one precedes them.
     """
 
-    clock: Place
-    axes: dict[str, tuple[Place, Place, Place]]
-    quaternion: tuple[Place, ...] = ()
-    biases: tuple[Place, ...] = ()
-    clocks: dict[str, Place] = field(default_factory=dict)
+    clock: ColumnRef
+    axes: dict[str, tuple[ColumnRef, ColumnRef, ColumnRef]]
+    quaternion: tuple[ColumnRef, ...] = ()
+    biases: tuple[ColumnRef, ...] = ()
+    clocks: dict[str, ColumnRef] = field(default_factory=dict)
 
-    def clock_of(self, axes: str) -> Place:
+    def clock_of(self, axes: str) -> ColumnRef:
         """Return the clock of the sensor with these axes."""
         return self.clocks.get(axes, self.clock)
 
@@ -69,25 +69,25 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
         titles: the header's cells.
         head: (N, K) first rows; NaN where a cell is not a number.
     """
-    groups: dict[tuple[str, ...], dict[str, Place]] = {}
-    quaternion: dict[str, Place] = {}
-    biases: dict[str, Place] = {}
+    groups: dict[tuple[str, ...], dict[str, ColumnRef]] = {}
+    quaternion: dict[str, ColumnRef] = {}
+    biases: dict[str, ColumnRef] = {}
     for k, title in enumerate(titles):
         part, axis, bias = quaternion_of(title), axis_of(title), bias_axis_of(title)
         if part is not None:
-            quaternion.setdefault(part, Place(k, title))
+            quaternion.setdefault(part, ColumnRef(k, title))
         elif axis is not None and not is_time(title):
-            place = Place(k, title, unit_of(title))
+            place = ColumnRef(k, title, unit_of(title))
             groups.setdefault(axis[1], {}).setdefault(axis[0], place)
         elif bias is not None:
-            biases.setdefault(bias, Place(k, title))
-    axes: dict[str, tuple[Place, Place, Place]] = {}
+            biases.setdefault(bias, ColumnRef(k, title))
+    axes: dict[str, tuple[ColumnRef, ColumnRef, ColumnRef]] = {}
     for words in sorted(groups, key=_preference):
         sensor = sensor_of(words)
         if set(groups[words]) == set("xyz") and sensor != "attitude":
             x, y, z = (groups[words][axis] for axis in "xyz")
             if "gf" in words and not x.unit:
-                x = Place(x.index, x.title, "g")
+                x = ColumnRef(x.index, x.title, "g")
             axes.setdefault(sensor or "", (x, y, z))
     attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
     clocks = _clocks(titles, head)
@@ -109,17 +109,17 @@ def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
     return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)
 
 
-def _clocks(titles: list[str], head: FloatArray) -> list[Place]:
+def _clocks(titles: list[str], head: FloatArray) -> list[ColumnRef]:
     return [
-        Place(k, title, time_unit_of(title))
+        ColumnRef(k, title, time_unit_of(title))
         for k, title in enumerate(titles)
         if is_time(title) and _grows(head[:, k])
     ]
 
 
-def _run_before(clocks: list[Place], column: int) -> list[Place]:
+def _run_before(clocks: list[ColumnRef], column: int) -> list[ColumnRef]:
     """Return the adjacent clocks that most closely precede a column."""
-    run: list[Place] = []
+    run: list[ColumnRef] = []
     for clock in reversed(clocks):
         if clock.index < (run[-1].index if run else column):
             if run and clock.index < run[-1].index - 1:
@@ -128,11 +128,11 @@ def _run_before(clocks: list[Place], column: int) -> list[Place]:
     return run[::-1]
 
 
-def _finest(clocks: list[Place], head: FloatArray) -> Place:
+def _finest(clocks: list[ColumnRef], head: FloatArray) -> ColumnRef:
     """Return the best clock: a sensor's own rather than the app's, then the finer unit."""
     order = {"ns": 0, "us": 1, "": 2, "s": 3, "ms": 4}
 
-    def rank(place: Place) -> tuple[bool, int]:
+    def rank(place: ColumnRef) -> tuple[bool, int]:
         own = "sensor" in place.title.lower()
         large = not place.unit and head[0, place.index] > 1e15
         return not own, 0 if large else order.get(place.unit, 2)
@@ -159,13 +159,17 @@ def by_rows(head: FloatArray) -> Layout | None:
             start += 1
         if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
             continue
-        x, y, z = (Place(start + k) for k in range(3))
+        x, y, z = (ColumnRef(start + k) for k in range(3))
         rest = width - start
-        quaternion = tuple(Place(start + k) for k in range(4)) if start and rest >= 4 else ()
-        biases: tuple[Place, ...] = ()
+        quaternion = tuple(ColumnRef(start + k) for k in range(4)) if start and rest >= 4 else ()
+        biases: tuple[ColumnRef, ...] = ()
         if rest == 6 and start and not np.ptp(head[:, start + 3 :], axis=0).any():
-            biases = tuple(Place(start + 3 + k) for k in range(3))
-        clock = Place(start - 1) if start > 1 and head[0, start - 1] <= _CLOCK_FROM else Place(time)
+            biases = tuple(ColumnRef(start + 3 + k) for k in range(3))
+        clock = (
+            ColumnRef(start - 1)
+            if start > 1 and head[0, start - 1] <= _CLOCK_FROM
+            else ColumnRef(time)
+        )
         return Layout(clock=clock, axes={"": (x, y, z)}, quaternion=quaternion, biases=biases)
     return None
 

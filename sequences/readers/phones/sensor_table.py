@@ -15,7 +15,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.phones.sensor_layout import Layout, Place, by_header, by_rows
+from stario.sequences.readers.phones.sensor_layout import ColumnRef, Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
@@ -121,7 +121,7 @@ def read_samples(
     return Samples(stamps, values[kept], unit)
 
 
-def _rows(table: SensorTable, used: Sequence[Place]) -> Table:
+def _rows(table: SensorTable, used: Sequence[ColumnRef]) -> Table:
     """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
     columns = max(indices) + 1

@@ -44,7 +44,7 @@ def accel_sign(
     files: PhoneFiles,
     accel: Samples,
     attitude: tuple[IntArray, Rotation] | None,
-    gravity_apart: bool = False,
+    gravity_in_own_file: bool = False,
 ) -> float:
     """Return 1.0, or -1.0 if the accelerometer has Apple's sign.
 
@@ -52,7 +52,7 @@ def accel_sign(
         files: files of the recording.
         accel: samples of its accelerometer.
         attitude: the phone's own attitude, as `logged_attitude` returns it.
-        gravity_apart: whether gravity was added from a separate file.
+        gravity_in_own_file: whether gravity was added from a separate file.
     """
     folder = files.gyro.parent
     in_g = is_in_g(accel.values)
@@ -66,7 +66,7 @@ def accel_sign(
             "%s: the accelerometer seems to be in g: pass `--accel-unit g` and, if the files are "
             "from an iPhone, `--accel-sign apple`", folder,
         )  # fmt: skip
-    elif sign is None and gravity_apart:
+    elif sign is None and gravity_in_own_file:
         _log.warning(
             "%s: gravity is in a separate file, as Sensor Logger writes it on iPhones, whose sign "
             "is inverted: if the files are from an iPhone, pass `--accel-sign apple`", folder,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.phones.files import PhoneFiles, phone_recordings
-from stario.sequences.readers.phones.phone import assembled
+from stario.sequences.readers.phones.phone import assemble_recording
 from stario.sequences.sequence import ImuSequence
 
 _PHONE = "iphone"
@@ -30,7 +30,7 @@ def read_advio(path: Path) -> ImuSequence:
         raise ReadError(path, _PHONE, "no gyro.csv and accelerometer.csv", "an ADVIO recording")
     poses = [path / name for name in _POSES if (path / name).is_file()][:1]
     name = path.resolve().name
-    return assembled(path / _PHONE, name, files, poses, orders=("wxyz",), core_motion=True)
+    return assemble_recording(path / _PHONE, name, files, poses, orders=("wxyz",), core_motion=True)
 
 
 def is_advio(path: Path) -> bool:

@@ -19,7 +19,7 @@ from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import read_lines, read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     columns = 11 if _holds_velocity(path) else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
-    keep = advancing(time)
+    keep = increasing_mask(time)
     table, time = table[keep], time[keep]
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
-from stario.sequences.readers.clocks import on_one_clock
+from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.published.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
 from stario.sequences.readers.text import IntArray, first_line, read_table, seconds
@@ -42,7 +42,7 @@ def read_imunet(path: Path) -> ImuSequence:
     folder = path if path.is_dir() else path.parent
     gyro_ns, gyro = _rows(folder / "gyro.txt", 3)
     accel_ns, accel = _rows(folder / "acce.txt", 3)
-    stamps, gyro, accel = on_one_clock(folder, gyro_ns, gyro, accel_ns, accel)
+    stamps, gyro, accel = resample_to_gyro(folder, gyro_ns, gyro, accel_ns, accel)
     time = seconds(stamps, stamps[0])
     poses = pose_files(folder)
     sequence = ImuSequence(

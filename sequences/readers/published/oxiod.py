@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import on_one_clock, time_unit
+from stario.sequences.readers.clocks import resample_to_gyro, time_unit
 from stario.sequences.readers.text import (
     IntArray,
     Table,
@@ -136,7 +136,7 @@ def _sensor_rows(path: Path) -> _Phone:
     stamps, code = _stamps_ns(table), table.values[:, 1]
     gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
     xyz = table.values[:, 2:5]
-    imu_ns, rate, force = on_one_clock(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
+    imu_ns, rate, force = resample_to_gyro(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
     field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
     return _Phone(seconds(imu_ns, imu_ns[0]), rate, force, imu_ns, field)
 

@@ -32,7 +32,7 @@ from stario.sequences.readers.checked import (
     trajectory,
 )
 from stario.sequences.readers.published.json_fields import JsonFields
-from stario.sequences.readers.text import magic
+from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -83,7 +83,7 @@ def read_ronin(path: Path) -> ImuSequence:
 
 def is_ronin(path: Path) -> bool:
     """Whether a path is an HDF5 file or a folder with `data.hdf5`."""
-    return (path / "data.hdf5").is_file() or magic(path, len(_MAGIC)) == _MAGIC
+    return (path / "data.hdf5").is_file() or first_bytes(path, len(_MAGIC)) == _MAGIC
 
 
 def _data_file(path: Path) -> Path:

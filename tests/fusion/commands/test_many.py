@@ -11,7 +11,7 @@ import pytest
 
 from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.readers.own_csv import read_own_csv
+from stario.sequences.readers.generic_csv import read_generic_csv
 
 # --- compare and evaluate ----------------------------------------------------------------------
 
@@ -67,7 +67,7 @@ def test_tracks_with_fixes_are_judged(stario, recording: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
-    walk = read_own_csv(recording)
+    walk = read_generic_csv(recording)
     assert walk.truth is not None
     write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
     done = stario("run", "part.csv", "--out", "out")
@@ -88,7 +88,7 @@ def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: 
 def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    sequence = read_own_csv(recording)
+    sequence = read_generic_csv(recording)
     write_csv(tmp_path / "short.csv", sequence.slice(0.0, 1.0))
     (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
     for bad in ("short.csv", "broken.csv"):
@@ -108,7 +108,7 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
     assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
     done = stario("evaluate", recording, "--json")
     assert json.loads(done.out)["over_recordings"]["ekf"]["ate_m"]["median"] > 0.0
-    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     stario("evaluate", "blind.csv").assert_one_line_error("truth")
 
 
@@ -117,7 +117,7 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
 def test_a_batch_goes_on_past_what_fails_and_says_so(
     stario, recording: Path, tmp_path: Path, jobs: int
 ) -> None:
-    walk = read_own_csv(recording)
+    walk = read_generic_csv(recording)
     write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
     write_csv(tmp_path / "blind.csv", walk.without_truth())
     (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
@@ -193,7 +193,7 @@ def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path:
 def test_training_goes_on_past_what_fails_and_keeps_its_windows(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
     (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
     call = ("train", recording, "list.txt", "--generated", 1, "--config", "tiny.json")
@@ -279,7 +279,7 @@ def test_backends_compares_filter_and_graph(stario) -> None:
 
 
 def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Path) -> None:
-    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     done = stario("check", "backends", "blind.csv", recording, "--json")
     assert done.code == 1
     assert "skipped: blind.csv" in done.err
@@ -289,5 +289,5 @@ def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Pat
 def test_recordings_too_short_to_hold_any_out_are_not_calibrated_by_simulation(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    write_csv(tmp_path / "short.csv", read_own_csv(recording).slice(0.0, 9.0))
+    write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
     stario("train", "short.csv", "--generated", 1).assert_one_line_error("--validation")

@@ -26,7 +26,7 @@ from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.files import read_tum
 from stario.sequences.readers import find_recordings
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.readers.own_csv import read_own_csv
+from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -103,7 +103,7 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
     done = stario("simulate", "w.csv", "--seconds", 5, "--rate", 50, "--seed", 7, "--json")
     assert done.code == 0
     figures = json.loads(done.out)
-    sequence = read_own_csv(tmp_path / "w.csv")
+    sequence = read_generic_csv(tmp_path / "w.csv")
     assert figures["samples"] == len(sequence) == 251
     assert figures["duration_s"] == pytest.approx(5.0)
     assert sequence.truth is not None
@@ -135,7 +135,7 @@ def test_run_speaks_json(stario, recording: Path, tmp_path: Path) -> None:
 def test_run_needs_no_truth_and_the_track_is_the_same(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    write_csv(tmp_path / "blind.csv", read_own_csv(recording).without_truth())
+    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     assert stario("run", recording, "--out", "seen").code == 0
     done = stario("run", "blind.csv", "--out", "blind", "--json")
     assert json.loads(done.out)["ekf"]["ate_m"] is None
@@ -158,7 +158,7 @@ def write_fixes(path: Path, truth: Trajectory, turn: float = 0.0, late: float = 
 def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    truth = read_own_csv(recording).truth
+    truth = read_generic_csv(recording).truth
     assert truth is not None
     for turn in (0.0, 1.0):
         fixes = write_fixes(tmp_path / "fixes.csv", truth, turn)
@@ -173,7 +173,7 @@ def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
 
 
 def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
-    truth = read_own_csv(recording).truth
+    truth = read_generic_csv(recording).truth
     assert truth is not None
     fixes = write_fixes(tmp_path / "fixes.csv", truth, late=1.7e9)
     done = stario("run", recording, "--fixes", fixes)
@@ -248,7 +248,7 @@ def test_recordings_go_into_an_archive_and_are_chosen_from_it(
     assert done.code == 0, done.err
     assert (tmp_path / "two/ekf.tum").exists()
     assert stario("convert", "all.h5:walk", "one.csv").code == 0
-    there, here = read_own_csv(tmp_path / "one.csv"), read_own_csv(recording)
+    there, here = read_generic_csv(tmp_path / "one.csv"), read_generic_csv(recording)
     np.testing.assert_array_equal(there.accel, here.accel)
     for arguments in (["run", "all.h5"], ["convert", "all.h5", "out.csv"]):
         stario(*arguments, "--where", "person=eve").assert_one_line_error("person=eve", "none")
@@ -279,7 +279,7 @@ def test_what_the_numbers_mean_can_be_told_to_every_command(
     stario, recording: Path, tmp_path: Path, command: str
 ) -> None:
     """Rates in degrees, Apple's user acceleration in g, axes turned against the truth's."""
-    walk = with_axes(read_own_csv(recording), "-y,x,z")
+    walk = with_axes(read_generic_csv(recording), "-y,x,z")
     upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
     linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
     write_csv(
@@ -296,7 +296,7 @@ def test_what_the_numbers_mean_can_be_told_to_every_command(
 
 
 def test_inspect_names_what_mends_a_recording(stario, recording: Path, tmp_path: Path) -> None:
-    walk = read_own_csv(recording)
+    walk = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
     done = stario("inspect", "g.csv", "--out", "out")
     assert done.code == 0
@@ -335,7 +335,7 @@ def test_export_takes_a_networks_name(stario, tmp_path: Path) -> None:
 def test_degrees_are_refused_with_the_option_that_helps(
     stario, recording: Path, tmp_path: Path, truth: bool
 ) -> None:
-    sequence = read_own_csv(recording)
+    sequence = read_generic_csv(recording)
     sequence = sequence if truth else sequence.without_truth()
     write_csv(tmp_path / "deg.csv", replace(sequence, gyro=np.degrees(sequence.gyro)))
     done = stario("run", "deg.csv", "--out", "out")
@@ -347,7 +347,7 @@ def test_degrees_are_refused_with_the_option_that_helps(
 
 @pytest.mark.usefixtures("undrawn")
 def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
-    sequence = read_own_csv(recording)
+    sequence = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
     stario("run", "g.csv").assert_one_line_error("--accel-unit g")
     assert stario("run", "g.csv", "--accel-unit", "g").code == 0
@@ -357,7 +357,7 @@ def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_pa
 def test_gravitys_sign_is_refused_with_the_option_that_helps(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    sequence = read_own_csv(recording)
+    sequence = read_generic_csv(recording)
     write_csv(tmp_path / "apple.csv", replace(sequence, accel=-sequence.accel))
     stario("run", "apple.csv").assert_one_line_error("--accel-unit=-m/s^2")
     assert stario("run", "apple.csv", "--accel-unit=-m/s^2").code == 0

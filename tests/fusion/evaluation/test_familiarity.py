@@ -50,13 +50,13 @@ def test_a_walk_as_in_training_is_familiar_and_a_trembling_one_is_not(
     usual = familiarity(model, walk)
     assert usual.outside is not None
     assert usual.outside < 0.3
-    assert not usual.strange
-    strange = familiarity(model, shaken(walk))
-    assert strange.outside == pytest.approx(1.0, abs=0.05)
-    assert strange.strange
-    [line] = [line for line in strange.lines() if line.startswith("!")]
+    assert not usual.is_unfamiliar
+    is_unfamiliar = familiarity(model, shaken(walk))
+    assert is_unfamiliar.outside == pytest.approx(1.0, abs=0.05)
+    assert is_unfamiliar.is_unfamiliar
+    [line] = [line for line in is_unfamiliar.lines() if line.startswith("!")]
     assert "share of power above 10 Hz" in line
-    assert strange.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
+    assert is_unfamiliar.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
 
 
 class Backwards(DisplacementModel):
@@ -82,13 +82,13 @@ def test_weights_that_walk_backwards_are_told(model: DisplacementModel) -> None:
 
 
 def test_health_says_so_in_batch_and_stream(model: DisplacementModel) -> None:
-    strange = shaken(simulated(12.0))
-    whole = Navigator(model).run(strange).health
+    is_unfamiliar = shaken(simulated(12.0))
+    whole = Navigator(model).run(is_unfamiliar).health
     assert whole is not None
     [note] = [note for note in whole.notes if "windows" in note]
     assert "sigma is widened" in note
     navigator = Navigator(model)
-    for row in zip(strange.time, strange.gyro, strange.accel, strict=True):
+    for row in zip(is_unfamiliar.time, is_unfamiliar.gyro, is_unfamiliar.accel, strict=True):
         navigator.push(*row)
     assert note in navigator.health.notes
     resumed = Navigator(model)

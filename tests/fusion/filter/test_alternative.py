@@ -12,8 +12,8 @@ from support import stream
 
 from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
-from stario.fusion.evaluation.checks.spoiling import faults
 from stario.fusion.filter.alternative import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.sequences.noise import ImuNoise

@@ -13,7 +13,7 @@ from support import GRAPH as CONFIG
 from stario.fusion import Navigator, NavState
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.fixed import fixed_track, true_fixes
+from stario.fusion.evaluation.checks.with_fixes import track_with_fixes, true_fixes
 from stario.fusion.filter.jacobians import turn_jacobian
 from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.fusion.lie import yaw_twist
@@ -70,7 +70,7 @@ def test_a_turned_network_does_not_make_the_yaw_overconfident(
     walk = make_walk(11, 120.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     told, ignored = (
-        fixed_track(model, walk, with_turn(sigma), "walks", 3.0, 0.1, backend=backend)
+        track_with_fixes(model, walk, with_turn(sigma), "walks", 3.0, 0.1, backend=backend)
         for sigma in (0.1, 0.0)
     )
     assert told.yaw_covered > 0.95

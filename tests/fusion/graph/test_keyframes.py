@@ -20,7 +20,7 @@ from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
-from stario.fusion.report.health import told
+from stario.fusion.report.health import health_lines
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
@@ -153,7 +153,7 @@ def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
     np.testing.assert_array_equal(track.trajectory.position_W, filtered.trajectory.position_W)
     np.testing.assert_array_equal(track.covariance, filtered.covariance)
     assert track.health.notes == ["graph fell back to the filter's track: velocity at 12.3 s"]
-    assert any("filter's track" in line for line in told(track.health))
+    assert any("filter's track" in line for line in health_lines(track.health))
 
 
 def test_a_perfect_sensor_is_no_reason_to_fail(walk: ImuSequence, make_oracle: Make) -> None:

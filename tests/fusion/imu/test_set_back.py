@@ -9,7 +9,7 @@ import pytest
 
 from stario.fusion import Navigator, PriorPose
 from stario.fusion.imu.stream_checks import ClockSetBackDetector, ClockSetBackError
-from stario.fusion.report.health import told
+from stario.fusion.report.health import health_lines
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 
@@ -47,7 +47,7 @@ def test_a_recordings_track_ends_there_and_its_health_says_why(
     walk = set_back(make_walk(3, 16.0), by)
     track = Navigator(still_model).run(walk)
     assert track.time[-1] == pytest.approx(8.0, abs=0.11)
-    (line,) = [line for line in told(track.health) if "clock" in line]
+    (line,) = [line for line in health_lines(track.health) if "clock" in line]
     assert line.startswith("! ")
     assert "Split" in line
     (problem,) = [p for p in inspect_recording(walk).problems if "clock" in p]

@@ -92,7 +92,7 @@ def test_the_track_with_true_attitude_remembers_too(walk) -> None:
 
 def test_a_model_without_memory_is_asked_itself(still_model) -> None:
     network = StatefulInference(still_model, 10)
-    assert not network.remembers
+    assert not network.is_recurrent
     assert network.memory is None
     with pytest.raises(InputError, match="memory"):
         network.memory = (1, (1,))

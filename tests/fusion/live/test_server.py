@@ -290,7 +290,7 @@ def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, 
     from stario.fusion.live import drawn as module
 
     monkeypatch.setattr(module, "MOST_POINTS", 50)
-    drawn, navigator = module.Drawn(), new_navigator()
+    drawn, navigator = module.DisplayedTrack(), new_navigator()
     for k in range(800):
         state = navigator.push(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
         if state is not None:

@@ -8,7 +8,7 @@ import pytest
 from recorded import DATA
 
 from stario.fusion import Health, Navigator
-from stario.fusion.report.health import findings, told
+from stario.fusion.report.health import findings, health_lines
 from stario.network import load_model
 from stario.sequences import read_recording
 
@@ -59,12 +59,12 @@ def test_one_dropped_sample_of_thousands_is_not_none() -> None:
 
 
 def test_only_sensor_weights_and_filter_together_condemn_the_data() -> None:
-    [verdict] = told(SHAKEN)
+    [verdict] = health_lines(SHAKEN)
     assert verdict.startswith("! This track cannot be trusted")
     assert "3 spike, 9 saturated" in verdict
     assert "17%" in verdict
     for agrees in ({"flagged": {"spike": 1}}, {"gated": 3}, {"notes": []}):
-        lines = told(replace(SHAKEN, **agrees))
+        lines = health_lines(replace(SHAKEN, **agrees))
         assert not any("trusted" in line for line in lines)
         assert any(line.startswith("! ") for line in lines)
 
@@ -77,6 +77,6 @@ def test_a_board_shaken_by_hand_gets_one_line_and_one_turned_by_hand_does_not() 
     turned = navigator.run(read_recording(BAGS / "phidgets_imu_upside_down.bag")).health
     assert shaken is not None
     assert turned is not None
-    [warning] = [line for line in told(shaken) if line.startswith("!")]
+    [warning] = [line for line in health_lines(shaken) if line.startswith("!")]
     assert "cannot be trusted" in warning
-    assert not any("trusted" in line for line in told(turned))
+    assert not any("trusted" in line for line in health_lines(turned))

@@ -21,7 +21,7 @@ from stario.fusion.table.cells import LEADING, Cell, fill_cell
 from stario.fusion.table.filling import backend, fill, table_cells
 from stario.fusion.table.sets import DataSet, folder_set
 from stario.fusion.table.summary import filled_cells, set_table
-from stario.fusion.table.training import Reading, cell_recipe
+from stario.fusion.table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError
@@ -41,8 +41,8 @@ def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet
 
 
 @pytest.fixture(scope="module")
-def reading(tmp_path_factory: pytest.TempPathFactory) -> Reading:
-    return Reading(read_recording, {}, tmp_path_factory.mktemp("cache"))
+def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
+    return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
 
 
 def cell(dataset: DataSet, network: str = "DeepILS", seed: int = 0, steps: int = 4) -> Cell:
@@ -50,7 +50,7 @@ def cell(dataset: DataSet, network: str = "DeepILS", seed: int = 0, steps: int =
 
 
 def test_a_cell_leaves_model_errors_and_tracks(
-    dataset: DataSet, reading: Reading, tmp_path: Path
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=2)
     fill_cell(done, tmp_path, reading)
@@ -95,13 +95,13 @@ def test_where_only_waypoints_are_real_they_alone_choose(
         alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
         with pytest.raises(InputError, match="stop"):
             training.train_cell(
-                alone, recipe, tmp_path, Reading(read, {}, tmp_path / read.__name__)
+                alone, recipe, tmp_path, ReaderConfig(read, {}, tmp_path / read.__name__)
             )
     assert chosen == [True, False]
 
 
 def test_a_killed_cell_goes_on_and_ends_the_same(
-    dataset: DataSet, reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
     whole, killed = cell(dataset), cell(dataset)
@@ -124,7 +124,7 @@ def test_a_killed_cell_goes_on_and_ends_the_same(
 
 
 def test_what_is_filled_is_kept_and_a_new_network_or_seed_fills_in(
-    dataset: DataSet, reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
     whole = cells_module.train_cell
@@ -159,7 +159,7 @@ def test_what_is_filled_is_kept_and_a_new_network_or_seed_fills_in(
 
 
 def test_cells_of_another_recipe_are_refused_and_other_steps_stand_beside(
-    dataset: DataSet, reading: Reading, tmp_path: Path
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=1)
     fill_cell(done, tmp_path, reading)
@@ -188,7 +188,7 @@ def test_the_order_is_what_matters_first_and_steps_are_equal(dataset: DataSet) -
         table_cells(sets, RECIPE, networks=["Nobody"])
 
 
-def test_a_cell_travels_to_other_machines(dataset: DataSet, reading: Reading) -> None:
+def test_a_cell_travels_to_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
     work = partial(fill_cell, out=Path("out"), reading=reading)
     sent = pickle.loads(pickle.dumps((work, cell(dataset))))
     assert sent[1] == cell(dataset)

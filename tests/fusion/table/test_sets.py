@@ -9,14 +9,14 @@ from recorded import DATA
 
 from stario.fusion.table import sets
 from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
-from stario.sequences.datasets.splits import Listed
+from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import InputError
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
 
 def test_a_set_is_split_once_and_the_same_by_a_seed() -> None:
-    recordings = [Listed(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
+    recordings = [ListEntry(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
     first, again, other = (sets._split("a", recordings, seed) for seed in (3, 3, 4))
     assert first == again
     assert first.test != other.test
@@ -28,7 +28,7 @@ def test_a_set_is_split_once_and_the_same_by_a_seed() -> None:
 
 def test_two_phones_on_one_walk_stay_together() -> None:
     recordings = [
-        Listed(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
+        ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
     ]
     for seed in range(5):
         split = sets._split("kipd", recordings, seed)
@@ -38,10 +38,12 @@ def test_two_phones_on_one_walk_stay_together() -> None:
 
 
 def test_two_phones_on_one_walk_validate_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    phones = [Listed(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")]
-    held = [Listed(Path("ridi.h5:dan"), "ridi dan")]
+    phones = [
+        ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
+    ]
+    held = [ListEntry(Path("ridi.h5:dan"), "ridi dan")]
     parts = {"all": [*phones, *held], "test": [], "holdout": held}
-    monkeypatch.setattr(sets, "listed", lambda name, data: parts[name])
+    monkeypatch.setattr(sets, "read_packaged_list", lambda name, data: parts[name])
     for seed in range(9):
         [together] = development_sets(Path(), seed, 2, [ALL])
         names = [path.name.removesuffix("S9").removesuffix("S20") for path in together.validation]

@@ -123,8 +123,8 @@ def test_a_model_that_remembers_depends_on_the_order_of_windows(tmp_path: Path) 
     windows = some_windows(6)
     at_once = loaded.stateful_inference(3).predict(windows)[0]
     track = loaded.stateful_inference(3)
-    one_by_one = np.concatenate([track.predict(windows[k : k + 1])[0] for k in range(6)])
-    assert np.array_equal(at_once, one_by_one)
+    process_each = np.concatenate([track.predict(windows[k : k + 1])[0] for k in range(6)])
+    assert np.array_equal(at_once, process_each)
     # The first window of each series is alone, the others are not.
     alone = loaded.predict(windows)[0]
     np.testing.assert_allclose(at_once[:3], alone[:3], atol=1e-5)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.network.training.augment import Augmentation, WindowSampler, heading_of
-from stario.network.training.lever_arm import draw_swing
+from stario.network.training.lever_arm import sample_swing
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
@@ -319,7 +319,7 @@ def test_a_window_looks_the_same_whichever_way_the_device_points() -> None:
 def test_swinging_a_device_turns_its_heading_along() -> None:
     """At rest and swung about the vertical the rate is all there is to see; H turns with it."""
     generator = torch.Generator().manual_seed(0)
-    swings = draw_swing(64, 1.0, 2.0, 0.0, generator)
+    swings = sample_swing(64, 1.0, 2.0, 0.0, generator)
     level = torch.zeros(64, 1, 10, 2)
     level[..., 0] = 1.0
     turn = (swings.angle.at(torch.arange(10) / 10.0)[0] * swings.axis[:, 2:]).mean(dim=1)

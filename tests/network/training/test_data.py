@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stario.network.training.config import SIMULATED, TrainingConfig
-from stario.network.training.data import Material, Recorded, gather, split_off
+from stario.network.training.data import RecordingStreams, TrainingData, mix_sources, split_off
 from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream
@@ -35,7 +35,7 @@ def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
 
 def test_kinds_of_streams_make_up_their_shares() -> None:
     recorded = of([stream("a", 3000), stream("a", 1000)])
-    material = gather(recorded, [stream("c", 700)], {SIMULATED: 0.05})
+    material = mix_sources(recorded, [stream("c", 700)], {SIMULATED: 0.05})
     drawn = np.array([len(s) for s in material.streams]) * material.weights
     assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
     assert material.words[0].startswith("recorded")
@@ -43,21 +43,21 @@ def test_kinds_of_streams_make_up_their_shares() -> None:
 
 def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> None:
     recorded = [
-        Recorded(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
-        Recorded(Path("a/short.h5:y"), [moving("y", 1.0)]),
-        Recorded(Path("other.csv"), [moving("z", 1.0)]),
+        RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
+        RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
+        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
     ]
-    material = gather(recorded, [], {"long.h5": 0.5, "short.h5": 0.3})
+    material = mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.3})
     drawn = {name: 0.0 for name in "xyz"}
     for one, weight in zip(material.streams, material.weights, strict=True):
         drawn[one.name] += weight * len(one)
     assert drawn["y"] / drawn["x"] == pytest.approx(0.6)
     assert drawn["z"] / drawn["x"] == pytest.approx(0.4)
     with pytest.raises(ConfigError, match="shares"):
-        gather(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
+        mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
 
 
-def drawn(material: Material, reach: int = 1) -> dict[str, float]:
+def drawn(material: TrainingData, reach: int = 1) -> dict[str, float]:
     """Share of the windows that are drawn from streams of each name."""
     found: dict[str, float] = {}
     for one, weight in zip(material.streams, material.weights, strict=True):
@@ -68,14 +68,14 @@ def drawn(material: Material, reach: int = 1) -> dict[str, float]:
 
 def test_what_is_named_but_absent_leaves_its_share_to_the_other_recordings() -> None:
     recorded = [
-        Recorded(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
-        Recorded(Path("other.csv"), [moving("z", 1.0)]),
+        RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
+        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
     ]
     shares = {"ridi": 0.2, "kipd": 0.5, SIMULATED: 0.1}
-    found = drawn(gather(recorded, [moving("c", 1.0)], shares))
+    found = drawn(mix_sources(recorded, [moving("c", 1.0)], shares))
     assert found["c"] == pytest.approx(0.1)
     assert found["x"] == pytest.approx(0.9 * 0.4)
-    alone = drawn(gather(recorded[:1], [moving("c", 1.0)], shares))
+    alone = drawn(mix_sources(recorded[:1], [moving("c", 1.0)], shares))
     assert alone["c"] == pytest.approx(0.1)
 
 
@@ -83,12 +83,12 @@ def test_shares_are_of_the_windows_that_can_be_drawn() -> None:
     """Of stretches hardly longer than a window few are: they are drawn the more often."""
     whole = moving("y", 1.0)
     recorded = [
-        Recorded(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
-        Recorded(Path("a/kipd.h5:y"), [whole.part(0, 420)] * 5),
-        Recorded(Path("a/tyrex.h5:w"), [moving("w", 1.0).part(0, 300)]),
+        RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
+        RecordingStreams(Path("a/kipd.h5:y"), [whole.part(0, 420)] * 5),
+        RecordingStreams(Path("a/tyrex.h5:w"), [moving("w", 1.0).part(0, 300)]),
     ]
     shares = {"ridi": 0.3, "kipd": 0.3, "tyrex": 0.4}
-    found = drawn(gather(recorded, [], shares, reach=361), reach=361)
+    found = drawn(mix_sources(recorded, [], shares, reach=361), reach=361)
     assert found == {"x": pytest.approx(0.5), "y": pytest.approx(0.5), "w": 0.0}
 
 
@@ -96,19 +96,19 @@ def test_shares_that_leave_nothing_are_refused() -> None:
     recorded = of([moving("x", 1.0)])
     for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
         with pytest.raises(ConfigError, match="shares: found 0 for every"):
-            gather([] if generated else recorded, generated, given)
+            mix_sources([] if generated else recorded, generated, given)
     with pytest.raises(ConfigError, match=r"shares: found a sum of 1\.2"):
         TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
-def of(*recordings: list[WorldStream]) -> list[Recorded]:
-    return [Recorded(Path(str(k)), streams) for k, streams in enumerate(recordings)]
+def of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
+    return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 
 
 def test_lively_recordings_are_drawn_more_often() -> None:
     calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = gather(of([calm], [lively]), [])
+    material = mix_sources(of([calm], [lively]), [])
     assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
     assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 

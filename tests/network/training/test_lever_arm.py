@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stario.network.training.lever_arm import Sines, Swing, draw_swing, swung
+from stario.network.training.lever_arm import Sines, Swing, apply_swing, sample_swing
 
 GRAVITY = 9.80665
 
@@ -15,14 +15,14 @@ def at_rest(size: int) -> torch.Tensor:
 
 
 def drawn(size: int, share: float = 1.0) -> Swing:
-    drawn = draw_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
+    drawn = sample_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
     angle = Sines(*(value.double() for value in vars(drawn.angle).values()))
     return Swing(drawn.axis.double(), drawn.lever.double(), angle)
 
 
 def test_acceleration_integrates_to_the_displacement() -> None:
     swing = drawn(64)
-    imu, displacement = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
+    imu, displacement = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     # The velocity a window begins with is omega x r.
     now = torch.zeros(1, dtype=torch.float64)
     lever = turned(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
@@ -40,7 +40,7 @@ def test_acceleration_integrates_to_the_displacement() -> None:
 def test_rate_and_lever_belong_to_one_rotation() -> None:
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
     swing = drawn(64)
-    imu, _ = swung(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
+    imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
     lever = turned(swing.lever, swing.axis, alpha)
     gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
@@ -57,7 +57,7 @@ def test_no_swing_is_faster_than_its_bound() -> None:
 def test_what_is_not_swung_stays_as_it_is() -> None:
     imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     displacement = torch.ones(16, 1, 3, dtype=torch.float64)
-    after, moved = swung(imu, displacement, drawn(16, share=0.0))
+    after, moved = apply_swing(imu, displacement, drawn(16, share=0.0))
     assert torch.allclose(after, imu, atol=1e-12)
     assert torch.equal(moved, displacement)
 

@@ -84,8 +84,8 @@ def test_two_processes_train_as_one_does(network: str, tolerance: float, tmp_pat
 
 def test_without_a_launcher_there_is_one_process_that_leads() -> None:
     with workers("cpu", 7) as these:
-        assert these.leads
-        assert these.mean(3.0) == these.agreed(3.0) == 3.0
+        assert these.is_leader
+        assert these.mean(3.0) == these.broadcast(3.0) == 3.0
         batch = torch.arange(7)
         assert torch.equal(these.share(batch), batch)
 

@@ -336,7 +336,7 @@ def test_hours_are_validated_a_second_apart_by_a_network_that_remembers(
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
     cpu = torch.device("cpu")
-    held_out = ValidationSet(streams, cpu, remembers=True)
+    held_out = ValidationSet(streams, cpu, is_recurrent=True)
     assert held_out.stride == stride
     seconds = sum(len(stream) for stream in held_out.streams) / 200
     assert seconds == 60 * minutes

@@ -291,9 +291,9 @@ def test_short_walks_choose_weights_by_themselves() -> None:
     )
     assert list(held_out.legs) == ["positions"]  # eight seconds, though twelve are learned from
     errors = {"walk": 5.0, "positions": 0.25}
-    assert held_out.deciding(errors) == 0.25
+    assert held_out.selection_error(errors) == 0.25
     besides = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
-    assert besides.deciding(errors) == 2.625
+    assert besides.selection_error(errors) == 2.625
 
 
 def sampler_of(streams: list[LegStream], seconds: int) -> LegSampler:
@@ -326,5 +326,5 @@ def test_validation_goes_without_legs_that_tell_nothing(caplog: pytest.LogCaptur
         TrainingConfig(), chosen_by_legs=True,
     )  # fmt: skip
     assert held_out.legs == {}
-    assert held_out.deciding({"walk": 5.0}) == 5.0
+    assert held_out.selection_error({"walk": 5.0}) == 5.0
     assert "validation skips waypoints" in caplog.text

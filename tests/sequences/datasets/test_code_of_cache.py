@@ -7,7 +7,7 @@ def test_readers_levelling_windows_and_simulation_count() -> None:
     names = {"/".join(file.parts[-2:]) for file in code_files()}
     assert {
         "sequences/windows.py",
-        "readers/own_csv.py",
+        "readers/generic_csv.py",
         "attitude/levelling.py",
         "simulation/imu.py",
         "datasets/stream_cache.py",

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from stario.network.training.splits import NAMES, listed
+from stario.network.training.splits import NAMES, read_packaged_list
 from stario.sequences.datasets.splits import (
-    leave_out,
+    hold_out_group,
     random_split,
     read_list,
 )
@@ -84,12 +84,12 @@ def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -
     assert [one.group for one in found] == ["home anna", "home bo", ""]
     assert found[0].within("home")
     assert not found[0].within("home an")
-    outside, inside = leave_out(found, "home")
+    outside, inside = hold_out_group(found, "home")
     assert [one.path.name for one in outside] == ["walks.h5:two"]
     assert len(inside) == 2
-    assert listed(str(file), tmp_path) == found
+    assert read_packaged_list(str(file), tmp_path) == found
     with pytest.raises(InputError, match="home anna"):
-        leave_out(found, "office")
+        hold_out_group(found, "office")
     (tmp_path / "a.csv").unlink()
     with pytest.raises(InputError, match="--data"):
         read_list(file, tmp_path)

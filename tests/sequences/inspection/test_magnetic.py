@@ -20,7 +20,7 @@ from stario.sequences import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
-from stario.sequences.inspection.magnetic import judge_magnetometer
+from stario.sequences.inspection.magnetic import assess_magnetometer
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import clean_samples
@@ -40,7 +40,7 @@ def test_size_dip_lag_iron_and_drift_come_back() -> None:
     truth = sequence.truth
     assert truth is not None
     up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
-    found = judge_magnetometer(replace(sequence, gyro=sequence.gyro + drift * up_B))
+    found = assess_magnetometer(replace(sequence, gyro=sequence.gyro + drift * up_B))
     assert found is not None
     assert found.verdict == "good"
     assert found.correlation is not None
@@ -69,11 +69,11 @@ def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
     good = walk(MagneticField())
     assert good.magnetometer is not None
     magnets = tuple((t, t + 4.0, 150.0) for t in np.arange(2.0, 56.0, 8.0).tolist())
-    disturbed = judge_magnetometer(walk(MagneticField(magnets=magnets)))
+    disturbed = assess_magnetometer(walk(MagneticField(magnets=magnets)))
     assert disturbed is not None
     assert disturbed.verdict == "not usable"
     turned = Magnetometer(good.magnetometer.time, good.magnetometer.field[:, [1, 2, 0]])
-    wrong = judge_magnetometer(replace(good, magnetometer=turned))
+    wrong = assess_magnetometer(replace(good, magnetometer=turned))
     assert wrong is not None
     assert wrong.verdict == "not usable"
     assert "does not follow the gyroscope" in " ".join(wrong.problems)
@@ -100,7 +100,7 @@ def test_a_sensor_that_gives_zeros_at_first_is_looked_over_all_the_same() -> Non
     field = late.magnetometer.field.copy()
     field[:100] = 0.0
     with np.errstate(all="raise"):
-        found = judge_magnetometer(
+        found = assess_magnetometer(
             replace(late, magnetometer=Magnetometer(late.magnetometer.time, field))
         )
     assert found is not None
@@ -137,7 +137,7 @@ def test_recorded_magnetometers_know_the_gyroscopes_drift(
     known = recording.truth.covers(time)
     off = np.unwrap(yaw_of(levelled * recording.truth.at(time).attitude_WB.inv())[known])
     drift = np.polyfit(time[known], off, 1)[0]
-    found = judge_magnetometer(recording)
+    found = assess_magnetometer(recording)
     assert found is not None
     assert found.verdict == verdict
     assert math.degrees(found.drift_rad_s) == pytest.approx(math.degrees(drift), abs=sure)
@@ -146,6 +146,6 @@ def test_recorded_magnetometers_know_the_gyroscopes_drift(
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
 def test_magnets_beside_a_phone_are_not_trusted() -> None:
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
-    magnets = judge_magnetometer(read_recording(DATA / name))
+    magnets = assess_magnetometer(read_recording(DATA / name))
     assert magnets is not None
     assert magnets.verdict == "not usable"

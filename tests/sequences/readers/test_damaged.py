@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stario.sequences import generate_walk, read_recording, simulate_imu, write_csv
-from stario.sequences.attitude.levelling import LEAST_FORCE
+from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
@@ -91,7 +91,7 @@ def test_a_truth_is_not_levelled_by_a_dead_accelerometer(walk: ImuSequence) -> N
     truth, dead = walk.truth, np.zeros_like(walk.accel)
     with pytest.raises(InputError, match="gravity"):
         align_tracked_body(walk.time, walk.gyro, dead, truth.time, truth.attitude_WB, truth.valid)
-    assert LEAST_FORCE > 0.0
+    assert MIN_GRAVITY_FORCE > 0.0
 
 
 def test_a_pose_of_another_clock_costs_no_memory(walk: ImuSequence) -> None:

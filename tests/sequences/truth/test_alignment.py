@@ -34,12 +34,12 @@ def captured(truth: Trajectory, noise_rad: float, seed: int = 0) -> tuple[np.nda
 
 def test_products_of_many_rotations_are_those_one_by_one() -> None:
     steps = Rotation.random(200, rng=np.random.default_rng(1))
-    one_by_one = [Rotation.identity()]
+    process_each = [Rotation.identity()]
     for step in steps:
-        one_by_one.append(one_by_one[-1] * step)
+        process_each.append(process_each[-1] * step)
     products = Rotation.from_quat(cumulative_rotations(steps))
     assert len(products) == 201
-    assert (products.inv() * Rotation.concatenate(one_by_one)).magnitude().max() < 1e-12
+    assert (products.inv() * Rotation.concatenate(process_each)).magnitude().max() < 1e-12
     assert len(cumulative_rotations(Rotation.identity(1)[:0])) == 1
 
 

@@ -32,7 +32,7 @@ def test_scale_and_bias_come_back(walk: ImuSequence, scale: float, bias: float) 
     assert found is not None
     assert found.scale == pytest.approx(scale, abs=2e-3)
     assert found.bias == pytest.approx(bias, abs=5e-4)
-    assert found.left < np.radians(1.0)
+    assert found.residual_rms < np.radians(1.0)
 
 
 def test_a_person_reads_how_far_it_turns(walk: ImuSequence) -> None:

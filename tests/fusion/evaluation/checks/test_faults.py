@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import (
     FaultResult,
     fault_table,
     matched_walk,
     run_faults,
 )
-from stario.fusion.evaluation.checks.spoiling import faults
 from stario.sequences.errors import InputError
 
 SECONDS = 20.0
@@ -77,8 +77,10 @@ def test_a_recording_without_truth_is_refused() -> None:
 def test_faults_are_drawn_from_the_seed() -> None:
     sequence, _ = matched_walk(5.0)
     for fault in faults(5.0):
-        if fault.spoil is not None:
-            first, again = (fault.spoil(sequence, np.random.default_rng(3)) for _ in range(2))
+        if fault.modify_samples is not None:
+            first, again = (
+                fault.modify_samples(sequence, np.random.default_rng(3)) for _ in range(2)
+            )
             np.testing.assert_array_equal(first.time, again.time)
             assert len(first) != len(sequence) or not (
                 np.array_equal(first.time, sequence.time)

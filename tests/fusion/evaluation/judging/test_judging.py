@@ -14,11 +14,11 @@ from recorded import DATA
 from stario.fusion.evaluation.judging.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
 from stario.fusion.evaluation.judging.figure import groups_figure
-from stario.fusion.evaluation.judging.judge import POOLED, Judged, Row, judge, rows_of
-from stario.fusion.evaluation.judging.network_alone import answers
+from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, Row, judge, rows_of
+from stario.fusion.evaluation.judging.network_alone import predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
 from stario.fusion.evaluation.judging.table import (
-    Judgement,
+    JudgingResult,
     judgement_text,
     verdict,
     write_judgement,
@@ -75,7 +75,7 @@ class Stub:
 
 def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
     prepared = prepare(recording, Path("walk"))
-    return recording_errors(prepared, answers(stub, prepared))
+    return recording_errors(prepared, predictions(stub, prepared))
 
 
 def test_of_poses_nine_tenths_of_the_truth_is_told_as_such(walk: ImuSequence) -> None:
@@ -164,7 +164,7 @@ def test_of_real_recordings_the_steps_come_near_the_truth(
 ) -> None:
     path = Path(f"{ARCHIVES}/{name}")
     prepared = prepare(read_recording(path), path)
-    found = recording_errors(prepared, answers(PedestrianDeadReckoning(), prepared))
+    found = recording_errors(prepared, predictions(PedestrianDeadReckoning(), prepared))
     assert found.kind == kind
     assert found.path_m == pytest.approx(path_m, rel=0.05)
     assert found.figures["length_ratio"] == pytest.approx(1.0, abs=0.3)
@@ -220,7 +220,7 @@ def test_steps_are_judged_like_a_network(walk: ImuSequence) -> None:
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
-def judged_pair(walk: ImuSequence) -> list[Judged]:
+def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     ours = {"a": 0.95, "b": 0.9}
     prepared = [
         replace(prepare(recording, Path(name)), path=Path(name), attributes={"person": person})
@@ -254,7 +254,7 @@ def test_rows_compare_weights_by_group_and_over_all(walk: ImuSequence) -> None:
 def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path: Path) -> None:
     judged = judged_pair(walk)
     rows = rows_of(judged, "set", "ours", "theirs")
-    found = Judgement("ours", "theirs", rows, judged)
+    found = JudgingResult("ours", "theirs", rows, judged)
     assert "ratio over 10 s" in judgement_text(found)
     written = write_judgement(tmp_path, found)
     assert [path.name for path in written] == [

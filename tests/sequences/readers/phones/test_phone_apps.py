@@ -468,7 +468,7 @@ def test_the_apps_own_files_hold_gravity_and_what_is_known_of_truth(name: str) -
     read = read_recording(RAW / name)
     assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
     assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0
-    assert KINDS[name] in read.truth_words()
+    assert KINDS[name] in read.truth_summary()
     logged = ("shopping_mall_eight", "pyojinkim_android", "senslogs_tyrex")
     assert (read.device_attitude is not None) == any(part in name for part in logged)
     if read.truth is not None:

@@ -13,8 +13,8 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.fusion_gain import LEAST_SIGMA
 from stario.fusion.evaluation.checks.groups import by_group
-from stario.fusion.evaluation.checks.worth import LEAST_SIGMA
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -29,7 +29,7 @@ _FEWEST = 4
 
 
 @dataclass(frozen=True)
-class FixedTrack:
+class FixConsistency:
     """Errors of one recording with fixes.
 
     Attributes:
@@ -65,7 +65,7 @@ def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list
     ]
 
 
-def fixed_track(
+def track_with_fixes(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
@@ -74,7 +74,7 @@ def fixed_track(
     sigma: float = 0.3,
     backend: BackendName = "ekf",
     seed: int = 0,
-) -> FixedTrack:
+) -> FixConsistency:
     """Run a recording with fixes and evaluate its track.
 
     Raises:
@@ -93,7 +93,7 @@ def fixed_track(
     late = errors.estimate.time > middle
     known = np.searchsorted(track.time, errors.estimate.time[late])
     P, off, yaw = track.covariance[known], errors.position_W[late], errors.yaw[late]
-    return FixedTrack(
+    return FixConsistency(
         sequence.name,
         group,
         track.health.fixes.get("applied", 0) / len(fixes),
@@ -105,7 +105,7 @@ def fixed_track(
     )
 
 
-def fixed_table(found: Sequence[FixedTrack]) -> str:
+def fixes_table(found: Sequence[FixConsistency]) -> str:
     """Return a row for each group: medians of its recordings, and how often yaw is covered."""
     head = ["group", "n", "fixes applied", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
     rows = [head]

@@ -35,7 +35,7 @@ GOOD_YAW = math.radians(10.0)
 
 
 @dataclass(frozen=True)
-class Worth:
+class FusionGain:
     """Errors of one recording with and without the fusion.
 
     Attributes:
@@ -60,13 +60,13 @@ class Worth:
     yaw_sigma: float
 
 
-def worth_of(
+def fusion_gain(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
     group: str,
     backends: Sequence[BackendName] = get_args(BackendName),
-) -> Worth:
+) -> FusionGain:
     """Run a recording through the network alone and the back ends.
 
     Raises:
@@ -86,7 +86,7 @@ def worth_of(
             f"{LEAST} or more",
         )
     error, sigma = _yaw(first, sequence.truth)
-    return Worth(
+    return FusionGain(
         sequence.name,
         group,
         network_m,
@@ -98,7 +98,7 @@ def worth_of(
     )
 
 
-def worth_table(found: Sequence[Worth]) -> str:
+def fusion_gain_table(found: Sequence[FusionGain]) -> str:
     """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
     names = list(found[0].fused_m) if found else []
     head = ["group", "n", "network"]
@@ -115,7 +115,7 @@ def worth_table(found: Sequence[Worth]) -> str:
     return "\n".join([*aligned(rows), words, more])
 
 
-def _row(group: str, part: Sequence[Worth], names: Sequence[str]) -> list[str]:
+def _row(group: str, part: Sequence[FusionGain], names: Sequence[str]) -> list[str]:
     row = [group, str(len(part)), f"{np.median([one.network_m for one in part]):.2f}"]
     for name in names:
         ratio = np.log([one.fused_m[name] / one.network_m for one in part])

@@ -55,7 +55,7 @@ from stario.sequences.sequence import (
     PositionTrack,
     Trajectory,
 )
-from stario.sequences.time_order import advancing
+from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ _HEAD_LINES = 200
 """Number of lines in which the header must be for a file to be recognised."""
 
 
-def read_own_csv(path: Path) -> ImuSequence:
+def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes.
 
     Raises:
@@ -167,7 +167,7 @@ def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
     )
 
 
-def is_own_csv(path: Path) -> bool:
+def is_generic_csv(path: Path) -> bool:
     """Whether a file starts with a header that names columns of this format."""
     return is_header(first_lines(path, _HEAD_LINES, comments=True))
 
@@ -267,7 +267,7 @@ def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
     names = [name for name in POSITION if name in rows.table]
     known = np.stack([rows.table[name] for name in names], axis=1)
     kept = np.flatnonzero(np.isfinite(known).all(axis=1) & np.isfinite(rows.time))
-    kept = kept[advancing(rows.time[kept])]
+    kept = kept[increasing_mask(rows.time[kept])]
     if len(kept) < 2:
         _log.warning("%s: %d rows hold a position, too few for a track", path, len(kept))
         return None
@@ -281,7 +281,7 @@ def _truth(path: Path, rows: _Rows) -> Trajectory | None:
     time = rows.time
     poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
-    kept = kept[advancing(time[kept])]
+    kept = kept[increasing_mask(time[kept])]
     if len(kept) < 2:
         _log.warning("%s: %d rows hold ground truth, too few for a trajectory", path, len(kept))
         return None

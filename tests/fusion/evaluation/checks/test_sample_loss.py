@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.missing import Moved, moved_ends, moved_table
+from stario.fusion.evaluation.checks.sample_loss import EndShift, end_shift_table, end_shifts
 from stario.network.model import load_model
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
@@ -18,7 +18,7 @@ from stario.sequences.sequence import ImuSequence
 def test_a_tenth_of_a_second_and_one_sample_in_twenty_hardly_move_the_end(
     walk: ImuSequence,
 ) -> None:
-    found = moved_ends(load_model("default"), walk, NavigatorConfig(), "walks")
+    found = end_shifts(load_model("default"), walk, NavigatorConfig(), "walks")
     assert len(found) == 7
     assert {one.recording for one in found} == {walk.name}
     *gaps, dropped = found
@@ -33,12 +33,12 @@ def test_a_device_that_lies_still_has_no_path(walk: ImuSequence, still_model: An
     force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
     still = replace(walk, gyro=0.0 * walk.gyro, accel=force, truth=None)
     with pytest.raises(InputError, match="metre"):
-        moved_ends(still_model, still, NavigatorConfig(), "table")
+        end_shifts(still_model, still, NavigatorConfig(), "table")
 
 
 def test_the_table_counts_ends_that_stay_in_both() -> None:
     values = [(0.005, 1.0), (0.02, 1.0), (0.005, 4.0), (0.0, 0.0)]
-    table = moved_table([Moved("a", "set", "gap", *pair) for pair in values])
+    table = end_shift_table([EndShift("a", "set", "gap", *pair) for pair in values])
     row = table.splitlines()[1].split()
     assert row[:3] == ["set", "4", "50%"]
     assert row[-1] == "4.00"

@@ -14,8 +14,8 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.corruption import drops, gap
 from stario.fusion.evaluation.checks.groups import by_group
-from stario.fusion.evaluation.checks.spoiling import drops, gap
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
@@ -38,7 +38,7 @@ _SHORTEST_PATH = 1.0
 
 
 @dataclass(frozen=True)
-class Moved:
+class EndShift:
     """Shift of a track's end caused by missing samples.
 
     Attributes:
@@ -56,14 +56,14 @@ class Moved:
     degrees: float
 
 
-def moved_ends(
+def end_shifts(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
     group: str,
     backend: BackendName = "ekf",
     seed: int = 0,
-) -> list[Moved]:
+) -> list[EndShift]:
     """Run a recording with each of the faults and return the shifts of its end.
 
     Raises:
@@ -82,9 +82,9 @@ def moved_ends(
     faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
     return [
-        Moved(sequence.name, group, name, *_between(whole, run(spoilt), path))
-        for name, spoil in faults
-        for spoilt in (spoil(sequence, np.random.default_rng(seed)),)
+        EndShift(sequence.name, group, name, *_between(whole, run(spoilt), path))
+        for name, modify_samples in faults
+        for spoilt in (modify_samples(sequence, np.random.default_rng(seed)),)
     ]
 
 
@@ -95,7 +95,7 @@ def _between(whole: Track, other: Track, path: float) -> tuple[float, float]:
     return metres, abs(math.degrees(yaw_twist(turn)))
 
 
-def moved_table(found: Sequence[Moved]) -> str:
+def end_shift_table(found: Sequence[EndShift]) -> str:
     """Return a row for each group: how many ends stay within limits, and how far ends move."""
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]

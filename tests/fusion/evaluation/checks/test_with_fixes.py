@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import CONFIG
 
-from stario.fusion.evaluation.checks.fixed import fixed_table, fixed_track, true_fixes
+from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes, true_fixes
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -17,11 +17,11 @@ Make = Callable[..., Any]
 
 def test_fixes_of_the_truth_hold_a_track_to_it(walk: ImuSequence, make_oracle: Make) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    found = fixed_track(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
+    found = track_with_fixes(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
     assert found.applied > 0.8
     assert found.position_rms < 0.3
     assert found.yaw_covered == 1.0
-    row = fixed_table([found]).splitlines()[1].split()
+    row = fixes_table([found]).splitlines()[1].split()
     assert row[:2] == ["walks", "1"]
     assert row[-1] == "100.0%"
 
@@ -35,6 +35,6 @@ def test_fixes_err_as_much_as_they_say(walk: ImuSequence) -> None:
 
 def test_without_poses_there_is_nothing_to_judge_by(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
-        fixed_track(still_model, replace(walk, truth=None), CONFIG, "walks")
+        track_with_fixes(still_model, replace(walk, truth=None), CONFIG, "walks")
     with pytest.raises(InputError, match="fixes"):
-        fixed_track(still_model, walk, CONFIG, "walks", every=15.0)
+        track_with_fixes(still_model, walk, CONFIG, "walks", every=15.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import CONFIG
 
-from stario.fusion.evaluation.checks.worth import Worth, worth_of, worth_table
+from stario.fusion.evaluation.checks.fusion_gain import FusionGain, fusion_gain, fusion_gain_table
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
@@ -16,10 +16,10 @@ Make = Callable[..., Any]
 
 
 def test_ratios_are_geometric_means_by_group() -> None:
-    rows = [Worth("a", "x", 1.0, {"ekf": 0.5}, 3.0, 1.0, 0.01, 0.1)]
-    rows += [Worth("b", "x", 1.0, {"ekf": 2.0}, 3.0, 5.0, 0.9, 0.1)]
-    rows += [Worth("c", "y", 2.0, {"ekf": 1.0}, 1.0, float("nan"), float("nan"), 0.1)]
-    _, x, y, pooled, *_ = worth_table(rows).splitlines()
+    rows = [FusionGain("a", "x", 1.0, {"ekf": 0.5}, 3.0, 1.0, 0.01, 0.1)]
+    rows += [FusionGain("b", "x", 1.0, {"ekf": 2.0}, 3.0, 5.0, 0.9, 0.1)]
+    rows += [FusionGain("c", "y", 2.0, {"ekf": 1.0}, 1.0, float("nan"), float("nan"), 0.1)]
+    _, x, y, pooled, *_ = fusion_gain_table(rows).splitlines()
     assert x.split()[:4] == ["x", "2", "1.00", "1.00"]
     assert x.split()[-5:] == ["3.0", "3.0", "26.1", "50%", "50%"]
     assert y.split()[3] == "0.50"
@@ -30,19 +30,19 @@ def test_a_fusion_with_a_true_network_is_as_good_at_waypoints_as_at_poses(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    poses = worth_of(oracle, walk, CONFIG, "walks", ("ekf",))
+    poses = fusion_gain(oracle, walk, CONFIG, "walks", ("ekf",))
     every = slice(None, None, 500)
     at = walk.truth.time[every], walk.truth.position_W[every, :2]
     tapped = replace(walk, truth=None, positions=PositionTrack(*at, "waypoints"))
-    waypoints = worth_of(oracle, tapped, CONFIG, "walks", ("ekf",))
+    waypoints = fusion_gain(oracle, tapped, CONFIG, "walks", ("ekf",))
     assert poses.fused_m["ekf"] < 0.5
     assert waypoints.fused_m["ekf"] == pytest.approx(poses.fused_m["ekf"], abs=0.2)
 
 
 def test_without_truth_there_is_nothing_to_judge(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
-        worth_of(still_model, replace(walk, truth=None), CONFIG, "walks")
+        fusion_gain(still_model, replace(walk, truth=None), CONFIG, "walks")
     # A mean over a group would be not-a-number for one tap within the track.
     tapped = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
     with pytest.raises(InputError, match="fewer than 2 within the track"):
-        worth_of(still_model, replace(walk, truth=None, positions=tapped), CONFIG, "walks")
+        fusion_gain(still_model, replace(walk, truth=None, positions=tapped), CONFIG, "walks")

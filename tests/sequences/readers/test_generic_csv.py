@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
-from stario.sequences.readers.own_csv import read_own_csv
+from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
     FloatArray,
@@ -53,7 +53,7 @@ def test_what_is_written_comes_back_to_the_last_bit(tmp_path: Path, walk: ImuSeq
 def test_without_truth_there_is_none(tmp_path: Path, walk: ImuSequence) -> None:
     write_csv(tmp_path / "walk.csv", walk.without_truth())
     assert (tmp_path / "walk.csv").read_text().startswith(HEADER + "\n0.0,")
-    read = read_own_csv(tmp_path / "walk.csv")
+    read = read_generic_csv(tmp_path / "walk.csv")
     assert read.truth is None
     assert np.array_equal(read.accel, walk.accel)
 
@@ -65,7 +65,7 @@ def test_a_magnetometer_comes_back_in_shared_rows_and_in_rows_of_its_own(
     field = np.random.default_rng(2).normal(0.0, 30.0, (len(time), 3))
     given = replace(walk, magnetometer=Magnetometer(time, field))
     write_csv(tmp_path / "walk.csv", given)
-    read = read_own_csv(tmp_path / "walk.csv")
+    read = read_generic_csv(tmp_path / "walk.csv")
     assert read.magnetometer is not None
     assert np.array_equal(read.magnetometer.time, time)
     assert np.array_equal(read.magnetometer.field, field)
@@ -83,14 +83,14 @@ def test_the_fields_unit_is_the_headers_and_what_is_no_sample_is_left_out(tmp_pa
         "0.2,0,0,0,0,0,9.8,,,",
         "0.3,,,,,,,4000,5000,6000",
     )
-    read = read_own_csv(path)
+    read = read_generic_csv(path)
     assert read.magnetometer is not None
     assert np.array_equal(read.time, [0.0, 0.1, 0.2])
     assert np.array_equal(read.magnetometer.time, [0.0, 0.3])
     assert np.allclose(read.magnetometer.field, [[1, 2, 3], [4, 5, 6]])
     written(path, f"{HEADER},mx [uT]", "0.0,0,0,0,0,0,9.8,1")
     with pytest.raises(ReadError, match="no my, mz"):
-        read_own_csv(path)
+        read_generic_csv(path)
 
 
 def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence) -> None:
@@ -103,7 +103,7 @@ def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence)
     truth = Trajectory(time, position, spin, valid=valid)
     shifted = ImuSequence("walk", walk.time + 5e-4, walk.gyro, walk.accel, truth)
     write_csv(tmp_path / "walk.csv", shifted)
-    read = read_own_csv(tmp_path / "walk.csv")
+    read = read_generic_csv(tmp_path / "walk.csv")
     assert np.array_equal(read.gyro, walk.gyro)
     assert np.abs(read.time - walk.time).max() < 1e-15
     assert read.truth is not None
@@ -120,7 +120,7 @@ def test_bad_samples_and_their_order_survive(tmp_path: Path, walk: ImuSequence) 
     gyro[12], accel[12] = np.nan, np.nan
     bad = ImuSequence("bad", time, gyro, accel, walk.truth)
     write_csv(tmp_path / "bad.csv", bad)
-    read = read_own_csv(tmp_path / "bad.csv")
+    read = read_generic_csv(tmp_path / "bad.csv")
     assert np.array_equal(read.time, time)
     assert np.array_equal(read.gyro, gyro, equal_nan=True)
     assert np.array_equal(read.accel, accel, equal_nan=True)
@@ -142,13 +142,13 @@ def test_time_is_read_exactly_from_any_epoch(tmp_path: Path, unit: str, per_seco
         cut = len(whole) - 9 + digits
         rows.append(f"{whole[:cut]}.{whole[cut:]}".rstrip(".") + f",{ROW}")
     header = f"timestamp [{unit}],gx,gy,gz,ax,ay,az"
-    read = read_own_csv(written(tmp_path / "epoch.csv", header, *rows))
+    read = read_generic_csv(written(tmp_path / "epoch.csv", header, *rows))
     assert read.time.tolist() == [step / 1e9 for step in steps.tolist()]
 
 
 def test_units_are_brought_to_si(tmp_path: Path) -> None:
     def read(header: str) -> tuple[FloatArray, FloatArray]:
-        imu = read_own_csv(written(tmp_path / "units.csv", header, f"0,{ROW}"))
+        imu = read_generic_csv(written(tmp_path / "units.csv", header, f"0,{ROW}"))
         return imu.gyro[0], imu.accel[0]
 
     gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.0])
@@ -187,7 +187,7 @@ def test_order_is_free_and_unknown_columns_are_ignored(
         "stand, 9.0, 2.0 ,1.0,,0.3,0.2,0.1,1,1010",
     )
     with caplog.at_level(logging.INFO):
-        read = read_own_csv(path)
+        read = read_generic_csv(path)
     assert "activity, temperature, qw" in caplog.text
     assert read.time.tolist() == [0.0, 0.01]
     assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
@@ -200,13 +200,13 @@ def test_slower_truth_is_valid_on_its_rows_only(tmp_path: Path) -> None:
     ]
     rows[20] = rows[20].replace("20,0,1", "20,,nan")
     path = written(tmp_path / "slow.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
-    read = read_own_csv(path)
+    read = read_generic_csv(path)
     assert len(read) == 21
     assert read.truth is not None
     assert np.allclose(read.truth.time, [0.0, 0.05, 0.1, 0.15])
     assert np.allclose(read.truth.position_W[:, 0], [0, 5, 10, 15])
     none = [row.rsplit(",", 7)[0] + ",,,,,,," for row in rows]
-    assert read_own_csv(written(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
+    assert read_generic_csv(written(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
 
 
 GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
@@ -244,7 +244,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
 def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, lines: list[str], told: str) -> None:
     path = written(tmp_path / "own.csv", *lines)
     with pytest.raises(ReadError) as caught:
-        read_own_csv(path)
+        read_generic_csv(path)
     assert "own.csv" in str(caught.value)
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -277,7 +277,7 @@ def test_rows_that_begin_and_end_with_blank_cells_stay_apart(tmp_path: Path) -> 
     header = f"{TRUTH_HEADER},{HEADER},note"
     truths = ["1,2,3,0,0,0,1", ",,,,,,", " , , ,,,,", "4,5,6,0,0,0,1"]
     rows = [f"{truth},{0.01 * k:.2f},{ROW}," for k, truth in enumerate(truths)]
-    read = read_own_csv(written(tmp_path / "both.csv", header, *rows))
+    read = read_generic_csv(written(tmp_path / "both.csv", header, *rows))
     assert np.allclose(read.time, [0.0, 0.01, 0.02, 0.03])
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
     assert read.truth is not None
@@ -286,7 +286,9 @@ def test_rows_that_begin_and_end_with_blank_cells_stay_apart(tmp_path: Path) -> 
 
 def test_a_wild_time_does_not_cost_the_truth_behind_it(tmp_path: Path) -> None:
     rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
-    truth = read_own_csv(written(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)).truth
+    truth = read_generic_csv(
+        written(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+    ).truth
     assert truth is not None
     assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
@@ -297,19 +299,19 @@ def test_columns_like_truth_that_are_not_read_are_warned_of(
 ) -> None:
     count = names.count(",") + 1
     path = written(tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1))
-    assert read_own_csv(path).truth is None
+    assert read_generic_csv(path).truth is None
     (record,) = (r for r in caplog.records if r.levelno == logging.WARNING)
     assert f"no ground truth is read from {names.replace(',', ', ')}: " in record.getMessage()
 
 
 def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path) -> None:
     header = "t,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
-    read = read_own_csv(written(tmp_path / "named.csv", header, *GOOD[1:]))
+    read = read_generic_csv(written(tmp_path / "named.csv", header, *GOOD[1:]))
     for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
         with pytest.raises(InputError, match=r"for named, whose file names its unit, .*omit the"):
             with_units(read, **options)
     assert np.array_equal(with_units(read).gyro, read.gyro)
-    plain = read_own_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better
+    plain = read_generic_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better
     assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))
 
 

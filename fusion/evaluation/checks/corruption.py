@@ -10,8 +10,8 @@ import numpy as np
 from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 
-Spoil = Callable[[ImuSequence, np.random.Generator], ImuSequence]
-Corrupt = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
+ModifySamples = Callable[[ImuSequence, np.random.Generator], ImuSequence]
+ModifyPredictions = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
 """Changes measured displacements (M, 3) and covariances (M, 3, 3) in place; the first argument is
 the share (M,) of all windows that are complete at each one's end."""
 
@@ -27,8 +27,8 @@ class Fault:
     """
 
     name: str
-    spoil: Spoil | None = None
-    corrupt: Corrupt | None = None
+    modify_samples: ModifySamples | None = None
+    modify_predictions: ModifyPredictions | None = None
 
 
 def faults(duration: float) -> list[Fault]:
@@ -36,57 +36,57 @@ def faults(duration: float) -> list[Fault]:
     half = 0.5 * duration
     return [
         Fault("none"),
-        Fault("network off by 1 m for 5 s", corrupt=_offset_block(5.0 / duration, 1.0)),
-        Fault("5 % of windows off by 2 m", corrupt=_outliers(0.05, 2.0)),
-        Fault("covariance 100 times too small", corrupt=_overconfident(0.01)),
+        Fault("network off by 1 m for 5 s", modify_predictions=_offset_block(5.0 / duration, 1.0)),
+        Fault("5 % of windows off by 2 m", modify_predictions=_outliers(0.05, 2.0)),
+        Fault("covariance 100 times too small", modify_predictions=_overconfident(0.01)),
         *(Fault(f"gap of {length:g} s", gap(half, length)) for length in (0.1, 1.0, 3.0)),
         *(Fault(f"{share:.0%} of samples dropped", drops(share)) for share in (0.05, 0.2)),
         *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
         Fault("accelerometer clipped", _clipped(0.98)),
         *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
-        Fault("one NaN from the network", corrupt=_nan_answer(0)),
-        Fault("one NaN in the covariance", corrupt=_nan_answer(1)),
+        Fault("one NaN from the network", modify_predictions=_nan_answer(0)),
+        Fault("one NaN in the covariance", modify_predictions=_nan_answer(1)),
         Fault("1 % duplicated, 1 % swapped", _reordered(0.01)),
         Fault("three wild timestamps", _wild_times(3)),
         Fault("ten spikes", _spikes(10)),
     ]
 
 
-def _offset_block(share: float, metres: float) -> Corrupt:
-    def corrupt(
+def _offset_block(share: float, metres: float) -> ModifyPredictions:
+    def modify_predictions(
         over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         mean[(over > 0.5) & (over <= 0.5 + share), 0] += metres
 
-    return corrupt
+    return modify_predictions
 
 
-def _outliers(share: float, metres: float) -> Corrupt:
-    def corrupt(
+def _outliers(share: float, metres: float) -> ModifyPredictions:
+    def modify_predictions(
         over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         hit = rng.random(len(mean)) < share
         mean[hit] += rng.choice([-metres, metres], (int(hit.sum()), 3)) / np.sqrt(3.0)
 
-    return corrupt
+    return modify_predictions
 
 
-def _overconfident(factor: float) -> Corrupt:
-    def corrupt(
+def _overconfident(factor: float) -> ModifyPredictions:
+    def modify_predictions(
         over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         covariance *= factor
 
-    return corrupt
+    return modify_predictions
 
 
-def _nan_answer(which: int) -> Corrupt:
-    def corrupt(
+def _nan_answer(which: int) -> ModifyPredictions:
+    def modify_predictions(
         over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         (mean, covariance)[which][len(mean) // 2] = np.nan
 
-    return corrupt
+    return modify_predictions
 
 
 def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
@@ -95,51 +95,51 @@ def _kept(sequence: ImuSequence, keep: BoolArray) -> ImuSequence:
     )
 
 
-def gap(start: float, seconds: float) -> Spoil:
+def gap(start: float, seconds: float) -> ModifySamples:
     """Remove `seconds` of samples, from `start` seconds after the first sample on."""
 
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         since = sequence.time - sequence.time[0] - start
         return _kept(sequence, (since <= 0.0) | (since >= seconds))
 
-    return spoil
+    return modify_samples
 
 
-def drops(share: float) -> Spoil:
+def drops(share: float) -> ModifySamples:
     """Remove a share of the samples at random."""
     return lambda sequence, rng: _kept(sequence, rng.random(len(sequence)) >= share)
 
 
-def _resampled(rate: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _resampled(rate: float) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         time = np.arange(sequence.time[0], sequence.time[-1], 1.0 / rate)
         gyro, accel = (
             interpolated(time, sequence.time, values) for values in (sequence.gyro, sequence.accel)
         )
         return replace(sequence, time=time, gyro=gyro, accel=accel)
 
-    return spoil
+    return modify_samples
 
 
-def _clipped(quantile: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _clipped(quantile: float) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         limit = float(np.quantile(np.abs(sequence.accel).max(axis=1), quantile))
         return replace(sequence, accel=np.clip(sequence.accel, -limit, limit))
 
-    return spoil
+    return modify_samples
 
 
-def _one_nan(field: str) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _one_nan(field: str) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         values = getattr(sequence, field).copy()
         values[len(values) // 2] = np.nan
         return replace(sequence, **{field: values})
 
-    return spoil
+    return modify_samples
 
 
-def _reordered(share: float) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _reordered(share: float) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         order = np.arange(len(sequence))
         for k in np.flatnonzero(rng.random(len(order) - 1) < share):
             order[[k, k + 1]] = order[[k + 1, k]]
@@ -151,23 +151,23 @@ def _reordered(share: float) -> Spoil:
             accel=sequence.accel[order],
         )
 
-    return spoil
+    return modify_samples
 
 
-def _wild_times(count: int) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _wild_times(count: int) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         time = sequence.time.copy()
         time[rng.integers(0, len(time), count)] += 1e6
         return replace(sequence, time=time)
 
-    return spoil
+    return modify_samples
 
 
-def _spikes(count: int) -> Spoil:
-    def spoil(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
+def _spikes(count: int) -> ModifySamples:
+    def modify_samples(sequence: ImuSequence, rng: np.random.Generator) -> ImuSequence:
         gyro, accel = sequence.gyro.copy(), sequence.accel.copy()
         gyro[rng.integers(0, len(gyro), count // 2), 1] += 200.0
         accel[rng.integers(0, len(accel), count - count // 2), 2] += 500.0
         return replace(sequence, gyro=gyro, accel=accel)
 
-    return spoil
+    return modify_samples
