@@ -35,5 +35,5 @@ def read_packaged_list(name: str, data: Path) -> list[ListEntry]:
 
 
 def split_paths(data: Path, split: str) -> list[Path]:
-    """Return the paths of the recordings of a list; arguments and errors as for `read_packaged_list`."""
+    """Return the paths of a list's recordings; arguments and errors as `read_packaged_list`."""
     return [one.path for one in read_packaged_list(split, data)]
