@@ -68,9 +68,9 @@ def smooth(
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
     builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
-    for taken, state in zip(measurements, local[1:], strict=True):
-        near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
-        builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
+    for m, state in zip(measurements, local[1:], strict=True):
+        fixes = [accepted.fix.shifted(-origin) for accepted in m.fixes]
+        builder.step(m.interval, m.offered, fixes, m.zero_velocity, state, m.segment)
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
@@ -113,12 +113,12 @@ def filled(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[Nav
     for i in keyframes[:-1]:
         start, end = states[-1], graph.state(i + 1)
         if len(segments[i]) > 1:
-            states += _between(start, end, segments[i])
+            states += _interpolated_states(start, end, segments[i])
         states.append(end)
     return states
 
 
-def _between(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
+def _interpolated_states(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
     """The states inside an interval, by the IMU from its start, bent to meet its end.
 
     What is missing at the end comes from white noise all along: the angle grows with time, the
@@ -134,21 +134,21 @@ def _between(start: NavState, end: NavState, segments: list[Segment]) -> list[Na
     states = []
     for time, R, v, p in rows[:-1]:
         s = (time - start.time) / duration
-        along = s * s * (3.0 - 2.0 * s) * dp + duration * s * s * (s - 1.0) * dv
-        speed = 6.0 * s * (1.0 - s) / duration * dp + s * (3.0 * s - 2.0) * dv
+        dp_s = s * s * (3.0 - 2.0 * s) * dp + duration * s * s * (s - 1.0) * dv
+        dv_s = 6.0 * s * (1.0 - s) / duration * dp + s * (3.0 * s - 2.0) * dv
         states.append(
             NavState(
                 time,
                 exp_so3(s * turn) @ R,
-                v + speed,
-                p + along,
-                _mix(start.b_g, end.b_g, s),
-                _mix(start.b_a, end.b_a, s),
-                _mix(start.covariance, end.covariance, s),
+                v + dv_s,
+                p + dp_s,
+                _interpolate(start.b_g, end.b_g, s),
+                _interpolate(start.b_a, end.b_a, s),
+                _interpolate(start.covariance, end.covariance, s),
             )
         )
     return states
 
 
-def _mix(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
+def _interpolate(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
     return np.asarray((1.0 - s) * a + s * b)

@@ -134,9 +134,9 @@ class GraphBuilder:
             self.close(guess)
             if self.estimates_turn:
                 self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
-            began = self._joints.get(self.count - self._window)
-            if displacement is not None and began is not None:
-                self._add_displacement(began, interval, *displacement)
+            window_start = self._joints.get(self.count - self._window)
+            if displacement is not None and window_start is not None:
+                self._add_displacement(window_start, interval, *displacement)
             self._joints[self.count] = self.graph.last
             if zero_velocity is not None:
                 self._add_zero_velocity(zero_velocity)
@@ -185,11 +185,11 @@ class GraphBuilder:
         """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
         R, v, p, b_g, b_a = self.graph.pose(k)
         for segment in self.segments[k]:
-            ahead = segment.predict(R, v, p, b_g, b_a)
+            end = segment.predict(R, v, p, b_g, b_a)
             if segment.stop > time:
-                share = (time - segment.start) / segment.duration
-                return _pose_between((R, v, p), ahead, share, segment.duration)
-            R, v, p = ahead
+                fraction = (time - segment.start) / segment.duration
+                return _pose_between((R, v, p), end, fraction, segment.duration)
+            R, v, p = end
         return R, v, p
 
     def _begin_disconnected(self, state: NavState) -> None:
@@ -259,8 +259,8 @@ def _usable(value: FloatArray, covariance: FloatArray) -> bool:
     return finite and dpotrf(covariance, lower=1)[1] == 0
 
 
-def _pose_between(start: Pose, end: Pose, share: float, duration: float) -> Pose:
+def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:
     """Between two poses a tenth of a second apart, with constant rate and acceleration."""
     (R0, v0, p0), (R1, v1, _) = start, end
-    v = v0 + share * (v1 - v0)
-    return exp_so3(share * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * share * duration * (v0 + v)
+    v = v0 + fraction * (v1 - v0)
+    return exp_so3(fraction * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * fraction * duration * (v0 + v)

@@ -33,7 +33,7 @@ _WIDER, _NARROWER = 1.2, 0.99
 """Ratios of variances from which on the gyroscope bias's prior is another: a graph begins anew
 with a wider one, and is told the difference to a narrower one."""
 
-_ROUNDS = 3
+_MAX_ROUNDS = 3
 """Of each optimisation: the next keyframe's goes on from there."""
 
 
@@ -97,10 +97,10 @@ class FixedLagEstimator:
         if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bearing and (told := gained_bias_information(*taken.bearing)):
-            self._add_bias_information(*told)
-        near = [self._near(accepted) for accepted in taken.fixes]
-        if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
+        if taken.bearing and (bias := gained_bias_information(*taken.bearing)):
+            self._add_bias_information(*bias)
+        local_fixes = [self._in_graph_frame(accepted) for accepted in taken.fixes]
+        if self._builder.step(taken.interval, taken.displacement, local_fixes, taken.zero_velocity):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -115,7 +115,7 @@ class FixedLagEstimator:
             self._begin(self._builder.count)
             return accepted
         for taken in accepted:
-            if taken.fix is fix and self._builder.fix(self._near(taken)):
+            if taken.fix is fix and self._builder.fix(self._in_graph_frame(taken)):
                 self._solve()
         return accepted
 
@@ -152,10 +152,10 @@ class FixedLagEstimator:
     def health(self, counts: SampleCounts) -> Health:
         """The filter's report with the graph's sigmas, and how often the graph fell back."""
         health = self._filter.health(counts, self.nav_state())
-        times, why = self._fallbacks
-        if times == 0:
+        count, reason = self._fallbacks
+        if count == 0:
             return health
-        note = f"graph fell back to the filter {times} times, last for {why}"
+        note = f"graph fell back to the filter {count} times, last for {reason}"
         return replace(health, notes=[*health.notes, note])
 
     @property
@@ -170,15 +170,15 @@ class FixedLagEstimator:
         """As the filter did: what the narrower prior knows more, as a measurement of zero."""
         variance = self._filter.bias_prior.variance
         if variance < _NARROWER * self._bias_prior:
-            more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
-            self._add_bias_information(np.zeros(3), more * np.eye(3))
+            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+            self._add_bias_information(np.zeros(3), pseudo_variance * np.eye(3))
             self._bias_prior = variance
 
     def _add_bias_information(self, b_g: FloatArray, covariance: FloatArray) -> None:
         graph = self._builder.graph
         graph.add(GyroBias(graph.last, b_g, covariance), gated=False)
 
-    def _near(self, accepted: Accepted) -> Fix:
+    def _in_graph_frame(self, accepted: Accepted) -> Fix:
         """A fix as the filter inflated it, from the graph's origin."""
         return accepted.inflated.shifted(-self._origin_W)
 
@@ -198,7 +198,7 @@ class FixedLagEstimator:
         builder = self._builder
         graph = builder.graph
         try:
-            graph.solve(_ROUNDS)
+            graph.solve(_MAX_ROUNDS)
             newest = graph.state(graph.last)
             builder.forget(newest.time - self._config.graph.lag)
         except IndeterminateError as error:

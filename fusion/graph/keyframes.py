@@ -30,13 +30,13 @@ from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
-_MOVED = 1e-3
+_CONVERGED = 1e-3
 """A round that moves no keyframe further [m] is the last."""
 
-_LOST_SIGMA = 1e5
+_UNDETERMINED_SIGMA = 1e5
 """Nobody walks so far, so fast or so biased: a state this uncertain [m, m/s, rad, ...] is free."""
 
-_LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
+_MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
 """Of a prior: smaller ones are rounding."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
@@ -143,7 +143,7 @@ class KeyframeGraph:
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
-            light = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
+            down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
             (self._states, self._turns), self._tree = start, None
             if isinstance(error, IndeterminateError):
@@ -151,7 +151,7 @@ class KeyframeGraph:
             raise IndeterminateError(
                 self._state_named(str(error))
             ) from error  # gtsam's way to tell
-        return Solution(rounds, light)
+        return Solution(rounds, down_weighted)
 
     def pose(self, k: int) -> KeyframeState:
         """A keyframe without its covariance."""
@@ -182,11 +182,11 @@ class KeyframeGraph:
                 reached += [k for k in term.term.keyframes if k > before]
         keys = [key for k in old for key in self._keys(k)]
         try:
-            _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+            _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
             raise IndeterminateError(self._state_named(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
-        self.add(self._marginal(range(before, max(reached) + 1), rest), gated=False)
+        self.add(self._marginal(range(before, max(reached) + 1), remaining), gated=False)
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
@@ -210,13 +210,13 @@ class KeyframeGraph:
                 factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
         return factors
 
-    def _marginal(self, reached: range, rest: Any) -> Prior:
+    def _marginal(self, reached: range, remaining: Any) -> Prior:
         """What elimination left of the keyframes that it reached."""
         turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
         for k in reached:  # a window may reach a pose alone: columns of the rest as well
-            rest.push_back(_uninformative_factor(k, k in self._turns))
+            remaining.push_back(_uninformative_factor(k, k in self._turns))
         keys = [key(k) for k in reached for key in (X, V, B)]
-        A, b = rest.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
+        A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
         about = tuple(self.pose(k) for k in reached)
         to_local = block_diag(
@@ -246,7 +246,7 @@ class KeyframeGraph:
             before = self._positions(values)
             values = values.retract(self._tree.optimize())
             moved = float(np.abs(self._positions(values) - before).max())
-            if not moved > _MOVED:
+            if not moved > _CONVERGED:
                 break
         if not np.isfinite(moved):
             raise IndeterminateError("the optimisation diverged")
@@ -266,7 +266,7 @@ class KeyframeGraph:
     def _check_determined(self) -> None:
         for k in (next(iter(self._time)), self.last):
             sigma = np.sqrt(np.diag(self.state(k).covariance))
-            if not (sigma < _LOST_SIGMA).all():
+            if not (sigma < _UNDETERMINED_SIGMA).all():
                 worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
                 raise IndeterminateError(f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s")
 
@@ -284,8 +284,8 @@ def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
     covariance: FloatArray = state.covariance
     turns: tuple[tuple[int, float], ...] = ()
     if turn is not None:
-        across = turn.covariance[:CORE, None]
-        covariance = np.block([[covariance, across], [across.T, turn.covariance[CORE:, None]]])
+        cross = turn.covariance[:CORE, None]
+        covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
         turns = ((k, turn.turn),)
     root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
     return Prior(k, (about,), root, np.zeros(len(root)), turns)
@@ -293,16 +293,16 @@ def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
 
 def _root_information(covariance: FloatArray) -> FloatArray:
     """A root of the inverse; directions that rounding left without variance are given a little."""
-    scale = np.sqrt(np.maximum(covariance.diagonal(), _LEAST_VARIANCE))
+    scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    values = np.maximum(values, _LEAST_CORRELATED)
+    values = np.maximum(values, _MIN_EIGENVALUE)
     return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
-def _uninformative_factor(k: int, turned: bool) -> Any:
+def _uninformative_factor(k: int, has_turn: bool) -> Any:
     """A factor without information on a keyframe, and on the network's turn there."""
     blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
-    if turned:
+    if has_turn:
         blocks.append((T(k), np.zeros((1, 1))))
     return linear_factor(blocks, np.zeros(1))
 

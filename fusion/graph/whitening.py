@@ -12,7 +12,7 @@ import numpy as np
 from stario.fusion.graph.factors import Displacement, Term
 from stario.sequences.sequence import FloatArray
 
-_FALSE, _FALSE_WAY = 0.5, 0.75
+_OUTLIER_POWER, _DISPLACEMENT_POWER = 0.5, 0.75
 """Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,
 as the filter does. Displacements go wrong in rows, and count less: five seconds of them off by 1 m
 cost 0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with the half."""
@@ -50,7 +50,7 @@ class Whitened:
             raise IndeterminateError(f"a {kind} that is not finite")
         if squared <= self.limit:
             return residual, blocks, 1.0
-        power = _FALSE_WAY if isinstance(self.term, Displacement) else _FALSE
+        power = _DISPLACEMENT_POWER if isinstance(self.term, Displacement) else _OUTLIER_POWER
         return residual, blocks, (self.limit / squared) ** power
 
     def factor(self, values: Any) -> Any:

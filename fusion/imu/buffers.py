@@ -18,22 +18,6 @@ from stario.sequences.windows import (
     resample,
 )
 
-_TAIL = 4
-"""Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
-
-_FIELDS = 64
-"""Fields that are kept: more than come between two intervals."""
-
-_AHEAD = 1.0
-"""A field that is this much ahead of the newest sample [s] is refuted by one that is not."""
-
-_FIELD_SECONDS = 0.11
-"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
-
-
-_LATE = 0.1
-"""A field older than the interval that was cut last by this [s] belongs to none that comes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -60,6 +44,10 @@ class Window:
     R_NB: FloatArray
     heading: float
     flagged: bool
+
+
+_TAIL_SAMPLES = 4
+"""Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
 
 
 class WindowBuffer:
@@ -92,7 +80,7 @@ class WindowBuffer:
         rows[:, 0] = time
         rows[:, 1:4] = (attitudes @ gyro[:, :, None])[:, :, 0]
         rows[:, 4:] = (attitudes @ accel[:, :, None])[:, :, 0]
-        tail, self._tail = self._tail, rows[-_TAIL - 1 : -1]
+        tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         start = float(time[0])
         # Averages reach half a step back: the tail.
         known = rows if tail is None else np.concatenate([tail, rows])
@@ -110,11 +98,24 @@ class WindowBuffer:
         return Window(imu_N, blocks[0].R_NB, heading, any(block.flagged for block in blocks))
 
 
+_MAX_FIELDS = 64
+"""Fields that are kept: more than come between two intervals."""
+
+_MAX_AHEAD = 1.0
+"""A field that is this much ahead of the newest sample [s] is refuted by one that is not."""
+
+_MAX_FIELD_AGE = 0.11
+"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
+
+_MAX_DELAY = 0.1
+"""A field older than the interval that was cut last by this [s] belongs to none that comes."""
+
+
 class FieldBuffer:
     """The newest magnetic fields of a stream."""
 
     def __init__(self) -> None:
-        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
         self._asked = -math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
@@ -129,11 +130,11 @@ class FieldBuffer:
         while (
             self._fields
             and time <= (last := self._fields[-1][0])
-            and -math.inf < now < last - _AHEAD
+            and -math.inf < now < last - _MAX_AHEAD
         ):
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
-        newest = max(newest, self._asked - _LATE)
+        newest = max(newest, self._asked - _MAX_DELAY)
         right = math.isfinite(time) and time > newest and float(np.abs(field_B).sum()) < ABSURD
         if right:
             self._fields.append((time, field_B))
@@ -143,5 +144,5 @@ class FieldBuffer:
         """The newest one at a time [s]; fields from ahead of it wait."""
         self._asked = time
         return next(
-            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
+            (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None
         )

@@ -42,10 +42,10 @@ BRIDGED = 0.2
 """A hole no longer than this [s] is bridged by what was measured at its ends, which a walker's step
 hardly changes; what is longer is a gap, that no window spans."""
 
-_HOLE = 0.05
+_HOLE_SECONDS = 0.05
 """A step longer than this [s] is a hole: what happened in it is little known."""
 
-_ALONE = 20
+_ISOLATED_SAMPLES = 20
 """Samples in a row that stand alone: then their times are not in seconds."""
 
 Sample = tuple[float, float, float, float, float, float, float]
@@ -149,7 +149,7 @@ class FrontEnd:
         self._late.on_time()
         before, self._newest = self._newest, time
         self.counts.used += 1
-        if self._samples and time - before > _HOLE:
+        if self._samples and time - before > _HOLE_SECONDS:
             self._hole = before, time
             if time - before > MAX_IMU_GAP:
                 self.counts.add_gap(before, time - before)
@@ -182,10 +182,10 @@ class FrontEnd:
             self._before_long_gap = None
         return intervals + self._complete()
 
-    def _check_pace(self) -> None:
+    def _check_time_unit(self) -> None:
         """Refuse a stream of which every sample from the first on stands alone."""
-        alone = self.counts.gap_count
-        if alone >= _ALONE and self.counts.used == alone + 1:
+        isolated = self.counts.gap_count
+        if isolated >= _ISOLATED_SAMPLES and self.counts.used == isolated + 1:
             step = statistics.median(length for _, length in self.counts.gaps)
             raise InputError(
                 "time", f"samples {step:.3g} s apart", "50 to 1000 in a second", "give times in s"
@@ -195,7 +195,7 @@ class FrontEnd:
         """End the interval in progress, span the gap by one of its own, start the grid anew."""
         before = self._samples
         self._samples = [sample]
-        self._check_pace()
+        self._check_time_unit()
         self._window.clear()
         if self._attitude is None:
             self._next = -math.inf

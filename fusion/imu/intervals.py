@@ -76,7 +76,7 @@ class ImuInterval:
 
     def without_window(self) -> ImuInterval:
         """What an estimator needs of it, without what only the network sees."""
-        return changed(self, window=None, attitudes=_NONE_KEPT)
+        return changed(self, window=None, attitudes=_NO_ATTITUDES)
 
     @property
     def start(self) -> float:
@@ -89,7 +89,7 @@ class ImuInterval:
         return float(self.time[-1])
 
 
-_NONE_KEPT = np.empty((0, 3, 3))
+_NO_ATTITUDES = np.empty((0, 3, 3))
 
 GAPS_LISTED = 100
 """How many gaps are kept one by one: an endless stream may have any number."""

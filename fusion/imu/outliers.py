@@ -18,8 +18,8 @@ SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
 """Off both neighbours by more than this, a sample is a spike [rad/s], [m/s^2]: heel strikes stay
 below half of it at 50 Hz."""
 
-_MOVES = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
-_LARGE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
+_MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+_LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
 """An axis that varies, or reads, no more than this may repeat itself: coarse digits at rest."""
 
 
@@ -56,23 +56,23 @@ class OutlierDetector:
         """
         values = table[:, 1:]
         steps = values[1:] - values[:-1]
-        spiky = np.abs(steps).max(axis=0) > SPIKE
-        spikes = self._mend(values) if spiky.any() else _NO_AXES
+        candidates = np.abs(steps).max(axis=0) > SPIKE
+        spikes = self._replace_spikes(values) if candidates.any() else _NO_AXES
         largest = np.maximum(self.largest, np.abs(values).max(axis=0))
         self._repeats = np.where(largest > self.largest, 0.0, self._repeats)
         self.largest = largest
-        stuck = _NO_AXES
+        saturated = _NO_AXES
         if not steps.all():
-            stuck = self._stuck(values)
-        wrong = (spikes + stuck) > 0
-        if not wrong.any():
+            saturated = self._count_saturated(values)
+        bad = (spikes + saturated) > 0
+        if not bad.any():
             return NO_FLAGS
         return Flags(
-            bool(wrong[:3].any()), bool(wrong[3:].any()), int(spikes.max()), int(stuck.max())
+            bool(bad[:3].any()), bool(bad[3:].any()), int(spikes.max()), int(saturated.max())
         )
 
     @staticmethod
-    def _mend(values: FloatArray) -> FloatArray:
+    def _replace_spikes(values: FloatArray) -> FloatArray:
         """Number of spikes per axis (6,), replaced by the mean of their neighbours."""
         found = np.zeros(6)
         n = len(values)
@@ -87,17 +87,17 @@ class OutlierDetector:
                 found += off
         return found
 
-    def _stuck(self, values: FloatArray) -> FloatArray:
+    def _count_saturated(self, values: FloatArray) -> FloatArray:
         """Number of samples per axis (6,) that repeat at the axis's limit."""
         size = np.abs(values)
-        moving = (np.ptp(values, axis=0) > _MOVES) | (self.largest > _LARGE)
+        moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
         repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
         count = repeated.sum(axis=0)
         self._repeats = self._repeats + count
-        return np.asarray(np.where(self._repeats >= _NO_CHANCE, count, 0.0))
+        return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))
 
 
-_NO_CHANCE = 2.0
+_MIN_REPEATS = 2.0
 """Repetitions at one and the same limit from which on they are none by chance."""
 
 NO_FLAGS = Flags()

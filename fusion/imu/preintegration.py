@@ -33,7 +33,7 @@ from stario.sequences.sequence import FloatArray
 # gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
 # the graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
-_LEAST_WALK = 1e-7
+_MIN_WALK = 1e-7
 
 _GAP_STEPS = 10
 
@@ -153,10 +153,10 @@ def gap_segment(
     density = turned / (stop - start) * np.outer(up_B, up_B)
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
-    hover = config.gravity * up_B + b_a
+    force_B = config.gravity * up_B + b_a
     # In one step position and velocity would be in error together: no graph can invert that.
     for _ in range(_GAP_STEPS):
-        pim.integrateMeasurement(hover, b_g, dt)
+        pim.integrateMeasurement(force_B, b_g, dt)
     return Segment(start, stop, config.gravity, pim)
 
 
@@ -180,7 +180,7 @@ def segment_of_all(
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     f = config.filter
-    return _widened(
+    return _widened_noise(
         config.noise,
         interval.accel_factor,
         interval.flags,
@@ -190,7 +190,7 @@ def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
 
 
 @lru_cache(maxsize=64)  # intervals in a row are alike, and checked settings take long to make
-def _widened(
+def _widened_noise(
     noise: ImuNoise, accel_factor: float, flags: Flags, gap_gyro: float, gap_accel: float
 ) -> ImuNoise:
     """White noise, wider where a sensor was saturated and where samples are missing."""
@@ -227,17 +227,17 @@ def preintegrate(
         gravity: magnitude [m/s^2].
     """
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
-    each = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
-    held = each[0]
-    params = _params(held, gravity) if held is noise else _new_params(held, gravity)
+    densities = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
+    current = densities[0]
+    params = _params(current, gravity) if current is noise else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     integrate = pim.integrateMeasurement
     # gtsam subtracts the bias itself, so it is added back here.
-    steps = zip(force + b_a, rate + b_g, dt.tolist(), each, strict=True)
+    steps = zip(force + b_a, rate + b_g, dt.tolist(), densities, strict=True)
     for step_force, step_rate, step, density in steps:
-        if density is not held:
-            held = density
-            _set_white_noise(params, held)
+        if density is not current:
+            current = density
+            _set_white_noise(params, current)
         integrate(step_force, step_rate, step)
     return Segment(float(time[0]), float(time[-1]), gravity, pim)
 
@@ -268,14 +268,14 @@ def corrected_increments(
     W = skew(gyro)
     W0, W1, first, last = W[:-1], W[1:], pairs[:-1], pairs[1:]
     # w0 x w1 - w1 x w0 counts the coning twice, hence its 1/24.
-    constant = 0.5 * (first + last) + step * _SHARES * (W0 @ last - W1 @ first)
+    constant = 0.5 * (first + last) + step * _CROSS_WEIGHTS * (W0 @ last - W1 @ first)
     force = constant[:, :, 1:]
     turn = (0.5 * step) * (W0 + W1)
     force = force + turn @ (0.5 * force + turn @ force / 6.0)
     return dt, constant[:, :, 0], force[:, :, 0]
 
 
-_SHARES = np.array([1.0 / 24.0, 1.0 / 12.0])
+_CROSS_WEIGHTS = np.array([1.0 / 24.0, 1.0 / 12.0])
 _EYE = np.eye(3)
 
 
@@ -284,8 +284,8 @@ def _new_params(noise: ImuNoise, gravity: float) -> Any:
     _set_white_noise(params, noise)
     params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
     # gtsam's graph factors invert them: none may be zero.
-    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _LEAST_WALK) ** 2)
-    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _LEAST_WALK) ** 2)
+    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _MIN_WALK) ** 2)
+    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _MIN_WALK) ** 2)
     return params
 
 

@@ -38,8 +38,8 @@ class StillnessDetector:
             return False
         sums = None if self._moves(interval) else _sums_of(interval)
         self.window = (*self.window, sums)[-self._intervals :]
-        known = [sums for sums in self.window if sums is not None]
-        return len(known) == self._intervals and self._quiet(np.sum(known, axis=0))
+        quiet = [sums for sums in self.window if sums is not None]
+        return len(quiet) == self._intervals and self._is_quiet(np.sum(quiet, axis=0))
 
     def mean_rates(self) -> FloatArray:
         """Mean rate (n, 3) of each interval of a still second [rad/s]."""
@@ -60,7 +60,7 @@ class StillnessDetector:
         bound = scatter_bound(count * self._intervals, seconds, self._scale)
         return not looks_still(0.0, scatter, bound)
 
-    def _quiet(self, sums: FloatArray) -> bool:
+    def _is_quiet(self, sums: FloatArray) -> bool:
         """Whether a second may scatter like this."""
         count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count

@@ -30,26 +30,6 @@ SET_BACK_SECONDS = 5.0
 """Late samples that advance for so long in a row [s] are of a clock that was set back; batches that
 come twice or in the wrong order are shorter."""
 
-_FROZEN_SECONDS = 0.1
-"""One sample for so long [s] is none: loggers that repeat slow ones do so for a few hundredths."""
-
-_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
-"""A coarse sensor at rest reads one sample as well: no faster turn [rad/s], and gravity to within
-this [m/s^2]."""
-
-_PIECE_S = 4.0
-"""Length of a piece [s], as in the check of recordings."""
-
-_WRONG_PIECES = 3
-"""Pieces that must fail, no calm one in between: two may share one fall; recordings fail none."""
-
-_TURNING_PIECES = 12
-"""Pieces in which the device turns that clear the gyroscope; later failures are not its unit's."""
-
-_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
-"""Exceeded for a twentieth of a piece: the first by walks, but at rest not by noise and bias, even
-in deg/s; the second by hardly any walk (recorded are 4.2 at most), but by all read as deg/s."""
-
 
 class ClockSetBackError(InputError):
     """The clock of the samples was set back.
@@ -96,6 +76,14 @@ class ClockSetBackDetector:
         return time - self._first
 
 
+_FROZEN_SECONDS = 0.1
+"""One sample for so long [s] is none: loggers that repeat slow ones do so for a few hundredths."""
+
+_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
+"""A coarse sensor at rest reads one sample as well: no faster turn [rad/s], and gravity to within
+this [m/s^2]."""
+
+
 class FrozenSensorDetector:
     """Watches the samples of a stream.
 
@@ -124,6 +112,20 @@ class FrozenSensorDetector:
         return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
 
 
+_PIECE_SECONDS = 4.0
+"""Length of a piece [s], as in the check of recordings."""
+
+_MIN_FAILED_PIECES = 3
+"""Pieces that must fail, no calm one in between: two may share one fall; recordings fail none."""
+
+_MIN_TURNING_PIECES = 12
+"""Pieces in which the device turns that clear the gyroscope; later failures are not its unit's."""
+
+_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
+"""Exceeded for a twentieth of a piece: the first by walks, but at rest not by noise and bias, even
+in deg/s; the second by hardly any walk (recorded are 4.2 at most), but by all read as deg/s."""
+
+
 class GyroUnitCheck:
     """Looks at a stream's intervals until the unit of the gyroscope is beyond doubt."""
 
@@ -140,11 +142,11 @@ class GyroUnitCheck:
         if interval.gap:
             self._tables = []
             return
-        if self._turned >= _TURNING_PIECES:
+        if self._turned >= _MIN_TURNING_PIECES:
             return
         table = np.column_stack([interval.time, interval.gyro, interval.accel])
         self._tables.append(table[1:] if self._tables else table)
-        if interval.stop - self._tables[0][0, 0] > _PIECE_S - 1e-6:
+        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - 1e-6:
             piece, self._tables = np.vstack(self._tables), []
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 
@@ -153,9 +155,9 @@ class GyroUnitCheck:
             _check_unit(time, gyro, accel)
         except InputError as error:
             self._wrong += 1
-            if self._wrong >= _WRONG_PIECES:
-                fix = "if it is in deg/s, push np.radians(gyro)"
-                raise InputError("gyro", error.found, error.expected, fix) from None
+            if self._wrong >= _MIN_FAILED_PIECES:
+                remedy = "if it is in deg/s, push np.radians(gyro)"
+                raise InputError("gyro", error.found, error.expected, remedy) from None
         else:
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:
