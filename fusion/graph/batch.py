@@ -1,4 +1,4 @@
-"""The whole track at once: keyframes optimised together, the states between them filled in."""
+"""Batch smoothing: optimise all keyframes of a track together and fill in the states between."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
 
 _UNKNOWN_POSITION = 1e4
-"""Standard deviation of a position that only fixes tell [m]."""
+"""Standard deviation of a position determined by fixes alone [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Smoothed:
     """A smoothed track.
 
     Attributes:
-        states: as many as were given, at the same times.
-        note: one line on how it went, for the health report.
-        fell_back: whether the states are the filter's.
+        states: one for each filtered state, at the same times.
+        note: one-line summary for the health report.
+        fell_back: whether the optimisation failed and the states are the filter's.
     """
 
     states: list[NavState]
@@ -52,25 +52,25 @@ def smooth(
 
     Args:
         filtered: the filter's states in one frame: the start and one for each interval.
-        prior: the start before any frame transform.
-        measurements: what the filter took in, interval by interval.
-        transforms: of the frame since the start.
+        prior: first state before any frame transform.
+        measurements: measurements given to the filter, interval by interval.
+        transforms: frame transforms since the start.
         config: noise, filter and graph settings.
-        gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as the filter knows it by the
-            magnetic field, which the graph does not see; None without one.
-        turn_sigma: of the network's turn [rad], where the filter came to know of one.
+        gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as estimated by the filter with
+            the magnetic field, which the graph does not use; None without a field.
+        turn_sigma: standard deviation of the network's turn [rad]; 0 if the filter estimates none.
 
     Returns:
-        The graph's states with their marginal covariances; those given where the graph does not
-        determine one.
+        The graph's states with their marginal covariances; the filtered ones if the graph does
+        not determine a state.
     """
-    origin = filtered[0].p_W  # near the track: see `EkfState`
+    origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
     builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
-    for taken, state in zip(measurements, local[1:], strict=True):
-        near = [accepted.fix.shifted(-origin) for accepted in taken.fixes]
-        builder.step(taken.interval, taken.offered, near, taken.zero_velocity, state, taken.segment)
+    for m, state in zip(measurements, local[1:], strict=True):
+        fixes = [accepted.fix.shifted(-origin) for accepted in m.fixes]
+        builder.step(m.interval, m.offered, fixes, m.zero_velocity, state, m.segment)
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
@@ -85,13 +85,16 @@ def smooth(
     ]
     note = (
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
-        f"{solution.down_weighted} measurements weighed down"
+        f"{solution.down_weighted} measurements down-weighted"
     )
     return Smoothed(states, note)
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:
-    """The prior in the last frame: what fixes told of position and yaw is theirs to tell again."""
+    """Return the prior in the last frame, without the position and yaw determined by fixes.
+
+    These fixes are measurements of the graph as well.
+    """
     transforms = [transform for transform in transforms if transform.since <= first.time]
     if not transforms:
         return replace(first, covariance=prior.covariance)
@@ -107,22 +110,22 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
 
 
 def filled(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:
-    """The keyframes of a solved graph and the states at the ends of the segments between them."""
+    """Return the keyframes of a solved graph and the states where the segments between them end."""
     keyframes = graph.keyframes
     states = [graph.state(keyframes[0])]
     for i in keyframes[:-1]:
         start, end = states[-1], graph.state(i + 1)
         if len(segments[i]) > 1:
-            states += _between(start, end, segments[i])
+            states += _interpolated_states(start, end, segments[i])
         states.append(end)
     return states
 
 
-def _between(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
-    """The states inside an interval, by the IMU from its start, bent to meet its end.
+def _interpolated_states(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
+    """Return the states between two keyframes: dead-reckoned, then corrected to meet the second.
 
-    What is missing at the end comes from white noise all along: the angle grows with time, the
-    position along the cubic that leaves with no error and arrives with both (Hermite).
+    The error at the end is attributed to white noise throughout. The attitude correction grows with
+    time, the position correction along the cubic that starts at zero and ends with both (Hermite).
     """
     R, v, p = start.R_WB, start.v_W, start.p_W
     rows = []
@@ -134,21 +137,21 @@ def _between(start: NavState, end: NavState, segments: list[Segment]) -> list[Na
     states = []
     for time, R, v, p in rows[:-1]:
         s = (time - start.time) / duration
-        along = s * s * (3.0 - 2.0 * s) * dp + duration * s * s * (s - 1.0) * dv
-        speed = 6.0 * s * (1.0 - s) / duration * dp + s * (3.0 * s - 2.0) * dv
+        dp_s = s * s * (3.0 - 2.0 * s) * dp + duration * s * s * (s - 1.0) * dv
+        dv_s = 6.0 * s * (1.0 - s) / duration * dp + s * (3.0 * s - 2.0) * dv
         states.append(
             NavState(
                 time,
                 exp_so3(s * turn) @ R,
-                v + speed,
-                p + along,
-                _mix(start.b_g, end.b_g, s),
-                _mix(start.b_a, end.b_a, s),
-                _mix(start.covariance, end.covariance, s),
+                v + dv_s,
+                p + dp_s,
+                _interpolate(start.b_g, end.b_g, s),
+                _interpolate(start.b_a, end.b_a, s),
+                _interpolate(start.covariance, end.covariance, s),
             )
         )
     return states
 
 
-def _mix(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
+def _interpolate(a: FloatArray, b: FloatArray, s: float) -> FloatArray:
     return np.asarray((1.0 - s) * a + s * b)

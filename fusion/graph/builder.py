@@ -1,4 +1,4 @@
-"""From intervals to a graph: when a keyframe is made, what binds and what measures it."""
+"""From intervals to a graph: add keyframes, connect them, and add their measurements."""
 
 from __future__ import annotations
 
@@ -31,36 +31,37 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
 _SAME_TIME = 1e-6
-"""A fix this close to a keyframe [s] is at it."""
+"""A fix within this time of a keyframe [s] counts as at it."""
 
 Pose = tuple[FloatArray, FloatArray, FloatArray]
 """R_WB (3, 3), v_W (3,), p_W (3,)."""
 
 
 class GraphBuilder:
-    """Feeds intervals to a `KeyframeGraph`.
+    """Builds a `KeyframeGraph` from intervals.
 
-    Keyframes stand where windows begin and end and at both ends of a gap. More of them bring
-    nothing: the IMU binds them as well over half a second as over a tenth, and tells what lies
-    between a keyframe and a fix. Two windows of a second, where updates come as often, do better
-    than one that is trusted as both together (whole tracks of 177 recordings, which also decided
-    it: 0.84 of the network's error instead of 0.90, the 95th percentile 1.19 instead of 1.46).
+    Keyframes are placed where windows begin and end and at both ends of a gap. More of them gain
+    nothing: the IMU connects them as well over half a second as over a tenth, and predicts the
+    motion between a keyframe and a fix. Two windows per second, where updates are that frequent, do
+    better than one that is trusted as much as both (whole tracks of 177 recordings, on which this
+    was chosen: 0.84 of the network's error instead of 0.90, 95th percentile 1.19 instead of 1.46).
 
     Args:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
-        count: intervals since the start or the last gap, where a graph is begun anew.
-        turn_sigma: of the network's turn, where fixes tell it from the yaw [rad]; 0: none.
-        turn: what is known of it at the first state, where it is not new.
-        streaming: take fixes as the filter judged them; displacements too, where it gives them the
-            same weight. A loss of the graph's own starts from what the IMU says: while the speed is
-            not yet known it took right displacements for outliers, one after the other, in 2 of 100
-            simulated walks for good.
+        count: number of intervals since the start or the last gap, for a graph that begins later.
+        turn_sigma: standard deviation of the network's turn [rad], where fixes distinguish it from
+            the yaw; 0 for no turn.
+        turn: estimate of the turn at the first state; None if it is new.
+        streaming: rely on the filter's gating of fixes, and of displacements if it weights them
+            equally. A robust loss in the graph starts from the IMU's prediction: while the speed
+            was still unknown it rejected correct displacements, one after the other, and in 2 of
+            100 simulated walks for good.
 
     Attributes:
         graph: the graph so far.
-        segments: by keyframe, the intervals' segments from it to the next (or to now).
-        count: intervals since the start or the last gap.
+        segments: for each keyframe, the intervals' segments up to the next keyframe or now.
+        count: number of intervals since the start or the last gap.
     """
 
     def __init__(
@@ -79,14 +80,14 @@ class GraphBuilder:
         f = config.filter
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
-        # The filter weighs every window of a second, the graph one or two of them.
+        # The filter uses every window of a second, the graph only one or two of them.
         self._gated_by_filter = streaming and f.update_rate == self._overlap
         self._window = round(f.output_rate * WINDOW_SECONDS)  # intervals
         self._spacing = self._window // self._overlap  # intervals
         self._pending: list[ImuInterval] = []
-        # Keyframes where windows end and begin, by the count of intervals; a gap ends them all.
+        # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
-        self._gaps: list[int] = []  # keyframes that a gap follows
+        self._gaps: list[int] = []  # keyframes followed by a gap
 
     @property
     def estimates_turn(self) -> bool:
@@ -95,7 +96,7 @@ class GraphBuilder:
 
     @property
     def newest(self) -> Segment:
-        """The segment that ends now, behind the last keyframe."""
+        """Segment that ends now, after the last keyframe."""
         return self.segments[self.graph.last][-1]
 
     def step(
@@ -107,18 +108,18 @@ class GraphBuilder:
         guess: NavState | None = None,
         segment: Segment | None = None,
     ) -> bool:
-        """Take in an interval and what was measured in it.
+        """Add an interval and its measurements.
 
         Args:
-            interval: the next one.
-            displacement: of the window that ends with it, None where there is none.
-            fixes: within the interval, in order.
-            zero_velocity: what was measured at rest, None where the device moved.
-            guess: state at its end from where the optimisation starts, None: by the IMU.
-            segment: its samples, where they are already folded.
+            interval: the next interval.
+            displacement: measured over the window that ends with it; None if there is none.
+            fixes: fixes within the interval, in order.
+            zero_velocity: measurement at rest; None if the device moved.
+            guess: initial guess of the state at its end; None predicts it from the IMU.
+            segment: its preintegrated samples, if available.
 
         Returns:
-            Whether a keyframe was made.
+            Whether a keyframe was added.
         """
         before = self.graph.last
         if interval.gap:
@@ -134,9 +135,9 @@ class GraphBuilder:
             self.close(guess)
             if self.estimates_turn:
                 self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
-            began = self._joints.get(self.count - self._window)
-            if displacement is not None and began is not None:
-                self._add_displacement(began, interval, *displacement)
+            window_start = self._joints.get(self.count - self._window)
+            if displacement is not None and window_start is not None:
+                self._add_displacement(window_start, interval, *displacement)
             self._joints[self.count] = self.graph.last
             if zero_velocity is not None:
                 self._add_zero_velocity(zero_velocity)
@@ -145,7 +146,7 @@ class GraphBuilder:
         return self.graph.last > before
 
     def close(self, guess: NavState | None = None) -> None:
-        """Make a keyframe of the intervals since the last one, where there are any."""
+        """Add a keyframe at the end of the intervals since the last one, if there are any."""
         if not self._pending:
             return
         graph = self.graph
@@ -161,7 +162,7 @@ class GraphBuilder:
         self.segments[graph.add_keyframe(whole, guess)] = []
 
     def fix(self, fix: Fix) -> bool:
-        """Take in a fix up to now, which measures the keyframe before it; False where none is."""
+        """Add a fix up to now to the keyframe before it; return False if there is none."""
         graph = self.graph
         before = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
         if not before:
@@ -170,10 +171,10 @@ class GraphBuilder:
         return True
 
     def forget(self, time: float) -> None:
-        """Marginalise the keyframes before the last one up to a time [s].
+        """Marginalise the keyframes before the last one at or before a time [s].
 
         Raises:
-            IndeterminateError: they are not determined.
+            IndeterminateError: their states are not determined.
         """
         first = max((k for k in self.graph.keyframes if self.graph.time(k) <= time), default=0)
         self.graph.marginalise(first)
@@ -182,18 +183,18 @@ class GraphBuilder:
         self._gaps = [k for k in self._gaps if k >= first]
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
-        """Dead reckoning from a keyframe to a time [s], at most to the end of its segments."""
+        """Dead-reckon from a keyframe to a time [s], or to the end of its segments if earlier."""
         R, v, p, b_g, b_a = self.graph.pose(k)
         for segment in self.segments[k]:
-            ahead = segment.predict(R, v, p, b_g, b_a)
+            end = segment.predict(R, v, p, b_g, b_a)
             if segment.stop > time:
-                share = (time - segment.start) / segment.duration
-                return _pose_between((R, v, p), ahead, share, segment.duration)
-            R, v, p = ahead
+                fraction = (time - segment.start) / segment.duration
+                return _pose_between((R, v, p), end, fraction, segment.duration)
+            R, v, p = end
         return R, v, p
 
     def _begin_disconnected(self, state: NavState) -> None:
-        """Behind a gap too long to be bridged: from the filter's new start."""
+        """Continue from the filter's new start after a gap too long to be bridged."""
         self.count = 0
         k = self.graph.add_disconnected(state)
         self.segments[k] = []
@@ -206,7 +207,7 @@ class GraphBuilder:
         self._pending.append(interval.without_window())
 
     def _segment_of(self, interval: ImuInterval) -> Segment:
-        """With the turn of a walker in a gap, which the filter adds to its state itself."""
+        """Preintegrate; a gap includes a pedestrian's turn, which the filter adds to its state."""
         last = self.graph.last
         R, _, _, b_g, b_a = self.graph.pose(last)
         if not interval.gap:
@@ -228,7 +229,7 @@ class GraphBuilder:
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:
         zero, k = np.zeros(3), self.graph.last
-        # One keyframe stands for the intervals since the one before.
+        # One keyframe represents all intervals since the previous one.
         covariance = zero_velocity.covariance / self._spacing
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
         self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
@@ -239,7 +240,7 @@ class GraphBuilder:
         R_k, v_k, p_k, _, _ = graph.pose(k)
         R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
-        # What the IMU adds, or what happens unseen.
+        # Noise of the IMU since the keyframe, or of the motion in a gap.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
         turned = f.gap_gyro_noise**2 * dt + gap_yaw_variance(dt) if k in self._gaps else 0.0
         drift = accel_noise**2 * dt * np.eye(3)
@@ -259,8 +260,8 @@ def _usable(value: FloatArray, covariance: FloatArray) -> bool:
     return finite and dpotrf(covariance, lower=1)[1] == 0
 
 
-def _pose_between(start: Pose, end: Pose, share: float, duration: float) -> Pose:
-    """Between two poses a tenth of a second apart, with constant rate and acceleration."""
+def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:
+    """Interpolate between poses a tenth of a second apart, at constant rate and acceleration."""
     (R0, v0, p0), (R1, v1, _) = start, end
-    v = v0 + share * (v1 - v0)
-    return exp_so3(share * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * share * duration * (v0 + v)
+    v = v0 + fraction * (v1 - v0)
+    return exp_so3(fraction * log_so3(R1 @ R0.T)) @ R0, v, p0 + 0.5 * fraction * duration * (v0 + v)

@@ -1,12 +1,12 @@
-"""What the graph's keyframes are measured by, each linearised by hand.
+"""Measurement terms of the graph's keyframes, linearised by hand.
 
-Every term gives its residual (measured minus predicted) and the Jacobians of what it predicts; the
-graph whitens them, weighs down what may be an outlier and hands gtsam a `JacobianFactor` in C++,
-anew in every round of the optimisation. gtsam's own factors would do for position and velocity
-alone: no factor of its has a displacement that turns with the yaw of a pose and not with its tilt
-(README.md, "Graph factors").
+Every term gives its residual (measured minus predicted) and the Jacobians of its prediction; the
+graph whitens them, down-weights possible outliers and passes gtsam a `JacobianFactor` in C++, again
+in every round of the optimisation. gtsam's own factors would suffice for position and velocity
+only: none models a displacement that turns with the yaw of a pose and not with its tilt (README.md,
+"Graph factors").
 
-Tangent of a keyframe, as gtsam's: pose R exp(w), p + R dp in the order w, dp; velocity additive;
+Tangent of a keyframe, as in gtsam: pose R exp(w), p + R dp in the order w, dp; velocity additive;
 biases additive, accelerometer first. Keys: x pose, v velocity, b biases, t the network's turn (1,).
 """
 
@@ -36,38 +36,38 @@ class Linearised(NamedTuple):
 
 
 class Term(Protocol):
-    """A measurement of one keyframe or several."""
+    """A measurement of one or more keyframes."""
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """Numbers of the keyframes it measures, in order."""
+        """Numbers of the measured keyframes, in order."""
         ...
 
     @property
     def covariance(self) -> FloatArray:
-        """(m, m), in the axes of the residual."""
+        """Covariance (m, m), in the axes of the residual."""
         ...
 
     def linearise(self, values: Any) -> Linearised:
-        """At gtsam `Values`."""
+        """Linearise at gtsam `Values`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of successive keyframes together: root error = offset, white with a norm of 1.
+    """Joint prior on successive keyframes: root error = offset, with unit white noise.
 
     The error is right-invariant, so that a turn about the vertical and a shift are the same
-    directions wherever the keyframes have moved since: what was marginalised cannot come to know
-    yaw by being linearised elsewhere than the rest of the graph. In gtsam's own tangent it does,
-    and a stream's yaw then is reported twice as certain as it is.
+    directions wherever the keyframes have moved since: the marginalised information cannot gain yaw
+    by being linearised at a different point from the rest of the graph. In gtsam's own tangent it
+    does, and a stream's yaw is then reported as twice as certain as it is.
 
     Attributes:
-        k: the first of the keyframes.
-        about: n states, of keyframe k and those behind it, that the error is counted from.
-        root: (m, 15 n + t), the columns of the turns behind those of the keyframes.
-        offset: (m,).
-        turns: t keyframes with a network's turn, and the turn [rad] that its error is counted from.
+        k: number of the first keyframe.
+        about: n states, of keyframe k and its successors, relative to which the error is defined.
+        root: (m, 15 n + t) square-root information; columns of the keyframes, then of the turns.
+        offset: (m,) right-hand side.
+        turns: t keyframes with a network's turn, and the turn [rad] at which its error is zero.
     """
 
     k: int
@@ -78,16 +78,16 @@ class Prior:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """All of them."""
+        """All keyframes of the prior."""
         return tuple(range(self.k, self.k + len(self.about)))
 
     @property
     def covariance(self) -> FloatArray:
-        """It is white already."""
+        """Identity: the root is already white."""
         return np.eye(len(self.offset))
 
     def linearise(self, values: Any) -> Linearised:
-        """In the rows of the root."""
+        """Linearise in the rows of the root."""
         residual, blocks = self.offset, []
         for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
             root = self.root[:, CORE * n : CORE * (n + 1)]
@@ -105,19 +105,19 @@ class Prior:
 class Displacement:
     """The network's displacement from keyframe i to keyframe j.
 
-    The network saw the window in a levelled frame N, whose yaw against W is that of
+    The network is given the window in a levelled frame N, whose yaw psi relative to W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
-    pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also learn
+    pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also infer
     tilt from it, which on some recordings doubles the error.
 
     Attributes:
         i: keyframe at the window's start.
         j: keyframe at its end.
-        d_N: (3,) [m].
+        d_N: (3,) displacement [m].
         R_NB: (3, 3) levelled attitude at the window's start.
         covariance: (3, 3) [m^2] in N.
-        turned: whether the network's turn at keyframe j is a state: d_N = R_z(tau) R_z(psi)^T
-            (p_j - p_i) - n then, as in the filter (README.md, "Fixes").
+        turned: whether the network's turn tau at keyframe j is a state; then
+            d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md, "Fixes").
     """
 
     i: int
@@ -133,7 +133,7 @@ class Displacement:
         return self.i, self.j
 
     def linearise(self, values: Any) -> Linearised:
-        """In the axes of N."""
+        """Linearise in the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
         if self.turned:
@@ -152,13 +152,13 @@ class Displacement:
 
 @dataclass(frozen=True, eq=False)
 class TurnWander:
-    """The network's turn is forgotten as a Gauss-Markov error: tau_j = kept tau_i + n.
+    """Gauss-Markov model of the network's turn: tau_j = kept tau_i + n.
 
     Attributes:
-        i: keyframe of the turn before.
-        j: of this one.
-        kept: correlation of the two; 0 for the first, whose i is j.
-        covariance: (1, 1) of n [rad^2].
+        i: keyframe of the previous turn.
+        j: keyframe of this turn.
+        kept: correlation of the two; 0 for the first turn, where i is j.
+        covariance: (1, 1) covariance of n [rad^2].
     """
 
     i: int
@@ -168,11 +168,11 @@ class TurnWander:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """Of both turns."""
+        """Keyframes of both turns."""
         return self.i, self.j
 
     def linearise(self, values: Any) -> Linearised:
-        """About the vertical."""
+        """Linearise about the vertical."""
         now, before = turn_at(values, self.j), turn_at(values, self.i)
         blocks = [(T(self.j), np.eye(1))]
         if self.i != self.j:
@@ -186,10 +186,10 @@ class Position:
 
     Attributes:
         k: keyframe before the measurement.
-        p_W: (3,) [m].
+        p_W: (3,) position [m].
         covariance: (3, 3) [m^2].
         dt: time since the keyframe [s].
-        shift_W: (3,) what the IMU adds to p_k + dt v_k until then [m].
+        shift_W: (3,) displacement beyond p_k + dt v_k until then, by the IMU [m].
     """
 
     k: int
@@ -200,11 +200,11 @@ class Position:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """The one before."""
+        """The preceding keyframe."""
         return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
-        """In W."""
+        """Linearise in W."""
         R, p = _pose(values, self.k)
         predicted = p + self.dt * values.atVector(V(self.k)) + self.shift_W
         H = np.zeros((3, 6))
@@ -218,9 +218,9 @@ class Velocity:
 
     Attributes:
         k: keyframe before the measurement.
-        v_W: (3,) [m/s].
+        v_W: (3,) velocity [m/s].
         covariance: (3, 3) [m^2/s^2].
-        gain_W: (3,) what the IMU adds until then [m/s].
+        gain_W: (3,) change of velocity until then, by the IMU [m/s].
     """
 
     k: int
@@ -230,11 +230,11 @@ class Velocity:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """The one before."""
+        """The preceding keyframe."""
         return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
-        """In W."""
+        """Linearise in W."""
         predicted = values.atVector(V(self.k)) + self.gain_W
         return Linearised(self.v_W - predicted, [(V(self.k), _EYE)])
 
@@ -245,8 +245,8 @@ class Yaw:
 
     Attributes:
         k: keyframe before the measurement.
-        R_WB: (3, 3) attitude of the keyframe that explains the measurement: the one estimated,
-            turned about the vertical by measured minus estimated yaw.
+        R_WB: (3, 3) attitude of the keyframe that explains the measurement: the estimate turned
+            about the vertical by measured minus estimated yaw.
         covariance: (1, 1) [rad^2].
     """
 
@@ -256,11 +256,11 @@ class Yaw:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """The one before."""
+        """The preceding keyframe."""
         return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
-        """About the vertical."""
+        """Linearise about the vertical."""
         R, _ = _pose(values, self.k)
         residual = math.atan2(*twist(self.R_WB @ R.T))
         H = np.zeros((1, 6))
@@ -270,11 +270,11 @@ class Yaw:
 
 @dataclass(frozen=True, eq=False)
 class GyroBias:
-    """The gyroscope's bias, as rest, a prior or the magnetic field tells it.
+    """The gyroscope's bias, measured at rest, by a prior or by the magnetic field.
 
     Attributes:
         k: keyframe.
-        b_g: (3,) [rad/s].
+        b_g: (3,) bias [rad/s].
         covariance: (3, 3) [rad^2/s^2].
     """
 
@@ -284,17 +284,17 @@ class GyroBias:
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """The one."""
+        """The measured keyframe."""
         return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
-        """In B."""
+        """Linearise in B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
         return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
 
 
 def turn_at(values: Any, k: int) -> float:
-    """The network's turn at a keyframe [rad]."""
+    """Return the network's turn at a keyframe [rad]."""
     return float(values.atVector(T(k))[0])
 
 

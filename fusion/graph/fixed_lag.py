@@ -1,9 +1,9 @@
-"""The fixed-lag graph for streams: the last seconds optimised anew at every keyframe.
+"""The fixed-lag graph for streams: optimise the last seconds again at every keyframe.
 
-What leaves the lag is marginalised. The filter runs alongside: it judges what is measured for both
-(`GraphBuilder`) and tells the graph what the magnetic field says of the gyroscope; the stream goes
-on from the filter's state where the graph does not determine its own, or where a late fix has
-changed what was judged.
+Keyframes that leave the lag are marginalised. The filter runs alongside: it gates the measurements
+for both (`GraphBuilder`) and provides the information of the magnetic field on the gyroscope bias.
+The graph restarts from the filter's state where it does not determine its own, or where a late fix
+has changed the filter's gating.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from stario.fusion.state import Health, NavState
 from stario.sequences.sequence import FloatArray
 
 _WIDER, _NARROWER = 1.2, 0.99
-"""Ratios of variances from which on the gyroscope bias's prior is another: a graph begins anew
-with a wider one, and is told the difference to a narrower one."""
+"""Ratios of variances beyond which the gyroscope bias's prior has changed: a wider one restarts the
+graph, a narrower one is added as a measurement of the difference."""
 
-_ROUNDS = 3
-"""Of each optimisation: the next keyframe's goes on from there."""
+_MAX_ROUNDS = 3
+"""Maximum rounds of each optimisation; the next keyframe's continues from there."""
 
 
 @dataclass(frozen=True, eq=False)
 class FixedLagState:
-    """Everything that a `FixedLagEstimator` knows between two intervals.
+    """Complete state of a `FixedLagEstimator` between two intervals.
 
     Attributes:
-        estimator: of the filter alongside.
+        estimator: state of the filter alongside.
         builder: the graph.
-        ahead: the newest state, carried on by the IMU from the last keyframe.
-        origin_W: (3,) of the graph's positions [m]: see `EkfState`.
-        map_frame: frame transforms before the graph began.
-        jumps: of the filter's track before that.
-        bias_prior: variance of the gyroscope bias's prior as the graph has it [rad^2/s^2].
-        fallbacks: how often the graph fell back to the filter, and why it last did.
+        ahead: newest state, propagated by the IMU from the last keyframe.
+        origin_W: (3,) origin of the graph's positions [m]; see `EkfState`.
+        map_frame: number of frame transforms before the graph began.
+        jumps: number of jumps of the filter's track before that.
+        bias_prior: variance of the gyroscope bias's prior in the graph [rad^2/s^2].
+        fallbacks: how often the graph fell back to the filter, and the latest reason.
     """
 
     estimator: EstimatorState
@@ -65,12 +65,12 @@ class FixedLagState:
 class FixedLagEstimator:
     """An `Estimator` whose states are those of a fixed-lag graph.
 
-    Between keyframes the state is that of the last one, carried on by the IMU.
+    Between keyframes the state is that of the last one, propagated by the IMU.
 
     Args:
         config: noise, filter and graph settings.
         start: time and levelled attitude of the first sample.
-        prior: what is known of the first pose; None starts level, at rest, at the origin.
+        prior: prior of the first pose; None starts level, at rest, at the origin.
     """
 
     smoothed = None
@@ -91,22 +91,22 @@ class FixedLagEstimator:
     def step(
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> None:
-        """Move to the interval's end and take in what was measured; as `Estimator.step`."""
+        """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
         taken = self._filter.step(interval, displacement, fixes)
         self._narrow_bias_prior()
         if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bearing and (told := gained_bias_information(*taken.bearing)):
-            self._add_bias_information(*told)
-        near = [self._near(accepted) for accepted in taken.fixes]
-        if self._builder.step(taken.interval, taken.displacement, near, taken.zero_velocity):
+        if taken.bearing and (bias := gained_bias_information(*taken.bearing)):
+            self._add_bias_information(*bias)
+        local_fixes = [self._in_graph_frame(accepted) for accepted in taken.fixes]
+        if self._builder.step(taken.interval, taken.displacement, local_fixes, taken.zero_velocity):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Take in a fix at a time before now; as `Estimator.late_fix`."""
+        """Apply a fix at a time before now; as `Estimator.late_fix`."""
         gating_counts = self._filter.gating_counts
         accepted = self._filter.late_fix(fix)
         if accepted is None:
@@ -115,13 +115,13 @@ class FixedLagEstimator:
             self._begin(self._builder.count)
             return accepted
         for taken in accepted:
-            if taken.fix is fix and self._builder.fix(self._near(taken)):
+            if taken.fix is fix and self._builder.fix(self._in_graph_frame(taken)):
                 self._solve()
         return accepted
 
     @property
     def state(self) -> FixedLagState:
-        """All that varies; it may be put back."""
+        """Complete state, which can be assigned back."""
         return FixedLagState(
             self._filter.state,
             self._builder,
@@ -141,49 +141,49 @@ class FixedLagEstimator:
 
     @property
     def time(self) -> float:
-        """Of the newest state [s]."""
+        """Time of the newest state [s]."""
         return self._ahead.state.time
 
     def nav_state(self) -> NavState:
-        """The newest state."""
+        """Return the newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
         return nav_states([ahead])[0].shifted(self._origin_W)
 
     def health(self, counts: SampleCounts) -> Health:
-        """The filter's report with the graph's sigmas, and how often the graph fell back."""
+        """Return the filter's report with the graph's sigmas and the number of fallbacks."""
         health = self._filter.health(counts, self.nav_state())
-        times, why = self._fallbacks
-        if times == 0:
+        count, reason = self._fallbacks
+        if count == 0:
             return health
-        note = f"graph fell back to the filter {times} times, last for {why}"
+        note = f"graph fell back to the filter {count} times, last because {reason}"
         return replace(health, notes=[*health.notes, note])
 
     @property
     def _stale(self) -> bool:
-        """Whether the filter knows by now that the graph began from something else."""
+        """Whether the filter has changed what the graph began from."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
         jumped = self._filter.map_frame_state.jumps != self._jumps
         return wider or turned or jumped or self._filter.map_frame != self._map_frame
 
     def _narrow_bias_prior(self) -> None:
-        """As the filter did: what the narrower prior knows more, as a measurement of zero."""
+        """Narrow the prior as the filter did: add its information as a measurement of zero."""
         variance = self._filter.bias_prior.variance
         if variance < _NARROWER * self._bias_prior:
-            more = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
-            self._add_bias_information(np.zeros(3), more * np.eye(3))
+            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+            self._add_bias_information(np.zeros(3), pseudo_variance * np.eye(3))
             self._bias_prior = variance
 
     def _add_bias_information(self, b_g: FloatArray, covariance: FloatArray) -> None:
         graph = self._builder.graph
         graph.add(GyroBias(graph.last, b_g, covariance), gated=False)
 
-    def _near(self, accepted: Accepted) -> Fix:
-        """A fix as the filter inflated it, from the graph's origin."""
+    def _in_graph_frame(self, accepted: Accepted) -> Fix:
+        """Return a fix as inflated by the filter, relative to the graph's origin."""
         return accepted.inflated.shifted(-self._origin_W)
 
     def _begin(self, count: int) -> None:
-        """A new graph from the filter's state."""
+        """Begin a new graph from the filter's state."""
         first = self._filter.nav_state()
         self._map_frame, self._origin_W = first.map_frame, first.p_W
         self._jumps = self._filter.map_frame_state.jumps
@@ -198,7 +198,7 @@ class FixedLagEstimator:
         builder = self._builder
         graph = builder.graph
         try:
-            graph.solve(_ROUNDS)
+            graph.solve(_MAX_ROUNDS)
             newest = graph.state(graph.last)
             builder.forget(newest.time - self._config.graph.lag)
         except IndeterminateError as error:

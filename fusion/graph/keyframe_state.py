@@ -1,4 +1,4 @@
-"""A keyframe's state: to and from gtsam, and its right-invariant error about another."""
+"""A keyframe's state: conversion to and from gtsam, and right-invariant error."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ _EYE = np.eye(3)
 
 
 class KeyframeState(NamedTuple):
-    """A keyframe's state."""
+    """State of a keyframe."""
 
     R_WB: FloatArray
-    """(3, 3)."""
+    """Attitude (3, 3)."""
     v_W: FloatArray
-    """(3,) [m/s]."""
+    """Velocity (3,) [m/s]."""
     p_W: FloatArray
-    """(3,) [m]."""
+    """Position (3,) [m]."""
     b_g: FloatArray
-    """(3,) [rad/s]."""
+    """Gyroscope bias (3,) [rad/s]."""
     b_a: FloatArray
-    """(3,) [m/s^2]."""
+    """Accelerometer bias (3,) [m/s^2]."""
 
     @classmethod
     def of(cls, values: Any, k: int) -> KeyframeState:
-        """Keyframe k in gtsam `Values`."""
+        """Read keyframe k from gtsam `Values`."""
         pose, bias = values.atPose3(X(k)), values.atConstantBias(B(k))
         return cls(
             pose.rotation().matrix(),
@@ -43,19 +43,19 @@ class KeyframeState(NamedTuple):
         )
 
     def insert_into(self, values: Any, k: int) -> None:
-        """Make this keyframe k of gtsam `Values`."""
+        """Insert this state into gtsam `Values` as keyframe k."""
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
         values.insert(V(k), self.v_W)
         values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
 
     def error_from(self, other: KeyframeState) -> FloatArray:
-        """Right-invariant error (15,) about another: theta, rho_v, rho_p, b_g, b_a."""
+        """Return the right-invariant error (15,) from another: theta, rho_v, rho_p, b_g, b_a."""
         R = self.R_WB @ other.R_WB.T
         pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
         return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
 
     def invariant_from_local(self) -> FloatArray:
-        """(15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
+        """Return the map (15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
         matrix = np.zeros((CORE, CORE))
         matrix[0:3, 0:3] = self.R_WB
         matrix[3:6, 0:3] = skew(self.v_W) @ self.R_WB

@@ -1,8 +1,8 @@
 """A factor graph over keyframes on gtsam: IMU, prior and measurements, solved and marginalised.
 
-A keyframe is a pose, a velocity and the biases. gtsam's `CombinedImuFactor` binds each to the next
-through the same preintegration as the filter's; the measurements are those of `factors`,
-linearised anew in every round. No factor calls back into Python.
+A keyframe is a pose, a velocity and the biases. gtsam's `CombinedImuFactor` connects each to the
+next by the same preintegration as in the filter; the measurements are the terms of `factors`,
+linearised again in every round. No factor calls back into Python.
 
 Sources: C. Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
 2017; F. Dellaert, M. Kaess, "Factor graphs for robot perception", 2017 (marginalisation).
@@ -30,14 +30,14 @@ from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
-_MOVED = 1e-3
-"""A round that moves no keyframe further [m] is the last."""
+_CONVERGED = 1e-3
+"""The optimisation stops after a round that moves no keyframe further than this [m]."""
 
-_LOST_SIGMA = 1e5
-"""Nobody walks so far, so fast or so biased: a state this uncertain [m, m/s, rad, ...] is free."""
+_UNDETERMINED_SIGMA = 1e5
+"""A state this uncertain [m, m/s, rad, ...] is undetermined: no walk is so far, fast or biased."""
 
-_LEAST_VARIANCE, _LEAST_CORRELATED = 1e-16, 1e-12
-"""Of a prior: smaller ones are rounding."""
+_MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
+"""Lower bounds of a prior's variances and of its correlations' eigenvalues: less is rounding."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
@@ -45,11 +45,11 @@ _NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
 
 @dataclass(frozen=True)
 class Solution:
-    """How the optimisation went.
+    """Outcome of an optimisation.
 
     Attributes:
-        rounds: linearisations of the measurements until nothing moved.
-        down_weighted: measurements that counted less than their covariance says.
+        rounds: number of times that the measurements were linearised.
+        down_weighted: number of measurements weighted less than their covariance implies.
     """
 
     rounds: int
@@ -57,20 +57,20 @@ class Solution:
 
 
 class KeyframeGraph:
-    """Keyframes, numbered from 0, with everything known of them.
+    """Keyframes, numbered from 0, with their IMU segments and measurements.
 
     Args:
         first: the first keyframe; its covariance is the prior.
-        gate: probability from which a residual counts as an outlier and is weighed down, where it
-            is not added as judged already.
-        turn: what is known of the network's turn at it, where that is a state.
+        gate: probability beyond which a residual counts as an outlier and is down-weighted, unless
+            it is added with `gated` false.
+        turn: estimate of the network's turn at the first keyframe; None if that is no state.
     """
 
     def __init__(self, first: NavState, gate: float, turn: TurnEstimate | None = None) -> None:
         self._gate = gate
         self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
-        self._segments: dict[int, Segment] = {}  # by the keyframe each begins at
+        self._segments: dict[int, Segment] = {}  # by the keyframe at which each begins
         self._terms: list[Whitened] = []
         self._turns: dict[int, float] = {}  # of the network, by keyframe
         self._tree: Any = None  # of the last solution
@@ -81,7 +81,7 @@ class KeyframeGraph:
         self.add(_prior(0, first, turn), gated=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the solution: `solve` comes before `state` then."""
+        """Return all but the solution: after restoring, call `solve` before `state`."""
         return vars(self) | {"_tree": None}
 
     @property
@@ -90,33 +90,33 @@ class KeyframeGraph:
         return list(self._time)
 
     def time(self, k: int) -> float:
-        """Of a keyframe [s]."""
+        """Return the time of a keyframe [s]."""
         return self._time[k]
 
     def add_keyframe(self, segment: Segment, guess: NavState) -> int:
-        """Bind a new keyframe to the last one by a segment; returns its number."""
+        """Connect a new keyframe to the last one by a segment; return its number."""
         self._segments[self.last] = segment
         self._insert(guess)
         return self.last
 
     def add_disconnected(self, state: NavState) -> int:
-        """A new keyframe that nothing binds to the last one; its covariance is its prior."""
+        """Add a unconnected keyframe with its covariance as prior; return its number."""
         self._insert(state)
         self.add(_prior(self.last, state), gated=False)
         return self.last
 
     def add(self, term: Term, gated: bool = True) -> None:
-        """Take in a measurement, of positive definite covariance; `gated` ones may be outliers."""
+        """Add a measurement with positive definite covariance, if `gated` as a possible outlier."""
         limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(Whitened.of(term, limit))
         self._tree = None
 
     def add_turn(self, sigma: float, memory: float) -> None:
-        """Make the network's turn at the last keyframe a state, where it is none yet.
+        """Make the network's turn at the last keyframe a state, unless it already is.
 
         Args:
-            sigma: of it in the long run [rad].
-            memory: after which it is forgotten [s].
+            sigma: its stationary standard deviation [rad].
+            memory: its correlation time [s].
         """
         j = self.last
         if j in self._turns:
@@ -128,14 +128,14 @@ class KeyframeGraph:
         self.add(TurnWander(i, j, kept, covariance), gated=False)
 
     def solve(self, most_rounds: int = 10) -> Solution:
-        """Move the keyframes to where everything known fits best.
+        """Optimise the keyframes.
 
         Args:
-            most_rounds: linearisations of the measurements after which it is good enough.
+            most_rounds: maximum number of linearisations of the measurements.
 
         Raises:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
-                keyframes stay as they were.
+                keyframes are then unchanged.
         """
         start = self._states, self._turns
         try:
@@ -143,32 +143,31 @@ class KeyframeGraph:
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
-            light = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
+            down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
             (self._states, self._turns), self._tree = start, None
             if isinstance(error, IndeterminateError):
                 raise
-            raise IndeterminateError(
-                self._state_named(str(error))
-            ) from error  # gtsam's way to tell
-        return Solution(rounds, light)
+            # gtsam's way to report it
+            raise IndeterminateError(self._state_named(str(error))) from error
+        return Solution(rounds, down_weighted)
 
     def pose(self, k: int) -> KeyframeState:
-        """A keyframe without its covariance."""
+        """Return a keyframe without its covariance."""
         return self._states[k]
 
     def state(self, k: int) -> NavState:
-        """A keyframe with its marginal covariance, after `solve`."""
+        """Return a keyframe with its marginal covariance; call after `solve`."""
         R, v, p, b_g, b_a = self.pose(k)
         joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Forget the keyframes before one, keeping what they say of it and of those behind it.
+        """Marginalise the keyframes before one, keeping their information on it and its successors.
 
         Raises:
-            IndeterminateError: what is forgotten is not determined.
+            IndeterminateError: a marginalised state is not determined.
         """
         old = [k for k in self._time if k < before]
         if not old:
@@ -182,11 +181,11 @@ class KeyframeGraph:
                 reached += [k for k in term.term.keyframes if k > before]
         keys = [key for k in old for key in self._keys(k)]
         try:
-            _, rest = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+            _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
             raise IndeterminateError(self._state_named(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
-        self.add(self._marginal(range(before, max(reached) + 1), rest), gated=False)
+        self.add(self._marginal(range(before, max(reached) + 1), remaining), gated=False)
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
@@ -202,7 +201,7 @@ class KeyframeGraph:
         return values
 
     def _imu_factors(self, before: float = math.inf) -> Any:
-        """What binds each keyframe before one to the next."""
+        """Return the factors that connect each keyframe before one to the next."""
         factors = gtsam.NonlinearFactorGraph()
         for i, segment in self._segments.items():
             if i < before:
@@ -210,13 +209,13 @@ class KeyframeGraph:
                 factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
         return factors
 
-    def _marginal(self, reached: range, rest: Any) -> Prior:
-        """What elimination left of the keyframes that it reached."""
+    def _marginal(self, reached: range, remaining: Any) -> Prior:
+        """Return the prior that elimination left on the keyframes that it reached."""
         turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
-        for k in reached:  # a window may reach a pose alone: columns of the rest as well
-            rest.push_back(_uninformative_factor(k, k in self._turns))
+        for k in reached:  # a window may reach only a pose; add the other columns
+            remaining.push_back(_uninformative_factor(k, k in self._turns))
         keys = [key(k) for k in reached for key in (X, V, B)]
-        A, b = rest.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
+        A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
         about = tuple(self.pose(k) for k in reached)
         to_local = block_diag(
@@ -232,10 +231,10 @@ class KeyframeGraph:
         self._tree = None
 
     def _optimise(self, most_rounds: int) -> tuple[int, Any]:
-        """Full steps of Gauss and Newton, which follow the IMU's stiff factors as a filter does.
+        """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
-        A step may raise their error by its second order and yet be right, where a start was askew:
-        Levenberg and Marquardt's damping then creeps, and a stream gives out what has not arrived.
+        From a poor start, a correct step may increase their error by its second-order terms.
+        Levenberg-Marquardt's damping is then slow, and a stream would output unconverged states.
         """
         factors, values, ordering = self._imu_factors(), self._values(), self._ordering()
         for _round in range(most_rounds):
@@ -246,7 +245,7 @@ class KeyframeGraph:
             before = self._positions(values)
             values = values.retract(self._tree.optimize())
             moved = float(np.abs(self._positions(values) - before).max())
-            if not moved > _MOVED:
+            if not moved > _CONVERGED:
                 break
         if not np.isfinite(moved):
             raise IndeterminateError("the optimisation diverged")
@@ -256,7 +255,7 @@ class KeyframeGraph:
         return np.array([values.atPose3(X(k)).translation() for k in self._time])
 
     def _ordering(self) -> Any:
-        """Time's: the graph is a chain whose longest link is a window."""
+        """Return the order of time: the graph is a chain whose longest link is a window."""
         return _ordering([key for k in self._time for key in self._keys(k)])
 
     def _keys(self, k: int) -> list[int]:
@@ -266,43 +265,45 @@ class KeyframeGraph:
     def _check_determined(self) -> None:
         for k in (next(iter(self._time)), self.last):
             sigma = np.sqrt(np.diag(self.state(k).covariance))
-            if not (sigma < _LOST_SIGMA).all():
+            if not (sigma < _UNDETERMINED_SIGMA).all():
                 worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
-                raise IndeterminateError(f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s")
+                raise IndeterminateError(
+                    f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s is undetermined"
+                )
 
     def _state_named(self, message: str) -> str:
-        """The state that gtsam's message is about."""
+        """Name the state that gtsam's message concerns."""
         found = re.search(r"Symbol: ([xvbt])(\d+)", message)
         if found is None:
             return message.strip().splitlines()[0]
-        return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s"
+        return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s is undetermined"
 
 
 def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
-    """A state's covariance, and that of the network's turn, as what is known of a keyframe."""
+    """Return the prior of a keyframe from a state's covariance and that of the network's turn."""
     about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     covariance: FloatArray = state.covariance
     turns: tuple[tuple[int, float], ...] = ()
     if turn is not None:
-        across = turn.covariance[:CORE, None]
-        covariance = np.block([[covariance, across], [across.T, turn.covariance[CORE:, None]]])
+        cross = turn.covariance[:CORE, None]
+        covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
         turns = ((k, turn.turn),)
     root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
     return Prior(k, (about,), root, np.zeros(len(root)), turns)
 
 
 def _root_information(covariance: FloatArray) -> FloatArray:
-    """A root of the inverse; directions that rounding left without variance are given a little."""
-    scale = np.sqrt(np.maximum(covariance.diagonal(), _LEAST_VARIANCE))
+    """Return a root of the inverse; directions left without variance by rounding get a little."""
+    scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    values = np.maximum(values, _LEAST_CORRELATED)
+    values = np.maximum(values, _MIN_EIGENVALUE)
     return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
-def _uninformative_factor(k: int, turned: bool) -> Any:
-    """A factor without information on a keyframe, and on the network's turn there."""
+def _uninformative_factor(k: int, has_turn: bool) -> Any:
+    """Return a factor without information on a keyframe and, if present, the turn there."""
     blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
-    if turned:
+    if has_turn:
         blocks.append((T(k), np.zeros((1, 1))))
     return linear_factor(blocks, np.zeros(1))
 

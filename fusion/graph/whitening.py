@@ -1,4 +1,4 @@
-"""Terms of the graph whitened, outliers weighed down, as linear factors of gtsam."""
+"""Whitened terms of the graph, with outliers down-weighted, as linear factors of gtsam."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 from stario.fusion.graph.factors import Displacement, Term
 from stario.sequences.sequence import FloatArray
 
-_FALSE, _FALSE_WAY = 0.5, 0.75
-"""Power of limit / squared norm that an outlier is weighed with: a half inflates it to the limit,
-as the filter does. Displacements go wrong in rows, and count less: five seconds of them off by 1 m
-cost 0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with the half."""
+_OUTLIER_POWER, _DISPLACEMENT_POWER = 0.5, 0.75
+"""Powers of limit / squared norm that weight outliers: a half inflates them to the limit, as the
+filter does. Wrong displacements come in a row and count less: five seconds of them off by 1 m cost
+0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with a half."""
 
 
 class IndeterminateError(Exception):
-    """The graph does not determine a state; the message names it and its time."""
+    """The graph cannot be solved; the message names the cause, such as a state and its time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """A term with its covariance's whitener (m, m) and the squared norm that is an outlier's."""
+    """A term, its covariance's whitener (m, m), and the squared norm that makes it an outlier."""
 
     term: Term
     whitener: FloatArray
@@ -32,35 +32,35 @@ class Whitened:
 
     @classmethod
     def of(cls, term: Term, limit: float) -> Whitened:
-        """A term with the squared norm of its white residual from which it is an outlier."""
+        """Whiten a term; a squared norm of its white residual above the limit is an outlier."""
         return cls(term, np.linalg.inv(np.linalg.cholesky(term.covariance)), limit)
 
     @property
     def first(self) -> int:
-        """The first keyframe it touches."""
+        """Number of its first keyframe."""
         return self.term.keyframes[0]
 
     def weighted(self, values: Any) -> tuple[FloatArray, list[tuple[int, FloatArray]], float]:
-        """Residual, Jacobian blocks and weight at gtsam `Values`."""
+        """Return residual, Jacobian blocks and weight at gtsam `Values`."""
         residual, blocks = self.term.linearise(values)
         white = self.whitener @ residual
         squared = float(white @ white)
         if not math.isfinite(squared):
             kind = type(self.term).__name__.lower()
-            raise IndeterminateError(f"a {kind} that is not finite")
+            raise IndeterminateError(f"a {kind} is not finite")
         if squared <= self.limit:
             return residual, blocks, 1.0
-        power = _FALSE_WAY if isinstance(self.term, Displacement) else _FALSE
+        power = _DISPLACEMENT_POWER if isinstance(self.term, Displacement) else _OUTLIER_POWER
         return residual, blocks, (self.limit / squared) ** power
 
     def factor(self, values: Any) -> Any:
-        """The linear factor, linearised and weighed at `Values`."""
+        """Return the linear factor, linearised and weighted at gtsam `Values`."""
         residual, blocks, weight = self.weighted(values)
         scaled = weight * self.whitener
         return linear_factor([(key, scaled @ H) for key, H in blocks], scaled @ residual)
 
 
 def linear_factor(blocks: list[tuple[int, FloatArray]], b: FloatArray) -> Any:
-    """A `JacobianFactor` of white rows; from Python only a conditional takes any number of keys."""
+    """Return a `JacobianFactor` of white rows; in Python only a conditional takes many keys."""
     unit = gtsam.noiseModel.Unit.Create(len(b))
     return gtsam.JacobianFactor(gtsam.GaussianConditional(blocks, 1, b, unit))

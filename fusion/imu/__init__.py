@@ -1,1 +1,1 @@
-"""The front end: raw samples checked, cut into intervals and preintegrated."""
+"""The front end: check raw samples, cut them into intervals and preintegrate them."""

@@ -1,4 +1,4 @@
-"""Buffers of a stream: the last second for the network, magnetic fields until their interval."""
+"""Buffers of a stream: the last second for the network, and magnetic fields not yet used."""
 
 from __future__ import annotations
 
@@ -18,32 +18,16 @@ from stario.sequences.windows import (
     resample,
 )
 
-_TAIL = 4
-"""Samples kept of the interval before: half a step of the window's grid at the fastest rate."""
-
-_FIELDS = 64
-"""Fields that are kept: more than come between two intervals."""
-
-_AHEAD = 1.0
-"""A field that is this much ahead of the newest sample [s] is refuted by one that is not."""
-
-_FIELD_SECONDS = 0.11
-"""How old the field at an interval's end may be [s]: slow sensors give ten in a second."""
-
-
-_LATE = 0.1
-"""A field older than the interval that was cut last by this [s] belongs to none that comes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """An interval's part of a window.
+    """One interval's part of a window.
 
     Attributes:
-        imu_N: (6, n) the IMU in N.
+        imu_N: (6, n) gyroscope [rad/s] and specific force [m/s^2] in N.
         R_NB: (3, 3) levelled attitude at its start.
-        facing_N: (2,) which way the device faces there.
-        flagged: whether a sample cannot be trusted.
+        facing_N: (2,) direction that the device faces there, as given by `facing`.
+        flagged: whether it contains faulty or missing samples.
     """
 
     imu_N: NDArray[np.float32]
@@ -54,7 +38,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The last second, as `ImuInterval` tells of it."""
+    """The last second; `ImuInterval` documents the values."""
 
     imu_N: NDArray[np.float32]
     R_NB: FloatArray
@@ -62,11 +46,15 @@ class Window:
     flagged: bool
 
 
+_TAIL_SAMPLES = 4
+"""Samples kept from the previous interval: half a step of the window's grid at the fastest rate."""
+
+
 class WindowBuffer:
     """The last second of unbroken samples.
 
     Args:
-        rate: intervals in a second.
+        rate: number of intervals per second.
     """
 
     def __init__(self, rate: int) -> None:
@@ -75,7 +63,7 @@ class WindowBuffer:
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
 
     def clear(self) -> None:
-        """No window spans what comes next."""
+        """Forget all samples, so that no window spans a gap."""
         self._blocks.clear()
         self._tail = None
 
@@ -87,21 +75,21 @@ class WindowBuffer:
         attitudes: FloatArray,
         flagged: bool,
     ) -> None:
-        """Take in an interval that follows: its samples and the levelled attitudes R_NB at them."""
+        """Add the next interval: its samples and the levelled attitudes R_NB at them."""
         rows = np.empty((len(time), 7))
         rows[:, 0] = time
         rows[:, 1:4] = (attitudes @ gyro[:, :, None])[:, :, 0]
         rows[:, 4:] = (attitudes @ accel[:, :, None])[:, :, 0]
-        tail, self._tail = self._tail, rows[-_TAIL - 1 : -1]
+        tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         start = float(time[0])
-        # Averages reach half a step back: the tail.
+        # The first average reaches half a grid step back, into the tail.
         known = rows if tail is None else np.concatenate([tail, rows])
         imu_N = resample(known[:, 0], known[:, 1:], start + self._grid).astype(np.float32).T
         R_NB = attitudes[0]
         self._blocks.append(Block(imu_N, R_NB, facing(R_NB), flagged))
 
     def window(self) -> Window | None:
-        """The second that ends with the newest interval; None before one is whole."""
+        """Return the second that ends with the newest interval; None before a whole one is held."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
             return None
@@ -110,30 +98,43 @@ class WindowBuffer:
         return Window(imu_N, blocks[0].R_NB, heading, any(block.flagged for block in blocks))
 
 
+_MAX_FIELDS = 64
+"""Maximum number of fields kept, more than arrive between two intervals."""
+
+_MAX_AHEAD = 1.0
+"""A field further than this ahead of the newest sample [s] is dropped once an earlier one comes."""
+
+_MAX_FIELD_AGE = 0.11
+"""Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
+
+_MAX_DELAY = 0.1
+"""A field this much older than the end of the last interval [s] is too late for any other."""
+
+
 class FieldBuffer:
     """The newest magnetic fields of a stream."""
 
     def __init__(self) -> None:
-        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_FIELDS)
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
         self._asked = -math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
-        """Take in a field (3,) [uT] in B; False where its value or its time cannot be right.
+        """Add a field; return False if its value or time cannot be right.
 
         Args:
-            time: its own [s].
-            field_B: (3,) [uT].
-            now: time of the newest sample [s]. One wild time must not make all that follow look
-                late, so a field far ahead of it counts only until an earlier one comes.
+            time: time of the field [s].
+            field_B: (3,) magnetic field in B [uT].
+            now: time of the newest sample [s]. A field far ahead of it is kept only until an
+                earlier one comes, so that one wild time does not make all later fields look late.
         """
         while (
             self._fields
             and time <= (last := self._fields[-1][0])
-            and -math.inf < now < last - _AHEAD
+            and -math.inf < now < last - _MAX_AHEAD
         ):
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
-        newest = max(newest, self._asked - _LATE)
+        newest = max(newest, self._asked - _MAX_DELAY)
         right = (
             math.isfinite(time)
             and time > newest
@@ -144,8 +145,8 @@ class FieldBuffer:
         return right
 
     def at(self, time: float) -> FloatArray | None:
-        """The newest one at a time [s]; fields from ahead of it wait."""
+        """Return the newest field (3,) up to a time [s], None if too old; later fields wait."""
         self._asked = time
         return next(
-            (m_B for t, m_B in reversed(self._fields) if time - _FIELD_SECONDS <= t <= time), None
+            (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None
         )

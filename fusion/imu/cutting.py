@@ -1,4 +1,4 @@
-"""IMU intervals cut in pieces at the times of fixes."""
+"""Split IMU intervals at the times of fixes."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from stario.fusion.fixes import Fix
 from stario.fusion.imu.intervals import ImuInterval
 
 _SAME_TIME = 1e-6
-"""Fixes this close [s] to an interval's end are taken to be at it."""
+"""A fix within this time of an interval's start or end [s] counts as at it."""
 
 
 def parts(
     interval: ImuInterval, fixes: Sequence[Fix]
 ) -> list[tuple[ImuInterval | None, list[Fix]]]:
-    """An interval cut at its fixes' times: each piece, and the fixes at that piece's end.
+    """Split an interval at the times of its fixes; return each piece with the fixes at its end.
 
-    Fixes at the interval's very start come first, with no piece before them.
+    Fixes at the start of the interval come first, with None as their piece.
 
     Args:
         interval: the interval.
-        fixes: with start <= time <= stop, in order.
+        fixes: fixes with start <= time <= stop, in order.
     """
     pieces: list[tuple[ImuInterval | None, list[Fix]]] = []
     rest = interval
@@ -43,7 +43,7 @@ def parts(
 
 
 def cut(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
-    """An interval before and after a time [s] inside it; window and update stay behind it."""
+    """Split an interval at a time [s] inside it; the second part keeps window and update."""
     k = int(np.searchsorted(interval.time, time))
     weight = (time - interval.time[k - 1]) / (interval.time[k] - interval.time[k - 1])
     first: dict[str, Any] = {"time": np.append(interval.time[:k], time)}

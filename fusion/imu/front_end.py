@@ -1,15 +1,15 @@
-"""From raw samples to intervals: what stands before network and filter, alike in stream and batch.
+"""The front end: raw samples to intervals for network and filter, the same in stream and batch.
 
 Samples are checked, brought into strictly increasing time and cut at an even grid of times, with
-the IMU interpolated exactly there (so that nothing is integrated twice or left out). Each interval
-carries its samples; at the times of a network update also the window that ends there, once a
-second of unbroken samples is there.
+the IMU interpolated exactly there (so that nothing is integrated twice or skipped). Each interval
+holds its samples and, at the times of a network update, the window that ends there, provided that
+the last second of samples is unbroken.
 Samples that jump ahead in time wait until others confirm them, so that one wild timestamp does not
-make all that follow look late (`sequences.time_order`). Behind a gap longer than `LONG_GAP`
-nothing of attitude and speed is left: it begins anew there.
+make all later samples look late (`sequences.time_order`). After a gap longer than `LONG_GAP`
+attitude and speed are unknown, and the attitude is initialised again from gravity.
 
-Nothing here depends on the filter: batch runs may therefore hand all windows to the network at once
-and still give the streamed track.
+Nothing here depends on the filter, so batch runs can pass all windows to the network at once and
+still reproduce the streamed track.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import MAX_IMU_GAP
 
 BRIDGED = 0.2
-"""A hole no longer than this [s] is bridged by what was measured at its ends, which a walker's step
-hardly changes; what is longer is a gap, that no window spans."""
+"""A hole no longer than this [s] is bridged by interpolating between the samples at its ends, which
+a pedestrian's step hardly changes; a longer one is a gap, which no window spans."""
 
-_HOLE = 0.05
-"""A step longer than this [s] is a hole: what happened in it is little known."""
+_HOLE_SECONDS = 0.05
+"""A time step longer than this [s] is a hole: the motion within it is poorly known."""
 
-_ALONE = 20
-"""Samples in a row that stand alone: then their times are not in seconds."""
+_ISOLATED_SAMPLES = 20
+"""This many samples in a row, each isolated by gaps, show that times are not in seconds."""
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -56,7 +56,7 @@ class FrontEnd:
     """Collects samples and yields intervals.
 
     Args:
-        config: update rate and levelling.
+        config: update rate, gravity, and whether the magnetometer is used.
     """
 
     def __init__(self, config: NavigatorConfig) -> None:
@@ -69,23 +69,23 @@ class FrontEnd:
         self._next = -math.inf
         self._newest = -math.inf
         self._window = WindowBuffer(rate)
-        self._hole = (-math.inf, -math.inf)  # the last one, its ends [s]
+        self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
         self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
         self._fields = FieldBuffer()
         self._late = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
-        self.gyro_unit = GyroUnitCheck()  # for streams, that nobody can check as a whole
+        self.gyro_unit = GyroUnitCheck()  # for streams, which cannot be checked as a whole
         self.counts = SampleCounts()
         self.start: Start | None = None
 
     def push(self, sample: Sample) -> list[ImuInterval]:
-        """Take one sample in; returns the intervals it completes (mostly none, seldom several).
+        """Add a sample; return the intervals that it completes (usually none, rarely several).
 
         Raises:
-            InputError: every sample stands alone.
-            ClockSetBackError: this one and those before it are of a clock that was set back.
+            InputError: every sample so far is isolated by gaps.
+            ClockSetBackError: this and the preceding samples come from a clock that was set back.
         """
         time = sample[0]
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < MAX_SENSOR_VALUE):
@@ -110,22 +110,22 @@ class FrontEnd:
         return []
 
     def push_field(self, time: float, field_B: FloatArray) -> None:
-        """Take in a magnetic field (3,) [uT] in B, before the samples that follow it."""
+        """Add a magnetic field (3,) [uT] in B, before any later sample is pushed."""
         if self._config.filter.magnetometer and not self._fields.add(time, field_B, self._newest):
             self.counts.field_dropped += 1
 
     @property
     def newest(self) -> float:
-        """Time of the newest sample that counts [s]; minus infinity before the first."""
+        """Time of the newest accepted sample [s]; minus infinity before the first."""
         return self._newest
 
     def finish(self) -> None:
-        """Nothing follows: what still waits for others to confirm its time is dropped."""
+        """End the stream: drop the samples that still wait for others to confirm their times."""
         self.counts.future += len(self._ahead)
         self._ahead = []
 
     def _drop_ahead(self, time: float) -> None:
-        """Drop those of the samples that wait which a sample shows to have come from the future."""
+        """Drop the waiting samples whose times are refuted by a new sample at `time`."""
         ahead = self._ahead
         known = len(ahead)
         if time < ahead[0][0]:
@@ -135,7 +135,7 @@ class FrontEnd:
         self.counts.future += known - len(ahead)
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
-        """A jump ahead in time, or a sample after one: enough of them confirm the jump."""
+        """Hold a sample that jumps ahead in time or follows one; accept all once confirmed."""
         ahead = self._ahead
         ahead.append(sample)
         far = ahead[0][0] - self._newest > LONG_GAP
@@ -149,7 +149,7 @@ class FrontEnd:
         self._late.on_time()
         before, self._newest = self._newest, time
         self.counts.used += 1
-        if self._samples and time - before > _HOLE:
+        if self._samples and time - before > _HOLE_SECONDS:
             self._hole = before, time
             if time - before > MAX_IMU_GAP:
                 self.counts.add_gap(before, time - before)
@@ -161,9 +161,9 @@ class FrontEnd:
         return self._begin() if self._attitude is None else self._complete()
 
     def _begin(self) -> list[ImuInterval]:
-        """Level the first attitude once its stretch is there, then catch up."""
+        """Level the first attitude after `START_SECONDS` of samples, then cut the intervals."""
         first = self._samples[0][0]
-        # One sample alone: its time is so large that a second does not count beside it.
+        # A single sample here: its time is so large that adding a second is lost in rounding.
         if self._newest < first + START_SECONDS or len(self._samples) == 1:
             self._next = first + START_SECONDS
             return []
@@ -182,20 +182,20 @@ class FrontEnd:
             self._before_long_gap = None
         return intervals + self._complete()
 
-    def _check_pace(self) -> None:
-        """Refuse a stream of which every sample from the first on stands alone."""
-        alone = self.counts.gap_count
-        if alone >= _ALONE and self.counts.used == alone + 1:
+    def _check_time_unit(self) -> None:
+        """Refuse a stream in which every sample so far is isolated by gaps."""
+        isolated = self.counts.gap_count
+        if isolated >= _ISOLATED_SAMPLES and self.counts.used == isolated + 1:
             step = statistics.median(length for _, length in self.counts.gaps)
             raise InputError(
-                "time", f"samples {step:.3g} s apart", "50 to 1000 in a second", "give times in s"
+                "time", f"samples {step:.3g} s apart", "50 to 1000 per second", "give times in s"
             )
 
     def _span_gap(self, sample: Sample) -> list[ImuInterval]:
-        """End the interval in progress, span the gap by one of its own, start the grid anew."""
+        """End the current interval, span the gap with one of its own and restart the grid."""
         before = self._samples
         self._samples = [sample]
-        self._check_pace()
+        self._check_time_unit()
         self._window.clear()
         if self._attitude is None:
             self._next = -math.inf
@@ -225,7 +225,7 @@ class FrontEnd:
         return intervals
 
     def _cut(self) -> tuple[FloatArray, Flags]:
-        """Samples of one period, the last one interpolated at its end; the rest stays."""
+        """Cut the samples of one period, interpolated at its end; keep the later ones."""
         stop = self._next
         later = next(k for k, sample in enumerate(self._samples) if sample[0] >= stop)
         table = np.array(self._samples[: later + 1])
@@ -250,8 +250,8 @@ class FrontEnd:
         return flags
 
     def _with_window(self, table: FloatArray, flags: Flags) -> ImuInterval:
-        assert self._attitude is not None  # no interval is cut before the start
-        # _cut() has counted this interval already.
+        assert self._attitude is not None  # no interval is cut before the first attitude
+        # _cut() has already counted this interval.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._fields.at(table[-1, 0])
         interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
@@ -272,9 +272,9 @@ class FrontEnd:
 def cut_recording(
     sequence: ImuSequence, config: NavigatorConfig
 ) -> tuple[list[ImuInterval], FrontEnd]:
-    """Every interval of a recording, and the front end with its counts and start.
+    """Cut a recording into intervals; return them and the front end with its counts and start.
 
-    What follows where the clock was set back is left out, and the counts say so.
+    Samples after the clock was set back are skipped, and the counts report it.
     """
     front_end = FrontEnd(config)
     intervals: list[ImuInterval] = []
@@ -286,7 +286,7 @@ def cut_recording(
         )
     )
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        # A wild time must not bring all fields of the future at once.
+        # A wild sample time must not release all later fields at once.
         while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
             front_end.push_field(*fields.popleft())
         try:

@@ -1,4 +1,4 @@
-"""What the front end hands on: intervals of samples, their start, and counts of the others."""
+"""Output of the front end: IMU intervals, the start from gravity, and sample counts."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from stario.sequences.sequence import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the filter begins.
+    """Start of the filter, estimated from the first second of samples.
 
     Attributes:
-        time: of the first sample [s].
-        R_WB: (3, 3) as of `GravityStart`, so the next two.
+        time: time of the first sample [s].
+        R_WB: (3, 3) levelled attitude; this and the next two are those of `GravityStart`.
         still: whether the device was at rest.
-        force: mean size of the specific force [m/s^2].
-        rate: of the samples, by their median step [Hz].
+        force: magnitude of the mean specific force [m/s^2].
+        rate: sampling rate, from the median step [Hz].
     """
 
     time: float
@@ -34,26 +34,26 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
-    """The stretch between two times of the grid.
+    """IMU samples between two times of the grid.
 
     Attributes:
-        time: (n + 1,) sample times, first and last are the grid's [s].
+        time: (n + 1,) sample times [s]; the first and the last are on the grid.
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
-        gap: True where no samples arrived for longer than is bridged; the samples then say nothing.
-        anew: behind a long gap, the levelled attitude at its end, as at the very first sample.
+        gap: whether this is a gap too long to be bridged; its samples carry no information then.
+        restart: new start after a long gap, estimated as at the first sample; None elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
-        window_flagged: whether samples of the window's are.
+        window_flagged: whether any of the window's samples are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
-        R_NB: (3, 3) levelled attitude at the end, gravity's correction applied.
+        R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
-        window: (6, 200) the network's input that ends here, None where there is none.
+        window: (6, 200) network input that ends here; None if there is none.
         R_NB_window: (3, 3) levelled attitude at the window's start.
-        heading: of the device in N, averaged over the window [rad].
-        levelled_bias: size of the gyroscope's bias as far as gravity tells it [rad/s].
-        levelled_bias_sigma: of it, per level axis [rad/s].
-        field_B: (3,) magnetic field at its end [uT], None where none was measured.
-        accel_factor: on the accelerometer's noise density, as the filter finds it.
+        heading: heading of the device in N, averaged over the window [rad].
+        levelled_bias: magnitude of the gyroscope's bias as estimated from gravity [rad/s].
+        levelled_bias_sigma: its standard deviation per level axis [rad/s].
+        field_B: (3,) magnetic field at its end [uT]; None if none was measured.
+        accel_factor: factor on the accelerometer's noise density, estimated by the filter.
     """
 
     time: FloatArray
@@ -75,54 +75,53 @@ class ImuInterval:
     window_flagged: bool = False
 
     def without_window(self) -> ImuInterval:
-        """What an estimator needs of it, without what only the network sees."""
-        return changed(self, window=None, attitudes=_NONE_KEPT)
+        """Return a copy without the window and attitudes, which an estimator does not need."""
+        return changed(self, window=None, attitudes=_NO_ATTITUDES)
 
     @property
     def start(self) -> float:
-        """Its first time [s]."""
+        """Time of the first sample [s]."""
         return float(self.time[0])
 
     @property
     def stop(self) -> float:
-        """Its last time [s]."""
+        """Time of the last sample [s]."""
         return float(self.time[-1])
 
 
-_NONE_KEPT = np.empty((0, 3, 3))
+_NO_ATTITUDES = np.empty((0, 3, 3))
 
 GAPS_LISTED = 100
-"""How many gaps are kept one by one: an endless stream may have any number."""
-
+"""Maximum number of gaps listed one by one; an endless stream may have any number."""
 
 LATE_SECONDS = 0.5
-"""From so long a row of late samples on health says so [s]."""
+"""Duration of consecutive late samples beyond which the health report notes them [s]."""
 
 UNFAMILIAR_SHARE = 0.3
-"""From this share of unfamiliar windows on health says so; of training windows 0.05 are."""
+"""Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
 
 
 @dataclass
 class SampleCounts:
-    """What became of the samples.
+    """Counts of the samples used, dropped and flagged, of gaps and of windows.
 
     Attributes:
-        used: samples taken in.
-        not_finite: dropped for a value that is not a number, infinite or absurdly large.
-        frozen: dropped for repeating all values of those before, though not at rest.
-        duplicate: dropped for repeating the newest time.
-        out_of_order: dropped for a time before the newest.
-        longest_late: for how long samples came out of order in a row, at most [s].
-        future: dropped for a time ahead of those that followed.
-        spike: used, but replaced for standing off its neighbours.
+        used: samples used.
+        not_finite: dropped: a value is not a number, infinite or absurdly large.
+        frozen: dropped: all values repeat those before, though the device is not at rest.
+        duplicate: dropped: the time repeats the newest.
+        out_of_order: dropped: the time is before the newest.
+        longest_late: longest duration of consecutive samples out of order [s].
+        future: dropped: the time is ahead of later samples.
+        spike: used, but replaced because they differ too much from their neighbours.
         saturated: used, but at the sensor's limit.
-        field_dropped: magnetic fields dropped for a value or a time that is out of order.
-        gap_count: stretches without samples that were not bridged.
-        longest_gap: of them [s].
-        gaps: (start, length) [s] of the newest `GAPS_LISTED` of them.
-        windows: that the network was asked about.
-        unfamiliar: of these outside what its weights were trained on.
-        set_back: by how much a recording's clock was set back where its track ends [s].
+        field_dropped: magnetic fields dropped: a value or a time is wrong.
+        gap_count: stretches without samples longer than `MAX_IMU_GAP`.
+        longest_gap: length of the longest [s].
+        gaps: (start, length) [s] of the newest `GAPS_LISTED`.
+        windows: windows given to the network.
+        unfamiliar: those of them outside what its weights were trained on.
+        set_back: amount by which a recording's clock was set back where its track ends [s].
     """
 
     used: int = 0
@@ -149,7 +148,7 @@ class SampleCounts:
         self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
 
     def health(self) -> Health:
-        """The part of the report that tells of the samples."""
+        """Return the part of the health report that concerns the samples."""
         names = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
         return Health(
             samples={name: getattr(self, name) for name in names},
@@ -168,13 +167,13 @@ class SampleCounts:
             )
         elif self.longest_late > LATE_SECONDS:
             notes.append(
-                f"samples came late for {self.longest_late:.1f} s in a row: twice, or from a clock "
-                "that was set back; then as much time is missing, which no sigma knows"
+                f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
+                "from a clock that was set back; if so, that time is missing and no sigma covers it"
             )
         if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
             share = self.unfamiliar / self.windows
             notes.append(
-                f"{share:.0%} of the windows move unlike all that the weights were trained on: "
+                f"{share:.0%} of the windows move unlike anything the weights were trained on: "
                 "the network's sigma is widened there"
             )
         return notes

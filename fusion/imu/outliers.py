@@ -1,9 +1,9 @@
-"""Samples that cannot be right though they are finite: single spikes, and a sensor at its limit.
+"""Finite samples that cannot be right: single spikes, and a sensor at its limit.
 
-A spike is one sample that stands off both its neighbours by more than a carried device can; it is
-replaced by their mean. Saturation shows in values that repeat exactly at the largest size the axis
-ever had, while it moves, again and again: two alike by chance, at a size that is soon surpassed,
-are none. What the sensor missed nobody knows, so such samples are only flagged.
+A spike is one sample that differs from both its neighbours by more than a carried device can cause;
+it is replaced by their mean. Saturation shows as values of a moving axis that repeat exactly and
+more than once at the largest magnitude measured so far; two that are equal by chance, at a
+magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only flagged.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from stario.sequences.sequence import BoolArray, FloatArray
 
 SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
-"""Off both neighbours by more than this, a sample is a spike [rad/s], [m/s^2]: heel strikes stay
-below half of it at 50 Hz."""
+"""A sample that differs from both neighbours by more than this is a spike [rad/s], [m/s^2]; heel
+strikes stay below half of it at 50 Hz."""
 
-_MOVES = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
-_LARGE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
-"""An axis that varies, or reads, no more than this may repeat itself: coarse digits at rest."""
+_MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+_LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
+"""An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
 
 
 class Flags(NamedTuple):
-    """What is wrong with a stretch of samples.
+    """Faults in a stretch of samples.
 
     Attributes:
         gyro: whether a sample of the gyroscope is saturated or was a spike.
-        accel: likewise of the accelerometer.
+        accel: the same for the accelerometer.
         spikes: number of samples replaced.
         saturated: number of samples at the limit.
-        missing: whether samples are missing, and those around were taken for them.
+        missing: whether samples are missing and were interpolated from those around them.
     """
 
     gyro: bool = False
@@ -42,43 +42,43 @@ class Flags(NamedTuple):
 
 
 class OutlierDetector:
-    """Looks through the samples of one stream, interval by interval."""
+    """Detects outliers in the samples of one stream, interval by interval."""
 
     def __init__(self) -> None:
         self.largest = np.zeros(6)
-        self._repeats = np.zeros(6)  # of each axis at the size that is its largest now
+        self._repeats = np.zeros(6)  # of each axis at its current largest magnitude
 
     def detect(self, table: FloatArray) -> Flags:
-        """Mend spikes in place and say what is wrong.
+        """Replace spikes in place and return the faults.
 
         Args:
-            table: (n, 7) samples: time, gyroscope, accelerometer; the first was looked at before.
+            table: (n, 7) samples: time, gyroscope, accelerometer; the first was checked before.
         """
         values = table[:, 1:]
         steps = values[1:] - values[:-1]
-        spiky = np.abs(steps).max(axis=0) > SPIKE
-        spikes = self._mend(values) if spiky.any() else _NO_AXES
+        candidates = np.abs(steps).max(axis=0) > SPIKE
+        spikes = self._replace_spikes(values) if candidates.any() else _NO_AXES
         largest = np.maximum(self.largest, np.abs(values).max(axis=0))
         self._repeats = np.where(largest > self.largest, 0.0, self._repeats)
         self.largest = largest
-        stuck = _NO_AXES
+        saturated = _NO_AXES
         if not steps.all():
-            stuck = self._stuck(values)
-        wrong = (spikes + stuck) > 0
-        if not wrong.any():
+            saturated = self._count_saturated(values)
+        bad = (spikes + saturated) > 0
+        if not bad.any():
             return NO_FLAGS
         return Flags(
-            bool(wrong[:3].any()), bool(wrong[3:].any()), int(spikes.max()), int(stuck.max())
+            bool(bad[:3].any()), bool(bad[3:].any()), int(spikes.max()), int(saturated.max())
         )
 
     @staticmethod
-    def _mend(values: FloatArray) -> FloatArray:
-        """Number of spikes per axis (6,), replaced by the mean of their neighbours."""
+    def _replace_spikes(values: FloatArray) -> FloatArray:
+        """Replace spikes by the mean of their neighbours; return their number per axis (6,)."""
         found = np.zeros(6)
         n = len(values)
         for k in range(1, n):
             before = values[k - 1]
-            # The last sample has no neighbour behind it yet: it is held against the two before.
+            # The last sample has no successor yet: it is compared with the two before it.
             after = values[k + 1] if k + 1 < n else values[max(k - 2, 0)]
             off = np.minimum(np.abs(values[k] - before), np.abs(values[k] - after)) > SPIKE
             if off.any():
@@ -87,20 +87,20 @@ class OutlierDetector:
                 found += off
         return found
 
-    def _stuck(self, values: FloatArray) -> FloatArray:
-        """Number of samples per axis (6,) that repeat at the axis's limit."""
+    def _count_saturated(self, values: FloatArray) -> FloatArray:
+        """Return the number of samples per axis (6,) that repeat at the axis's limit."""
         size = np.abs(values)
-        moving = (np.ptp(values, axis=0) > _MOVES) | (self.largest > _LARGE)
+        moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
         repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
         count = repeated.sum(axis=0)
         self._repeats = self._repeats + count
-        return np.asarray(np.where(self._repeats >= _NO_CHANCE, count, 0.0))
+        return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))
 
 
-_NO_CHANCE = 2.0
-"""Repetitions at one and the same limit from which on they are none by chance."""
+_MIN_REPEATS = 2.0
+"""Minimum number of repetitions at the same limit that cannot be chance."""
 
 NO_FLAGS = Flags()
-"""Nothing is wrong."""
+"""No faults."""
 
 _NO_AXES = np.zeros(6)

@@ -1,10 +1,11 @@
-"""Raw IMU between two updates, folded once into a segment that filter and graph share.
+"""Raw IMU samples between two updates, preintegrated once into a segment for filter and graph.
 
-gtsam's `PreintegratedCombinedMeasurements` does the folding. Each of its steps holds rate and
+The integration is gtsam's `PreintegratedCombinedMeasurements`. Each of its steps holds rate and
 specific force constant and rotates the force by the attitude at the step's start; instantaneous
-samples are therefore first turned into the equivalent constants (`corrected_increments`).
-gtsam accumulates the rotation as one rotation vector, to first order per step: segments of a tenth
-of a second lose nothing (4e-6 rad per second in lively motion at 200 Hz), whole seconds do (1e-3).
+samples are therefore first converted to equivalent constants (`corrected_increments`).
+gtsam accumulates the rotation as one rotation vector, to first order per step. The error is
+negligible over a tenth of a second (4e-6 rad per second in lively motion at 200 Hz), but not over a
+whole second (1e-3).
 
 README.md, "Preintegration". Sources: C. Forster et al., "On-manifold preintegration for real-time
 visual-inertial odometry", 2017; P. Savage, "Strapdown inertial navigation integration algorithm
@@ -30,20 +31,20 @@ from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 
-# gtsam adds this to the position's noise [m/sqrt(s)]; it keeps one-sample segments invertible for
-# the graph and is far below any sensor's.
+# gtsam adds this to the position noise [m/sqrt(s)]; it keeps one-sample segments invertible for the
+# graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
-_LEAST_WALK = 1e-7
+_MIN_WALK = 1e-7
 
 _GAP_STEPS = 10
 
 GAP_YAW_RATE = 0.5
-"""How far a walker turns in a gap, one standard deviation per second [rad/s]: 0.4 to 1.0 over one
-second and 0.36 to 0.7 per second over three in the training and validation recordings."""
+"""Standard deviation of a pedestrian's turn per second of a gap [rad/s]: 0.4 to 1.0 over one second
+and 0.36 to 0.7 per second over three in the training and validation recordings."""
 
 _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
-"""Densities where up to a fifth of a second is missing and what was measured around it is taken for
-it [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]: a walker's rates change by some tenths of a rad/s in it."""
+"""Noise densities where up to a fifth of a second is missing and was interpolated [rad/s/sqrt(Hz),
+m/s^2/sqrt(Hz)]: a pedestrian's rates change by some tenths of a rad/s in that time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ class Segment:
         return self.stop - self.start
 
     def __getstate__(self) -> dict[str, Any]:
-        """The samples folded as gtsam's own text archive, equal to the last bit."""
+        """Return the state, with the samples as gtsam's own text archive, exact to the last bit."""
         return vars(self) | {"pim": self.pim.serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -79,7 +80,7 @@ class Segment:
     def predict(
         self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Dead reckoning across the segment.
+        """Dead-reckon across the segment.
 
         Args:
             R_WB: (3, 3) attitude at the start.
@@ -103,11 +104,11 @@ def segment_of(
     b_a: FloatArray,
     config: NavigatorConfig,
 ) -> Segment:
-    """The segment from an interval's start to its end.
+    """Preintegrate an interval, or bridge it if it is a gap.
 
     Args:
         interval: samples, or a gap.
-        R_WB: (3, 3) attitude at its start; only a gap needs it.
+        R_WB: (3, 3) attitude at its start; used only for a gap.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
@@ -121,7 +122,7 @@ def segment_of(
 
 
 def gap_yaw_variance(seconds: float) -> float:
-    """Variance of a walker's turn since a gap began [rad^2]: as of one rate all through it."""
+    """Return the variance of a pedestrian's turn, at a constant rate, since a gap began [rad^2]."""
     return min(GAP_YAW_RATE * seconds, UNKNOWN_YAW) ** 2
 
 
@@ -134,17 +135,17 @@ def gap_segment(
     config: NavigatorConfig,
     turned: float = 0.0,
 ) -> Segment:
-    """Through a gap: constant velocity and attitude, under noise wide enough for a walker.
+    """Bridge a gap by constant velocity and attitude, with noise wide enough for a pedestrian.
 
     Args:
-        start: of the gap [s].
-        stop: its end [s].
+        start: start of the gap [s].
+        stop: end of the gap [s].
         R_WB: (3, 3) attitude at its start.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
-        turned: variance of a turn about the vertical within it [rad^2]; the filter, which turns
-            the velocity with it, adds that itself.
+        turned: variance of a turn about the vertical within the gap [rad^2]; 0 for the filter,
+            which adds it itself and turns the velocity with it.
     """
     f, dt = config.filter, (stop - start) / _GAP_STEPS
     noise = replace(config.noise, gyro_noise=f.gap_gyro_noise, accel_noise=f.gap_accel_noise)
@@ -153,24 +154,24 @@ def gap_segment(
     density = turned / (stop - start) * np.outer(up_B, up_B)
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
-    hover = config.gravity * up_B + b_a
-    # In one step position and velocity would be in error together: no graph can invert that.
+    force_B = config.gravity * up_B + b_a
+    # After a single step the errors of position and velocity are dependent: no graph inverts that.
     for _ in range(_GAP_STEPS):
-        pim.integrateMeasurement(hover, b_g, dt)
+        pim.integrateMeasurement(force_B, b_g, dt)
     return Segment(start, stop, config.gravity, pim)
 
 
 def segment_of_all(
     intervals: Sequence[ImuInterval], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
 ) -> Segment:
-    """The segment of several intervals in a row, none of them a gap, each with its own noise.
+    """Preintegrate consecutive intervals, none of them a gap, each with its own noise.
 
-    The noise of their mean would spread over half a second what a step's impact did in a tenth;
-    position and speed at the end are then correlated as they are not.
+    Their mean noise would spread the effect of a step's impact from a tenth of a second over half a
+    second, and correlate position and speed at the end wrongly.
     """
     first, rest = intervals[0], intervals[1:]
 
-    def joined(name: str) -> FloatArray:  # each begins with the sample that ended the one before
+    def joined(name: str) -> FloatArray:  # without the samples that intervals share
         return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
 
     noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in intervals)
@@ -180,7 +181,7 @@ def segment_of_all(
 
 def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     f = config.filter
-    return _widened(
+    return _widened_noise(
         config.noise,
         interval.accel_factor,
         interval.flags,
@@ -189,13 +190,13 @@ def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     )
 
 
-@lru_cache(maxsize=64)  # intervals in a row are alike, and checked settings take long to make
-def _widened(
+@lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow
+def _widened_noise(
     noise: ImuNoise, accel_factor: float, flags: Flags, gap_gyro: float, gap_accel: float
 ) -> ImuNoise:
-    """White noise, wider where a sensor was saturated and where samples are missing."""
+    """Return the white noise, widened where a sensor was saturated or samples are missing."""
     gyro, accel = noise.gyro_noise, accel_factor * noise.accel_noise
-    # What a saturated sensor missed is as unknown as what happens in a gap.
+    # What a saturated sensor missed is as unknown as the motion in a gap.
     if flags.gyro:
         gyro = max(gyro, gap_gyro)
     if flags.accel:
@@ -214,30 +215,30 @@ def preintegrate(
     noise: ImuNoise | Sequence[ImuNoise],
     gravity: float,
 ) -> Segment:
-    """Fold the samples of an interval into a segment.
+    """Preintegrate the samples of an interval into a segment.
 
     Args:
         time: (n + 1,) [s], strictly increasing; first and last are the interval's ends.
         gyro: (n + 1, 3) [rad/s] in B, interpolated to the ends by the caller.
         accel: (n + 1, 3) specific force [m/s^2] in B, likewise.
-        b_g: (3,) gyroscope bias to integrate with [rad/s]; later changes act to first order.
+        b_g: (3,) gyroscope bias to integrate with [rad/s]; later changes apply to first order.
         b_a: (3,) accelerometer bias [m/s^2], likewise.
-        noise: noise densities over this interval, or over each of the n steps; the walks are the
-            first's.
+        noise: noise densities over this interval, or over each of the n steps; the bias walks are
+            those of the first.
         gravity: magnitude [m/s^2].
     """
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
-    each = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
-    held = each[0]
-    params = _params(held, gravity) if held is noise else _new_params(held, gravity)
+    densities = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
+    current = densities[0]
+    params = _params(current, gravity) if current is noise else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     integrate = pim.integrateMeasurement
     # gtsam subtracts the bias itself, so it is added back here.
-    steps = zip(force + b_a, rate + b_g, dt.tolist(), each, strict=True)
+    steps = zip(force + b_a, rate + b_g, dt.tolist(), densities, strict=True)
     for step_force, step_rate, step, density in steps:
-        if density is not held:
-            held = density
-            _set_white_noise(params, held)
+        if density is not current:
+            current = density
+            _set_white_noise(params, current)
         integrate(step_force, step_rate, step)
     return Segment(float(time[0]), float(time[-1]), gravity, pim)
 
@@ -245,11 +246,11 @@ def preintegrate(
 def corrected_increments(
     time: FloatArray, gyro: FloatArray, accel: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Constant rate and force per interval that are equivalent to the samples at its ends.
+    """Return the constant rate and force over each step that are equivalent to the samples.
 
-    Rate w and force a are taken as linear between samples. With their means w_, a_ over an interval
-    dt the rotation vector is  dt w_ + dt^2/12 w0 x w1  (coning) and the velocity increment in the
-    axes of the interval's start is
+    Rate w and force a are taken as linear between samples. With their means w_, a_ over a step dt
+    the rotation vector is  dt w_ + dt^2/12 w0 x w1  (coning) and the velocity increment in the
+    axes of the step's start is
     dt a_ + dt^2/2 w_ x a_ + dt^2/12 (w0 x a1 - w1 x a0) + dt^3/6 w_ x (w_ x a_)
     (rotation of the force, sculling, second order of the rotation).
 
@@ -267,15 +268,15 @@ def corrected_increments(
     pairs[:, :, 0], pairs[:, :, 1] = gyro, accel
     W = skew(gyro)
     W0, W1, first, last = W[:-1], W[1:], pairs[:-1], pairs[1:]
-    # w0 x w1 - w1 x w0 counts the coning twice, hence its 1/24.
-    constant = 0.5 * (first + last) + step * _SHARES * (W0 @ last - W1 @ first)
+    # w0 x w1 - w1 x w0 counts the coning term twice, hence its 1/24.
+    constant = 0.5 * (first + last) + step * _CROSS_WEIGHTS * (W0 @ last - W1 @ first)
     force = constant[:, :, 1:]
     turn = (0.5 * step) * (W0 + W1)
     force = force + turn @ (0.5 * force + turn @ force / 6.0)
     return dt, constant[:, :, 0], force[:, :, 0]
 
 
-_SHARES = np.array([1.0 / 24.0, 1.0 / 12.0])
+_CROSS_WEIGHTS = np.array([1.0 / 24.0, 1.0 / 12.0])
 _EYE = np.eye(3)
 
 
@@ -283,9 +284,9 @@ def _new_params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     _set_white_noise(params, noise)
     params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
-    # gtsam's graph factors invert them: none may be zero.
-    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _LEAST_WALK) ** 2)
-    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _LEAST_WALK) ** 2)
+    # gtsam's graph factors invert these covariances: none may be zero.
+    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _MIN_WALK) ** 2)
+    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _MIN_WALK) ** 2)
     return params
 
 
@@ -294,5 +295,5 @@ def _set_white_noise(params: Any, noise: ImuNoise) -> None:
     params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
 
 
-# The accelerometer's factor comes in steps: the range in use fits.
+# The accelerometer's factor is quantised: all values in use fit.
 _params = lru_cache(maxsize=512)(_new_params)

@@ -1,4 +1,4 @@
-"""Stateful inference: a track's windows in the order of time, the memory gone after each gap."""
+"""Stateful inference: a track's windows in time order, with the memory cleared after each gap."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import rotated_windows
 
 LEAST_SIGMA = 5e-3
-"""No network knows a second's displacement better than this [m], whatever it says."""
+"""Minimum standard deviation of a second's displacement [m], whatever the network predicts."""
 
 FLAGGED_SCALE = 4.0
-"""On the network's covariance where a window has spikes or saturated samples: twice the sigma."""
+"""Factor on the covariance of windows with spikes, saturated or missing samples (sigma doubled)."""
 
 Displacement = tuple[FloatArray, FloatArray]
 """Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
 
 class Predictor(Protocol):
-    """What a navigator needs of a model; `DisplacementModel` is one.
+    """Interface that a navigator requires of a model; `DisplacementModel` implements it.
 
-    A model whose network remembers earlier windows has `stateful_inference(updates)` besides, which
-    gives a predictor for the windows of one unbroken stretch.
+    A model whose network remembers earlier windows also has `stateful_inference(updates)`, which
+    returns a predictor for the windows of one unbroken stretch.
     """
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Windows (B, 6, 200) to displacement (B, 3) [m] and covariance (B, 3, 3) [m^2].
+        """Predict displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] of windows (B, 6, 200).
 
-        Windows and answers are in frame H: z up, the device's heading zero.
+        Windows and predictions are in frame H: z up, the device's heading zero.
         """
         ...
 
 
 class StatefulInference:
-    """What a model predicts of the windows of one track.
+    """A model's predictions for the windows of one track.
 
     Args:
-        model: may remember.
-        updates: windows that begin within the length of one.
+        model: the model; its network may remember earlier windows.
+        updates: number of windows that begin within the length of one.
     """
 
     def __init__(self, model: Predictor, updates: int) -> None:
@@ -55,34 +55,34 @@ class StatefulInference:
 
     @property
     def is_recurrent(self) -> bool:
-        """Whether earlier windows matter, so that a gap does."""
+        """Whether predictions depend on earlier windows, and so on gaps."""
         return self._stretch is not self._model
 
     def restart(self) -> None:
-        """Forget what was before a gap."""
+        """Forget all windows before a gap."""
         begin = getattr(self._model, "stateful_inference", None)
         self._stretch: Any = self._model if begin is None else begin(self._updates)
 
     def predict(
         self, windows_N: NDArray[np.float32], heading: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The stretch's next windows, shown to the model in the device's heading frame H.
+        """Predict the stretch's next windows, given to the model in the device's heading frame H.
 
         Args:
             windows_N: (B, 6, 200) in a gravity-aligned frame N.
-            heading: (B,) the device's heading in N [rad].
+            heading: (B,) heading of the device in N [rad].
 
         Returns:
             displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
         """
         mean_H, covariance_H = self._stretch.predict(rotated_windows(windows_N, -heading))
         R_NH = about_z(heading).as_matrix()
-        with np.errstate(invalid="ignore"):  # the estimator refuses what is not finite
+        with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
-        """How many windows (B, 6, 200) move as nothing that the model's weights were trained on."""
+        """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
         known = getattr(getattr(self._model, "card", None), "known_motion", None)
         if known is None:
             return 0
@@ -91,10 +91,10 @@ class StatefulInference:
 
     @property
     def memory(self) -> Any:
-        """What the network remembers, as arrays and numbers; None without memory.
+        """State that the network remembers, as arrays and numbers; None without memory.
 
         Raises:
-            InputError: a memory is put back into a network that has none, or the reverse.
+            InputError: a memory is assigned to a network that has none, or the reverse.
         """
         return self._stretch.memory if self.is_recurrent else None
 
@@ -102,7 +102,9 @@ class StatefulInference:
     def memory(self, memory: Any) -> None:
         self.restart()
         if (memory is not None) != self.is_recurrent:
-            raise InputError("snapshot: network", "another kind of memory", "the same network's")
+            raise InputError(
+                "snapshot: network", "a different kind of memory", "that of the same network"
+            )
         if self.is_recurrent:
             self._stretch.memory = memory
 
@@ -110,9 +112,9 @@ class StatefulInference:
 def displacements_of(
     network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
 ) -> list[Displacement]:
-    """The network's displacements of the intervals' windows, as far as it can be trusted.
+    """Predict the displacements of the intervals' windows, with covariances that can be trusted.
 
-    The windows, and those that move as nothing the weights know, are counted.
+    Counts the windows, and those that move unlike anything the weights were trained on.
     """
     windows_N = np.stack([_window(interval) for interval in intervals])
     counts.windows += len(windows_N)
@@ -125,5 +127,5 @@ def displacements_of(
 
 
 def _window(interval: ImuInterval) -> NDArray[np.float32]:
-    assert interval.window is not None  # only intervals that have one are asked
+    assert interval.window is not None  # callers pass only intervals that have one
     return interval.window

@@ -1,7 +1,7 @@
-"""A still second, found interval by interval (`stario.sequences.inspection.stillness`).
+"""Detection of a still second, interval by interval (`stario.sequences.inspection.stillness`).
 
-A hand's tremor or a trolley's wheels exceed it. That an even glide looks still as well is left to
-the zero-velocity update's own chi-square test (README.md, "Zero velocity").
+A hand's tremor or a trolley's wheels exceed its bound. A smooth glide looks still as well and is
+left to the zero-velocity update's own chi-square test (README.md, "Zero velocity").
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from stario.sequences.sequence import FloatArray
 
 
 class StillnessDetector:
-    """Watches the last second of samples.
+    """Detects whether the device was still over the last second.
 
     Args:
-        intervals: in a second.
-        scale: factor on the densities of a phone's IMU; 0 never detects.
+        intervals: number of intervals per second.
+        scale: factor on the noise densities of a phone's IMU; 0 never detects.
 
     Attributes:
-        window: of each interval of the last second: samples, seconds, sums of gyro and accel, sums
-            of their squares (14,); None where it alone moves more than a second at rest may.
+        window: (14,) for each interval of the last second: number of samples, seconds, sums of gyro
+            and accel, sums of their squares; None if it alone moves more than a still second may.
     """
 
     def __init__(self, intervals: int, scale: float) -> None:
@@ -30,7 +30,7 @@ class StillnessDetector:
         self.window: tuple[FloatArray | None, ...] = ()
 
     def is_still(self, interval: ImuInterval) -> bool:
-        """Take an interval in; whether nothing moved over the second that ends with it."""
+        """Add an interval; return whether the device was still over the second ending with it."""
         if self._scale == 0.0:
             return False
         if interval.gap:
@@ -38,20 +38,20 @@ class StillnessDetector:
             return False
         sums = None if self._moves(interval) else _sums_of(interval)
         self.window = (*self.window, sums)[-self._intervals :]
-        known = [sums for sums in self.window if sums is not None]
-        return len(known) == self._intervals and self._quiet(np.sum(known, axis=0))
+        quiet = [sums for sums in self.window if sums is not None]
+        return len(quiet) == self._intervals and self._is_quiet(np.sum(quiet, axis=0))
 
     def mean_rates(self) -> FloatArray:
-        """Mean rate (n, 3) of each interval of a still second [rad/s]."""
+        """Return the mean rate (n, 3) of each interval of a still second [rad/s]."""
         table = np.array(self.window)
         return np.asarray(table[:, 2:5] / table[:, :1])
 
     def mean_seconds(self) -> float:
-        """Mean length of the intervals of a still second [s]."""
+        """Return the mean length of the intervals of a still second [s]."""
         return float(np.array(self.window)[:, 1].mean())
 
     def _moves(self, interval: ImuInterval) -> bool:
-        """Whether the interval's force alone scatters more than a second may."""
+        """Whether the interval's specific force alone scatters more than a still second may."""
         accel = interval.accel[1:]
         count = len(accel)
         total = accel.sum(axis=0)
@@ -60,8 +60,8 @@ class StillnessDetector:
         bound = scatter_bound(count * self._intervals, seconds, self._scale)
         return not looks_still(0.0, scatter, bound)
 
-    def _quiet(self, sums: FloatArray) -> bool:
-        """Whether a second may scatter like this."""
+    def _is_quiet(self, sums: FloatArray) -> bool:
+        """Whether a second with these sums scatters no more than a still one may."""
         count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
         bound = scatter_bound(count, float(sums[1]), self._scale)

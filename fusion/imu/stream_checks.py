@@ -27,35 +27,15 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.units import GYRO_UNITS
 
 SET_BACK_SECONDS = 5.0
-"""Late samples that advance for so long in a row [s] are of a clock that was set back; batches that
-come twice or in the wrong order are shorter."""
-
-_FROZEN_SECONDS = 0.1
-"""One sample for so long [s] is none: loggers that repeat slow ones do so for a few hundredths."""
-
-_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
-"""A coarse sensor at rest reads one sample as well: no faster turn [rad/s], and gravity to within
-this [m/s^2]."""
-
-_PIECE_S = 4.0
-"""Length of a piece [s], as in the check of recordings."""
-
-_WRONG_PIECES = 3
-"""Pieces that must fail, no calm one in between: two may share one fall; recordings fail none."""
-
-_TURNING_PIECES = 12
-"""Pieces in which the device turns that clear the gyroscope; later failures are not its unit's."""
-
-_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
-"""Exceeded for a twentieth of a piece: the first by walks, but at rest not by noise and bias, even
-in deg/s; the second by hardly any walk (recorded are 4.2 at most), but by all read as deg/s."""
+"""Late samples that advance for this long in a row [s] come from a clock that was set back; batches
+that arrive twice or in the wrong order are shorter."""
 
 
 class ClockSetBackError(InputError):
     """The clock of the samples was set back.
 
     Attributes:
-        by: how far [s].
+        by: amount [s].
     """
 
     def __init__(self, by: float) -> None:
@@ -63,30 +43,30 @@ class ClockSetBackError(InputError):
         super().__init__(
             "time",
             f"a clock set back by {by:.3g} s",
-            "one that goes on",
-            "what follows is another recording",
+            "a clock that advances",
+            "what follows is treated as a new recording",
         )
 
 
 class ClockSetBackDetector:
-    """Watches the samples that come late."""
+    """Detects late samples that come from a clock that was set back."""
 
     def __init__(self) -> None:
         self._first = self._last = 0.0
         self._running = False
 
     def on_time(self) -> None:
-        """A sample was not late."""
+        """Note that a sample was not late."""
         self._running = False
 
     def late(self, time: float, newest: float) -> float:
-        """A sample at `time` came after one at `newest` [s].
+        """Note that a sample at `time` [s] came after one at `newest` [s].
 
         Returns:
-            For how long such samples have come in a row by now [s].
+            Duration of the late samples in a row so far [s].
 
         Raises:
-            ClockSetBackError: the late samples are of another clock.
+            ClockSetBackError: the late samples come from another clock.
         """
         if not self._running or time < self._last:
             self._first = time
@@ -96,8 +76,16 @@ class ClockSetBackDetector:
         return time - self._first
 
 
+_FROZEN_SECONDS = 0.1
+"""Maximum time that values may repeat [s]; loggers repeat slow samples for a few hundredths."""
+
+_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
+"""A coarse sensor at rest repeats values as well: its rate is below the first [rad/s], its force
+within the second of gravity [m/s^2]."""
+
+
 class FrozenSensorDetector:
-    """Watches the samples of a stream.
+    """Detects a sensor that has stopped and repeats its last values.
 
     Args:
         gravity: magnitude [m/s^2].
@@ -110,7 +98,7 @@ class FrozenSensorDetector:
         self._changed = False
 
     def is_frozen(self, sample: tuple[float, ...]) -> bool:
-        """Whether a sample (time, gyro, accel) is only the one before it, held for too long."""
+        """Return whether a sample (time, gyro, accel) has repeated its values for too long."""
         time, values = sample[0], sample[1:]
         if values != self._values:
             self._changed = bool(self._values)
@@ -124,15 +112,30 @@ class FrozenSensorDetector:
         return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
 
 
+_PIECE_SECONDS = 4.0
+"""Length of a piece [s], as in the check of recordings."""
+
+_MIN_FAILED_PIECES = 3
+"""Failed pieces, with no calm one in between, that refuse a stream; two may share one fall, and no
+recording fails any."""
+
+_MIN_TURNING_PIECES = 12
+"""Turning pieces that clear the gyroscope; later failures are not due to its unit."""
+
+_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
+"""Rates exceeded for a twentieth of a piece: the first by walks, but not by noise and bias at rest,
+even in deg/s; the second by hardly any walk (maximum recorded 4.2), but by all read as deg/s."""
+
+
 class GyroUnitCheck:
-    """Looks at a stream's intervals until the unit of the gyroscope is beyond doubt."""
+    """Checks a stream's intervals until the unit of the gyroscope is beyond doubt."""
 
     def __init__(self) -> None:
         self._tables: list[FloatArray] = []  # time, gyro, accel (k, 7) of the piece so far
         self._wrong = self._turned = 0
 
     def check(self, interval: ImuInterval) -> None:
-        """Take in the stream's next interval.
+        """Add the stream's next interval.
 
         Raises:
             InputError: the gyroscope cannot be in rad/s.
@@ -140,11 +143,11 @@ class GyroUnitCheck:
         if interval.gap:
             self._tables = []
             return
-        if self._turned >= _TURNING_PIECES:
+        if self._turned >= _MIN_TURNING_PIECES:
             return
         table = np.column_stack([interval.time, interval.gyro, interval.accel])
         self._tables.append(table[1:] if self._tables else table)
-        if interval.stop - self._tables[0][0, 0] > _PIECE_S - 1e-6:
+        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - 1e-6:
             piece, self._tables = np.vstack(self._tables), []
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 
@@ -153,9 +156,9 @@ class GyroUnitCheck:
             _check_unit(time, gyro, accel)
         except InputError as error:
             self._wrong += 1
-            if self._wrong >= _WRONG_PIECES:
-                fix = "if it is in deg/s, push np.radians(gyro)"
-                raise InputError("gyro", error.found, error.expected, fix) from None
+            if self._wrong >= _MIN_FAILED_PIECES:
+                remedy = "if it is in deg/s, push np.radians(gyro)"
+                raise InputError("gyro", error.found, error.expected, remedy) from None
         else:
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:

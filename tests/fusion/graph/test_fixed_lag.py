@@ -284,7 +284,7 @@ def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
     def fails_once(self: KeyframeGraph, most_rounds: int = 5) -> Any:
         calls.append(self)
         if len(calls) == 16:  # two a second
-            raise IndeterminateError("velocity at 8.0 s")
+            raise IndeterminateError("velocity at 8.0 s is undetermined")
         return solve(self, most_rounds)
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
@@ -297,7 +297,8 @@ def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
     assert len(calls) > 30
     assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
     assert (
-        "fell back to the filter 1 times, last for velocity at 8.0 s" in navigator.health.notes[0]
+        "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"
+        in navigator.health.notes[0]
     )
 
 

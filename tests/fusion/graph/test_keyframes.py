@@ -144,7 +144,7 @@ def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(self: KeyframeGraph, most_rounds: int = 5) -> None:
-        raise IndeterminateError("velocity at 12.3 s")
+        raise IndeterminateError("velocity at 12.3 s is undetermined")
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
     filtered = Navigator(oracle, CONFIG).run(walk)
@@ -152,7 +152,9 @@ def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
     track = graph(oracle).run(walk)
     np.testing.assert_array_equal(track.trajectory.position_W, filtered.trajectory.position_W)
     np.testing.assert_array_equal(track.covariance, filtered.covariance)
-    assert track.health.notes == ["graph fell back to the filter's track: velocity at 12.3 s"]
+    assert track.health.notes == [
+        "graph fell back to the filter's track: velocity at 12.3 s is undetermined"
+    ]
     assert any("filter's track" in line for line in health_lines(track.health))
 
 
@@ -181,7 +183,7 @@ def test_measurements_without_meaning_are_refused_and_counted(
 def test_outliers_are_down_weighted(walk: ImuSequence, make_oracle: Make) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG, sigma=0.05), 2.0, 0.05**2)
     track = graph(model).run(walk)
-    assert "weighed down" in track.health.notes[0]
+    assert "down-weighted" in track.health.notes[0]
     assert " 0 measurements" not in track.health.notes[0]
     open_gate = replace(CONFIG, filter=replace(CONFIG.filter, gate=1.0 - 1e-16))
     model = Broken(make_oracle(walk, walk.truth, open_gate, sigma=0.05), 2.0, 0.05**2)

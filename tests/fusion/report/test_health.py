@@ -14,7 +14,7 @@ from stario.sequences import read_recording
 
 BAGS = DATA / "raw" / "rosbag"
 
-UNFAMILIAR = "60% of the windows move unlike all that the weights were trained on"
+UNFAMILIAR = "60% of the windows move unlike anything the weights were trained on"
 
 
 def test_what_stands_out_comes_with_what_to_do() -> None:
