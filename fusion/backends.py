@@ -18,7 +18,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, IntervalMeasurements
-from stario.fusion.filter.frame_transform import in_last_frame, smoothed_track
+from stario.fusion.filter.frame_transform import smoothed_track, to_final_frame
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix, FixQueue
 from stario.fusion.graph.batch import smooth
@@ -111,7 +111,7 @@ class EkfBackend:
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """Return the filter's states."""
         transforms = filtered.estimator.map_frame_state.transforms
-        states = in_last_frame(nav_states(filtered.estimates), transforms)
+        states = to_final_frame(nav_states(filtered.estimates), transforms)
         smoothed = smoothed_track(smoothed_poses(filtered.clones), transforms)
         return Solution(states, smoothed, [])
 
@@ -131,7 +131,7 @@ class GraphBackend:
         transforms, states = estimator.map_frame_state.transforms, nav_states(filtered.estimates)
         end, seen = states[-1], estimator.ekf.state.field is not None
         bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
-        own = in_last_frame(states, transforms)
+        own = to_final_frame(states, transforms)
         first = _with_bias_prior(states[0], estimator.bias_prior.variance)
         sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
         whole = smooth(own, first, filtered.measurements, transforms, config, bias, sigma)

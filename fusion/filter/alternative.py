@@ -43,7 +43,7 @@ class AlternativeHypothesis:
     """
 
     ekf: EkfState
-    began: float
+    start_time: float
     exclusive_fits: int = 0
     shared_fits: int = 0
 
@@ -66,7 +66,7 @@ class AlternativeHypothesis:
     @property
     def is_obsolete(self) -> bool:
         """Whether it can be dropped."""
-        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.began > _MAX_SECONDS
+        return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.start_time > _MAX_SECONDS
 
 
 class HypothesisPair:

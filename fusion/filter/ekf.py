@@ -274,7 +274,7 @@ class StateCloningEkf(ErrorStateEngine):
         blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
         return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
-    def exchange_gyro_bias_prior(self, old: float, new: float) -> None:
+    def replace_gyro_bias_prior(self, old: float, new: float) -> None:
         """Replace the gyroscope bias's zero-mean prior as if the new one had been used throughout.
 
         The old prior's information is removed and the new one's added: an update by a measurement

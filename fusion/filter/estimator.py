@@ -27,15 +27,15 @@ from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
     UpdateCounts,
-    counted,
+    incremented,
     innovation_row,
-    stacked,
+    innovations_from_rows,
 )
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
-from stario.fusion.filter.map_frame import KNOWN_YAW, MapFrame, MapFrameState
+from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA, MapFrame, MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
-from stario.fusion.imu.cutting import parts
+from stario.fusion.imu.cutting import split_at_fixes
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
 from stario.fusion.imu.stillness import StillnessDetector
@@ -74,7 +74,7 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        oriented = prior is not None and prior.yaw_sigma <= KNOWN_YAW
+        oriented = prior is not None and prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
         pivot, sigma = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
         self._map_frame = MapFrame(pivot, sigma, oriented, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
@@ -167,7 +167,7 @@ class Estimator:
             # Fixes within a long gap are useless: nothing links them to the track after it.
             for _ in fixes:
                 self._counts = changed(
-                    self._counts, fixes=counted(self._counts.fixes, "in a long gap")
+                    self._counts, fixes=incremented(self._counts.fixes, "in a long gap")
                 )
             reinitialise(self.ekf, interval, interval.restart, self._config)
             self._map_frame.lose_yaw(self.ekf)
@@ -175,7 +175,7 @@ class Estimator:
         if not fixes:
             return self._propagate_piece(interval, interval.start), []
         accepted = []
-        for piece, due in parts(interval, fixes):
+        for piece, due in split_at_fixes(interval, fixes):
             if piece is not None:
                 self._propagate_piece(piece, interval.start)
             accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
@@ -355,7 +355,7 @@ class Estimator:
 
     def innovations(self) -> Innovations:
         """Return every innovation so far."""
-        return stacked(self._innovations)
+        return innovations_from_rows(self._innovations)
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """Return the report so far, with the sigmas of another estimator's state if given."""

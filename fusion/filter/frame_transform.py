@@ -60,21 +60,21 @@ class FrameTransform:
         """Return whether an earlier state at a time [s] is transformed."""
         return self.since <= time < self.until
 
-    def turn_variance(self, own: float) -> float:
+    def turn_variance(self, yaw_variance: float) -> float:
         """Return the turn's variance [rad^2] for a state of yaw variance `own` before it."""
-        return self.yaw_sigma**2 + max(0.0, self.drift - own)
+        return self.yaw_sigma**2 + max(0.0, self.drift - yaw_variance)
 
     def position_covariance_of(
-        self, p_W: FloatArray, covariance: FloatArray, own: float
+        self, p_W: FloatArray, covariance: FloatArray, yaw_variance: float
     ) -> FloatArray:
         """Return the covariance (3, 3) of a transformed position [m^2].
 
         Args:
             p_W: (3,) position after the transform [m].
             covariance: (3, 3) covariance before the transform [m^2].
-            own: variance of the yaw there, in the track's own frame [rad^2].
+            yaw_variance: variance of the yaw there, in the track's own frame [rad^2].
         """
-        turned = _turn_covariance(self.turn_variance(own), np.zeros(3), p_W - self.pivot)
+        turned = _turn_covariance(self.turn_variance(yaw_variance), np.zeros(3), p_W - self.pivot)
         covariance = self.R @ covariance @ self.R.T + turned[6:9, 6:9]
         return (
             covariance
@@ -132,7 +132,7 @@ def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> Float
     return covariance
 
 
-def in_last_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
+def to_final_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
     """Return the states of a track, all in the frame in which the track ends."""
     for transform in transforms:
         states = [transform.state(state) for state in states]
@@ -151,8 +151,8 @@ def smoothed_track(
         for transform in transforms[pose.map_frame :]:
             if transform.applies_to(pose.time):
                 R_WB, p_W = transform.R @ R_WB, transform.position(p_W)
-                own = pose.covariance[2, 2]
-                covariance = transform.position_covariance_of(p_W, covariance, own)
+                yaw_variance = pose.covariance[2, 2]
+                covariance = transform.position_covariance_of(p_W, covariance, yaw_variance)
         rows.append((pose.time, p_W, R_WB, covariance))
     time, position, attitude, covariances = zip(*rows, strict=True)
     return Trajectory(

@@ -174,7 +174,7 @@ class AdaptiveBiasPrior:
         """Replace the prior as if the new one had been used from the start."""
         old, new = self.prior.variance + self._wander, updated.variance + self._wander
         ekf = self._hypotheses.ekf
-        self._hypotheses.apply_to_both(lambda: ekf.exchange_gyro_bias_prior(old, new))
+        self._hypotheses.apply_to_both(lambda: ekf.replace_gyro_bias_prior(old, new))
         self.prior = updated
 
     def _half_seconds(self, time: float) -> int:

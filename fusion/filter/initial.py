@@ -21,14 +21,14 @@ from stario.sequences.settings import check_number
 STILL_TILT_SIGMA = 0.01
 """Tilt sigma of the first attitude if the device was at rest [rad]."""
 
-WALKING_SPEED = 1.5
+GAP_VELOCITY_SIGMA = 1.5
 """Standard deviation of a pedestrian's mean velocity over a long gap, per axis [m/s]."""
 
 _ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
 """Limits on |R R^T - I|: above the first a matrix is not a rotation; above the second its input was
 rounded, and the nearest rotation is used."""
 
-FARTHEST = 1e4
+MAX_GAP_DISTANCE = 1e4
 """Maximum distance assumed to be covered in a gap [m]: the covariance must keep its digits."""
 
 
@@ -99,7 +99,7 @@ def reinitialise(
     tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, SMALLEST_SIGMA) ** 2 * np.eye(3)
-    reach = min(WALKING_SPEED * seconds, FARTHEST)
+    reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
     covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
     turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk

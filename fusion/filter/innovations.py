@@ -42,7 +42,7 @@ class UpdateCounts:
         """Return the counts with one more network measurement."""
         offered = self.offered + 1
         if result.residual is None:
-            return changed(self, offered=offered, refused=counted(self.refused, result.reason))
+            return changed(self, offered=offered, refused=incremented(self.refused, result.reason))
         return changed(
             self,
             offered=offered,
@@ -53,26 +53,26 @@ class UpdateCounts:
 
     def add_fix(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more fix."""
-        fixes = counted(self.fixes, "applied" if result.accepted else result.reason)
+        fixes = incremented(self.fixes, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
-            fixes = counted(fixes, "gated")
+            fixes = incremented(fixes, "gated")
         return changed(self, fixes=fixes)
 
     def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more measurement at rest."""
         what = "applied" if result.accepted else result.reason
-        return changed(self, zero_velocity=counted(self.zero_velocity, what))
+        return changed(self, zero_velocity=incremented(self.zero_velocity, what))
 
     def add_bearing(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more bearing of the magnetic field."""
-        bearings = counted(self.bearings, "applied" if result.accepted else result.reason)
+        bearings = incremented(self.bearings, "applied" if result.accepted else result.reason)
         if result.accepted and result.scale > 1.0:
-            bearings = counted(bearings, "gated")
+            bearings = incremented(bearings, "gated")
         return changed(self, bearings=bearings)
 
     def add_north(self) -> UpdateCounts:
         """Return the counts with north determined by the magnetic field."""
-        return changed(self, bearings=counted(self.bearings, "north"))
+        return changed(self, bearings=incremented(self.bearings, "north"))
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
         """Return the report: outcomes of samples and updates, and the state's sigmas."""
@@ -100,13 +100,13 @@ class UpdateCounts:
 
 
 def innovation_row(time: float, result: UpdateResult) -> tuple[float, ...] | None:
-    """Return a row for `stacked`; None for an invalid measurement."""
+    """Return a row for `innovations_from_rows`; None for an invalid measurement."""
     if result.residual is None or result.sigma is None:
         return None
     return time, *result.residual, *result.sigma, result.nis, float(is_gated(result))
 
 
-def stacked(rows: list[tuple[float, ...]]) -> Innovations:
+def innovations_from_rows(rows: list[tuple[float, ...]]) -> Innovations:
     """Return innovations from their rows."""
     table = np.array(rows).reshape(-1, 9)
     return Innovations(
@@ -123,6 +123,6 @@ def is_gated(result: UpdateResult) -> bool:
     return result.reason == "gated" or result.scale > 1.0
 
 
-def counted(counts: Mapping[str, int], reason: str) -> dict[str, int]:
+def incremented(counts: Mapping[str, int], reason: str) -> dict[str, int]:
     """Return the counts with one more of a reason."""
     return {**counts, reason: counts.get(reason, 0) + 1}

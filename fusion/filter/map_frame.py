@@ -37,14 +37,14 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
-KNOWN_YAW = 0.5
+MAX_PRIOR_YAW_SIGMA = 0.5
 """A first yaw with a sigma up to this [rad] is kept; a coarser one is left to the fixes."""
 
-COARSEST_YAW = 1.0
+MAX_YAW_SIGMA = 1.0
 """A yaw coarser than this [rad] does not determine the direction: it would make the filter
 overconfident in a wrong one."""
 
-FAR_ENOUGH = 0.3
+MAX_POSITION_YAW_SIGMA = 0.3
 """Two positions determine the yaw if its sigma is then at most this [rad]; half its square, which
 the linearisation neglects, is still far smaller (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
@@ -150,7 +150,7 @@ class MapFrame:
         """After a gap: if the yaw is lost, leave placing and turning the track to later fixes."""
         now, s = _nav_state(ekf), self.state
         variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
-        if not (s.placed or s.oriented) or variance <= KNOWN_YAW**2:
+        if not (s.placed or s.oriented) or variance <= MAX_PRIOR_YAW_SIGMA**2:
             return
         since = now.time if s.placed else s.since  # an unplaced track stays in one piece
         unoriented = s.unoriented
@@ -205,13 +205,12 @@ class MapFrame:
         now = _nav_state(ekf)
         turn, sigma = _turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself then measures the turn
-        if not (
-            math.isfinite(turn) and sigma <= (COARSEST_YAW if fix.kind == "yaw" else FAR_ENOUGH)
-        ):
+        most = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
+        if not (math.isfinite(turn) and sigma <= most):
             if fix.kind != "position":
                 return None
             turn, inflation = self.state.alignment.turn
-            if inflation > FAR_ENOUGH:
+            if inflation > MAX_POSITION_YAW_SIGMA:
                 self._add_to_alignment(ekf, fix)
                 return None
         R = exp_so3(np.array([0.0, 0.0, turn]))

@@ -17,7 +17,7 @@ from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.sequences.sequence import FloatArray
 
-SECONDS = 60.0
+CORRELATION_SECONDS = 60.0
 """Correlation time of the turn [s]."""
 
 
@@ -57,6 +57,6 @@ def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """Return the state with its turn propagated over a time [s]; unchanged if it has none."""
     if not s.has_turn:
         return s
-    kept = math.exp(-seconds / SECONDS)
-    P = gauss_markov(s.P, s.turn_row, kept, sigma)
-    return changed(s, P=P, network_turn=kept * s.network_turn)
+    correlation = math.exp(-seconds / CORRELATION_SECONDS)
+    P = gauss_markov(s.P, s.turn_row, correlation, sigma)
+    return changed(s, P=P, network_turn=correlation * s.network_turn)

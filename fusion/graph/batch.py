@@ -78,7 +78,7 @@ def smooth(
         solution = builder.graph.solve()
     except IndeterminateError as error:
         return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
-    solved = {state.time: state for state in filled(builder.graph, builder.segments)}
+    solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
     states = [
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
@@ -109,7 +109,7 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     return replace(first, covariance=covariance)
 
 
-def filled(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:
+def all_states(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:
     """Return the keyframes of a solved graph and the states where the segments between them end."""
     keyframes = graph.keyframes
     states = [graph.state(keyframes[0])]

@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import Displacement as Measured
-from stario.fusion.filter.network_turn import SECONDS as TURN_SECONDS
+from stario.fusion.filter.network_turn import CORRELATION_SECONDS as TURN_SECONDS
 from stario.fusion.filter.network_turn import TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
@@ -86,7 +86,7 @@ class GraphBuilder:
         self._spacing = self._window // self._overlap  # intervals
         self._pending: list[ImuInterval] = []
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
-        self._joints: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
+        self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: list[int] = []  # keyframes followed by a gap
 
     @property
@@ -124,7 +124,7 @@ class GraphBuilder:
         before = self.graph.last
         if interval.gap:
             self.close()
-            self._joints.clear()
+            self._window_keyframes.clear()
         if interval.restart is not None and guess is not None:
             self._begin_disconnected(guess)
             return True
@@ -135,10 +135,10 @@ class GraphBuilder:
             self.close(guess)
             if self.estimates_turn:
                 self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
-            window_start = self._joints.get(self.count - self._window)
+            window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
                 self._add_displacement(window_start, interval, *displacement)
-            self._joints[self.count] = self.graph.last
+            self._window_keyframes[self.count] = self.graph.last
             if zero_velocity is not None:
                 self._add_zero_velocity(zero_velocity)
         for fix in fixes:
@@ -170,7 +170,7 @@ class GraphBuilder:
         graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
         return True
 
-    def forget(self, time: float) -> None:
+    def marginalise_until(self, time: float) -> None:
         """Marginalise the keyframes before the last one at or before a time [s].
 
         Raises:
@@ -178,7 +178,7 @@ class GraphBuilder:
         """
         first = max((k for k in self.graph.keyframes if self.graph.time(k) <= time), default=0)
         self.graph.marginalise(first)
-        self._joints = {n: k for n, k in self._joints.items() if k >= first}
+        self._window_keyframes = {n: k for n, k in self._window_keyframes.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
         self._gaps = [k for k in self._gaps if k >= first]
 
@@ -198,7 +198,7 @@ class GraphBuilder:
         self.count = 0
         k = self.graph.add_disconnected(state)
         self.segments[k] = []
-        self._joints[0] = k
+        self._window_keyframes[0] = k
 
     def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
         if segment is None or interval.gap:

@@ -71,7 +71,7 @@ class Prior:
     """
 
     k: int
-    about: tuple[KeyframeState, ...]
+    reference: tuple[KeyframeState, ...]
     root: FloatArray
     offset: FloatArray
     turns: tuple[tuple[int, float], ...] = ()
@@ -79,7 +79,7 @@ class Prior:
     @property
     def keyframes(self) -> tuple[int, ...]:
         """All keyframes of the prior."""
-        return tuple(range(self.k, self.k + len(self.about)))
+        return tuple(range(self.k, self.k + len(self.reference)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -89,13 +89,13 @@ class Prior:
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the rows of the root."""
         residual, blocks = self.offset, []
-        for n, (k, about) in enumerate(zip(self.keyframes, self.about, strict=True)):
+        for n, (k, reference) in enumerate(zip(self.keyframes, self.reference, strict=True)):
             root = self.root[:, CORE * n : CORE * (n + 1)]
             state = KeyframeState.of(values, k)
-            residual = residual - root @ state.error_from(about)
+            residual = residual - root @ state.error_from(reference)
             H = root @ state.invariant_from_local()
             blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
-        for n, (k, turn) in enumerate(self.turns, CORE * len(self.about)):
+        for n, (k, turn) in enumerate(self.turns, CORE * len(self.reference)):
             residual = residual - self.root[:, n] * (turn_at(values, k) - turn)
             blocks.append((T(k), self.root[:, n : n + 1]))
         return Linearised(residual, blocks)
@@ -151,19 +151,19 @@ class Displacement:
 
 
 @dataclass(frozen=True, eq=False)
-class TurnWander:
-    """Gauss-Markov model of the network's turn: tau_j = kept tau_i + n.
+class TurnProcess:
+    """Gauss-Markov model of the network's turn: tau_j = correlation tau_i + n.
 
     Attributes:
         i: keyframe of the previous turn.
         j: keyframe of this turn.
-        kept: correlation of the two; 0 for the first turn, where i is j.
+        correlation: of the two; 0 for the first turn, where i is j.
         covariance: (1, 1) covariance of n [rad^2].
     """
 
     i: int
     j: int
-    kept: float
+    correlation: float
     covariance: FloatArray
 
     @property
@@ -176,8 +176,8 @@ class TurnWander:
         now, before = turn_at(values, self.j), turn_at(values, self.i)
         blocks = [(T(self.j), np.eye(1))]
         if self.i != self.j:
-            blocks.append((T(self.i), -self.kept * np.eye(1)))
-        return Linearised(np.array([self.kept * before - now]), blocks)
+            blocks.append((T(self.i), -self.correlation * np.eye(1)))
+        return Linearised(np.array([self.correlation * before - now]), blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,7 @@ class Position:
     p_W: FloatArray
     covariance: FloatArray
     dt: float
-    shift_W: FloatArray
+    dp_W: FloatArray
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -206,7 +206,7 @@ class Position:
     def linearise(self, values: Any) -> Linearised:
         """Linearise in W."""
         R, p = _pose(values, self.k)
-        predicted = p + self.dt * values.atVector(V(self.k)) + self.shift_W
+        predicted = p + self.dt * values.atVector(V(self.k)) + self.dp_W
         H = np.zeros((3, 6))
         H[:, 3:] = R
         return Linearised(self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)])
@@ -226,7 +226,7 @@ class Velocity:
     k: int
     v_W: FloatArray
     covariance: FloatArray
-    gain_W: FloatArray
+    dv_W: FloatArray
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -235,7 +235,7 @@ class Velocity:
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in W."""
-        predicted = values.atVector(V(self.k)) + self.gain_W
+        predicted = values.atVector(V(self.k)) + self.dv_W
         return Linearised(self.v_W - predicted, [(V(self.k), _EYE)])
 
 

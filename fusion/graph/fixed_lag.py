@@ -200,7 +200,7 @@ class FixedLagEstimator:
         try:
             graph.solve(_MAX_ROUNDS)
             newest = graph.state(graph.last)
-            builder.forget(newest.time - self._config.graph.lag)
+            builder.marginalise_until(newest.time - self._config.graph.lag)
         except IndeterminateError as error:
             self._fallbacks = (self._fallbacks[0] + 1, str(error))
             self._begin(builder.count)

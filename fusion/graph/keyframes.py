@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.filter.network_turn import TurnEstimate
-from stario.fusion.graph.factors import Prior, Term, TurnWander, turn_at
+from stario.fusion.graph.factors import Prior, Term, TurnProcess, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.preintegration import Segment
@@ -122,16 +122,16 @@ class KeyframeGraph:
         if j in self._turns:
             return
         i = max(self._turns, default=j)
-        kept = math.exp((self._time[i] - self._time[j]) / memory) if i != j else 0.0
-        self._turns[j] = kept * self._turns.get(i, 0.0)
-        covariance = np.array([[(1.0 - kept**2) * sigma**2]])
-        self.add(TurnWander(i, j, kept, covariance), gated=False)
+        correlation = math.exp((self._time[i] - self._time[j]) / memory) if i != j else 0.0
+        self._turns[j] = correlation * self._turns.get(i, 0.0)
+        covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
+        self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
-    def solve(self, most_rounds: int = 10) -> Solution:
+    def solve(self, max_rounds: int = 10) -> Solution:
         """Optimise the keyframes.
 
         Args:
-            most_rounds: maximum number of linearisations of the measurements.
+            max_rounds: maximum number of linearisations of the measurements.
 
         Raises:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
@@ -139,7 +139,7 @@ class KeyframeGraph:
         """
         start = self._states, self._turns
         try:
-            rounds, values = self._optimise(most_rounds)
+            rounds, values = self._optimise(max_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
@@ -217,11 +217,12 @@ class KeyframeGraph:
         keys = [key(k) for k in reached for key in (X, V, B)]
         A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
-        about = tuple(self.pose(k) for k in reached)
+        reference = tuple(self.pose(k) for k in reached)
         to_local = block_diag(
-            *(np.linalg.inv(state.invariant_from_local()) for state in about), np.eye(len(turns))
+            *(np.linalg.inv(state.invariant_from_local()) for state in reference),
+            np.eye(len(turns)),
         )
-        return Prior(reached[0], about, table[:, :-1] @ to_local, table[:, -1], turns)
+        return Prior(reached[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
@@ -230,14 +231,14 @@ class KeyframeGraph:
         self._states[k] = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
         self._tree = None
 
-    def _optimise(self, most_rounds: int) -> tuple[int, Any]:
+    def _optimise(self, max_rounds: int) -> tuple[int, Any]:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
         From a poor start, a correct step may increase their error by its second-order terms.
         Levenberg-Marquardt's damping is then slow, and a stream would output unconverged states.
         """
         factors, values, ordering = self._imu_factors(), self._values(), self._ordering()
-        for _round in range(most_rounds):
+        for _round in range(max_rounds):
             linear = factors.linearize(values)
             for term in self._terms:
                 linear.push_back(term.factor(values))
@@ -281,7 +282,7 @@ class KeyframeGraph:
 
 def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
     """Return the prior of a keyframe from a state's covariance and that of the network's turn."""
-    about = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
+    reference = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
     covariance: FloatArray = state.covariance
     turns: tuple[tuple[int, float], ...] = ()
     if turn is not None:
@@ -289,7 +290,7 @@ def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
         covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
         turns = ((k, turn.turn),)
     root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
-    return Prior(k, (about,), root, np.zeros(len(root)), turns)
+    return Prior(k, (reference,), root, np.zeros(len(root)), turns)
 
 
 def _root_information(covariance: FloatArray) -> FloatArray:

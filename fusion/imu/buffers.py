@@ -116,7 +116,7 @@ class FieldBuffer:
 
     def __init__(self) -> None:
         self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
-        self._asked = -math.inf
+        self._last_query = -math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
         """Add a field; return False if its value or time cannot be right.
@@ -134,7 +134,7 @@ class FieldBuffer:
         ):
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
-        newest = max(newest, self._asked - _MAX_DELAY)
+        newest = max(newest, self._last_query - _MAX_DELAY)
         right = (
             math.isfinite(time)
             and time > newest
@@ -146,7 +146,7 @@ class FieldBuffer:
 
     def at(self, time: float) -> FloatArray | None:
         """Return the newest field (3,) up to a time [s], None if too old; later fields wait."""
-        self._asked = time
+        self._last_query = time
         return next(
             (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None
         )

@@ -15,7 +15,7 @@ _SAME_TIME = 1e-6
 """A fix within this time of an interval's start or end [s] counts as at it."""
 
 
-def parts(
+def split_at_fixes(
     interval: ImuInterval, fixes: Sequence[Fix]
 ) -> list[tuple[ImuInterval | None, list[Fix]]]:
     """Split an interval at the times of its fixes; return each piece with the fixes at its end.
@@ -33,7 +33,7 @@ def parts(
             if not pieces:
                 pieces.append((None, []))
         elif fix.time < rest.stop - _SAME_TIME:
-            before, rest = cut(rest, fix.time)
+            before, rest = split_at(rest, fix.time)
             pieces.append((before, []))
         else:
             break
@@ -42,7 +42,7 @@ def parts(
     return [*pieces, (rest, list(fixes[taken:]))]
 
 
-def cut(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
+def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
     """Split an interval at a time [s] inside it; the second part keeps window and update."""
     k = int(np.searchsorted(interval.time, time))
     weight = (time - interval.time[k - 1]) / (interval.time[k] - interval.time[k - 1])

@@ -70,10 +70,10 @@ class FrontEnd:
         self._newest = -math.inf
         self._window = WindowBuffer(rate)
         self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
-        self._ahead: list[Sample] = []  # jumped ahead in time, not confirmed yet
+        self._unconfirmed: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_long_gap: Sample | None = None
         self._fields = FieldBuffer()
-        self._late = ClockSetBackDetector()
+        self._clock = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
         self.gyro_unit = GyroUnitCheck()  # for streams, which cannot be checked as a whole
@@ -94,16 +94,18 @@ class FrontEnd:
         if self._frozen.is_frozen(sample):
             self.counts.frozen += 1
             return []
-        if self._ahead and time > self._newest:
+        if self._unconfirmed and time > self._newest:
             self._drop_ahead(time)
-        newest = self._ahead[-1][0] if self._ahead and time > self._newest else self._newest
+        newest = self._newest
+        if self._unconfirmed and time > newest:
+            newest = self._unconfirmed[-1][0]
         if time == newest:
             self.counts.duplicate += 1
         elif time < newest:
             self.counts.out_of_order += 1
-            late = self._late.late(time, newest)
+            late = self._clock.note_late(time, newest)
             self.counts.longest_late = max(self.counts.longest_late, late)
-        elif self._ahead or time - newest > MAX_IMU_GAP:
+        elif self._unconfirmed or time - newest > MAX_IMU_GAP:
             return self._confirm(sample)
         else:
             return self._accept(sample)
@@ -121,12 +123,12 @@ class FrontEnd:
 
     def finish(self) -> None:
         """End the stream: drop the samples that still wait for others to confirm their times."""
-        self.counts.future += len(self._ahead)
-        self._ahead = []
+        self.counts.future += len(self._unconfirmed)
+        self._unconfirmed = []
 
     def _drop_ahead(self, time: float) -> None:
         """Drop the waiting samples whose times are refuted by a new sample at `time`."""
-        ahead = self._ahead
+        ahead = self._unconfirmed
         known = len(ahead)
         if time < ahead[0][0]:
             ahead.clear()
@@ -136,17 +138,17 @@ class FrontEnd:
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
         """Hold a sample that jumps ahead in time or follows one; accept all once confirmed."""
-        ahead = self._ahead
+        ahead = self._unconfirmed
         ahead.append(sample)
         far = ahead[0][0] - self._newest > LONG_GAP
         if len(ahead) < (CONFIRMED_FAR if far else CONFIRMED):
             return []
-        self._ahead = []
+        self._unconfirmed = []
         return [interval for waiting in ahead for interval in self._accept(waiting)]
 
     def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
-        self._late.on_time()
+        self._clock.on_time()
         before, self._newest = self._newest, time
         self.counts.used += 1
         if self._samples and time - before > _HOLE_SECONDS:

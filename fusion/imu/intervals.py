@@ -94,7 +94,7 @@ _NO_ATTITUDES = np.empty((0, 3, 3))
 GAPS_LISTED = 100
 """Maximum number of gaps listed one by one; an endless stream may have any number."""
 
-LATE_SECONDS = 0.5
+LATE_NOTE_SECONDS = 0.5
 """Duration of consecutive late samples beyond which the health report notes them [s]."""
 
 UNFAMILIAR_SHARE = 0.3
@@ -165,7 +165,7 @@ class SampleCounts:
             notes.append(
                 f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
             )
-        elif self.longest_late > LATE_SECONDS:
+        elif self.longest_late > LATE_NOTE_SECONDS:
             notes.append(
                 f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
                 "from a clock that was set back; if so, that time is missing and no sigma covers it"

@@ -59,7 +59,7 @@ class ClockSetBackDetector:
         """Note that a sample was not late."""
         self._running = False
 
-    def late(self, time: float, newest: float) -> float:
+    def note_late(self, time: float, newest: float) -> float:
         """Note that a sample at `time` [s] came after one at `newest` [s].
 
         Returns:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.filter.map_frame import KNOWN_YAW
+from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA
 from stario.fusion.state import NavState
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray
@@ -46,7 +46,7 @@ class DisplayedTrack:
     def add(self, state: NavState) -> None:
         """Append the newest state."""
         behind_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
-        if behind_gap and state.covariance[2, 2] > KNOWN_YAW**2:
+        if behind_gap and state.covariance[2, 2] > MAX_PRIOR_YAW_SIGMA**2:
             self.since = len(self.points)
         self.points.append(point_of(state))
         if len(self.points) > MOST_POINTS:

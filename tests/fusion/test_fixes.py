@@ -20,7 +20,7 @@ from stario.fusion.filter.jacobians import (
 )
 from stario.fusion.fix_file import read_fixes
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
-from stario.fusion.imu.cutting import cut
+from stario.fusion.imu.cutting import split_at
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
@@ -178,7 +178,7 @@ def test_fixes_of_the_future_wait(walk: ImuSequence, model: Any) -> None:
 def test_an_epoch_cut_in_two_says_the_same(walk: ImuSequence) -> None:
     interval = next(e for e in cut_recording(walk, CONFIG)[0] if e.window is not None)
     for time in (interval.start + 0.033, float(interval.time[4]), interval.stop - 1e-4):
-        first, second = cut(interval, time)
+        first, second = split_at(interval, time)
         assert first.stop == second.start == time
         assert first.window is None
         assert second.window is interval.window

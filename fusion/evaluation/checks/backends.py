@@ -11,7 +11,7 @@ import numpy as np
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.faults import DummyPredictor, with_true_displacements
-from stario.fusion.filter.innovations import stacked
+from stario.fusion.filter.innovations import innovations_from_rows
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -185,7 +185,7 @@ def _streamed(
         states.append(estimator.nav_state())
         times.append(process_time() - began)
     health = estimator.health(preprocessed.front_end.counts)
-    return track_from_states(states, stacked([]), health), np.array(times)
+    return track_from_states(states, innovations_from_rows([]), health), np.array(times)
 
 
 def _table(scores: Sequence[Score], by: Callable[[Score], dict[str, float]]) -> FloatArray:

@@ -27,7 +27,7 @@ def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
 def test_an_exchanged_prior_is_as_if_it_had_been_there_from_the_start(new: float) -> None:
     old = 1e-3
     ekf = ekf_with_rates_measured(old)
-    ekf.exchange_gyro_bias_prior(old**2, new**2)
+    ekf.replace_gyro_bias_prior(old**2, new**2)
     expected = ekf_with_rates_measured(new).state
     # The second residual took b_a as zero in both, so what is compared is linear.
     np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
@@ -41,7 +41,7 @@ def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_covariance() -> None:
     ekf.P = P
     core = slice(0, 15)  # a clone that has just been made is the pose once more
     before = np.linalg.eigvalsh(P[core, core]).min()
-    ekf.exchange_gyro_bias_prior(1e-6, 1e-5)
+    ekf.replace_gyro_bias_prior(1e-6, 1e-5)
     assert np.linalg.eigvalsh(ekf.P[core, core]).min() > 0.5 * before
     assert (np.diag(ekf.P)[9:12] <= 10.0 * np.diag(P)[9:12] * (1.0 + 1e-6)).all()
     assert (np.diag(ekf.P)[9:12] > np.diag(P)[9:12]).all()

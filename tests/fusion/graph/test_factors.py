@@ -15,7 +15,7 @@ from stario.fusion.graph.factors import (
     Position,
     Prior,
     Term,
-    TurnWander,
+    TurnProcess,
     Velocity,
     Yaw,
 )
@@ -54,8 +54,8 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         GyroBias(0, rng.normal(size=3), EYE),
         Prior(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
         Displacement(0, 1, rng.normal(size=3), R_NB, EYE, turned=True),
-        TurnWander(0, 1, 0.6, np.eye(1)),
-        TurnWander(1, 1, 0.0, np.eye(1)),
+        TurnProcess(0, 1, 0.6, np.eye(1)),
+        TurnProcess(1, 1, 0.0, np.eye(1)),
         Prior(0, (state,), rng.normal(size=(9, 16)), rng.normal(size=9), ((0, 0.2),)),
     ]
 

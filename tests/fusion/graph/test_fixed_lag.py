@@ -281,11 +281,11 @@ def test_where_the_graph_fails_the_stream_goes_on_from_the_filter(
 ) -> None:
     solve, calls = KeyframeGraph.solve, []
 
-    def fails_once(self: KeyframeGraph, most_rounds: int = 5) -> Any:
+    def fails_once(self: KeyframeGraph, max_rounds: int = 5) -> Any:
         calls.append(self)
         if len(calls) == 16:  # two a second
             raise IndeterminateError("velocity at 8.0 s is undetermined")
-        return solve(self, most_rounds)
+        return solve(self, max_rounds)
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
     filtered = stream(Navigator(oracle, CONFIG), walk)

@@ -143,7 +143,7 @@ def test_a_state_that_nothing_determines_is_named(first: int, name: str) -> None
 def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(self: KeyframeGraph, most_rounds: int = 5) -> None:
+    def fails(self: KeyframeGraph, max_rounds: int = 5) -> None:
         raise IndeterminateError("velocity at 12.3 s is undetermined")
 
     oracle = make_oracle(walk, walk.truth, CONFIG)

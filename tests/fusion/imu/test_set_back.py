@@ -17,8 +17,8 @@ Make = Callable[..., Any]
 
 
 def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
-    late = walk.time >= at
-    return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
+    note_late = walk.time >= at
+    return replace(walk.without_truth(), time=np.where(note_late, walk.time - by, walk.time))
 
 
 def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> None:
@@ -58,12 +58,12 @@ def test_late_samples_and_bursts_are_no_other_clock() -> None:
     watch = ClockSetBackDetector()
     for k in range(300):  # two sensors in turn, one half a second behind
         watch.on_time()
-        watch.late(0.01 * k - 0.5, 0.01 * k)
+        watch.note_late(0.01 * k - 0.5, 0.01 * k)
     for k in range(490):
-        watch.late(0.01 * k, 10.0)
+        watch.note_late(0.01 * k, 10.0)
     watch.on_time()
     for k in range(300):  # falling
-        watch.late(9.0 - 0.01 * k, 10.0)
+        watch.note_late(9.0 - 0.01 * k, 10.0)
 
 
 def test_a_block_that_is_logged_twice_costs_nothing(make_walk: Make, still_model: Any) -> None:
