@@ -164,7 +164,7 @@ def track_table(
         "nees": "NEES",
         "nis": "NIS",
         "seconds_network": "network [s]",
-        "seconds_filter": "rest [s]",
+        "seconds_filter": "other [s]",
     }
     rows = [[name, *(figure(found.get(key)) for key in columns)] for name, found in metrics.items()]
     lines = aligned([["", *columns.values()], *rows])
