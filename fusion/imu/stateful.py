@@ -22,6 +22,11 @@ LEAST_SIGMA = 5e-3
 FLAGGED_SCALE = 4.0
 """Factor on the covariance of windows with spikes, saturated or missing samples (sigma doubled)."""
 
+SLOPE_SIGMA = 0.03
+"""Standard deviation of the floor's slope: the networks learned on level floors, and are sure of
+the height. With it the median position NEES of KIPD, some of whose walks climb, falls from 12.4 to
+7.2, that of RIDI from 4.6 to 3.8; with 0.05 that of OxIOD would be 1.4 (2.4 expected)."""
+
 Displacement = tuple[FloatArray, FloatArray]
 """Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
@@ -120,10 +125,12 @@ def displacements_of(
     counts.windows += len(windows_N)
     counts.unfamiliar += network.unfamiliar(windows_N)
     heading = np.array([interval.heading for interval in intervals])
-    return [
-        (d_N, floored(FLAGGED_SCALE * C if interval.window_flagged else C, LEAST_SIGMA))
-        for interval, d_N, C in zip(intervals, *network.predict(windows_N, heading), strict=True)
-    ]
+    mean_N, covariance_N = network.predict(windows_N, heading)
+    flagged = np.array([interval.window_flagged for interval in intervals])
+    covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
+    with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values
+        covariance_N[:, 2, 2] += SLOPE_SIGMA**2 * np.square(mean_N[:, :2]).sum(axis=1)
+    return [(d_N, floored(C, LEAST_SIGMA)) for d_N, C in zip(mean_N, covariance_N, strict=True)]
 
 
 def _window(interval: ImuInterval) -> NDArray[np.float32]:
