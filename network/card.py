@@ -74,6 +74,7 @@ class Card:
         recipe: the command and settings that produced the weights.
         figures: results on named recordings.
         known_motion: summary of the training windows, None if there is none.
+        format: version of the card's layout.
     """
 
     architecture: str

@@ -53,7 +53,8 @@ class KnownMotion:
     """Summary of the training windows.
 
     Attributes:
-        centres: k-means centres of the windows, each five numbers on the scales of `described`.
+        centres: k-means centres of the windows, each five numbers on the scales of
+            `scaled_features`.
         limit: distance to the nearest centre that 95 % of the training windows do not exceed.
         ranges: 1st and 99th percentile of each of `FEATURES`, of "step_rate" [Hz] and of "speed"
             [m/s], for reports.

@@ -37,7 +37,7 @@ class AlternativeHypothesis:
 
     Attributes:
         ekf: state of the filter under this hypothesis.
-        began: time of the first outlier [s].
+        start_time: time of the first outlier [s].
         exclusive_fits: displacements that fitted only it, since one fitted only the filter.
         shared_fits: number of latest displacements in a row that fitted both.
     """

@@ -61,7 +61,7 @@ class FrameTransform:
         return self.since <= time < self.until
 
     def turn_variance(self, yaw_variance: float) -> float:
-        """Return the turn's variance [rad^2] for a state of yaw variance `own` before it."""
+        """Return the turn's variance [rad^2] for an earlier state with this yaw variance."""
         return self.yaw_sigma**2 + max(0.0, self.drift - yaw_variance)
 
     def position_covariance_of(

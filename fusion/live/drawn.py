@@ -34,7 +34,7 @@ class DisplayedTrack:
         origin: (3,) position displayed as zero [m].
         map_frame: `NavState.map_frame` of the newest states.
         since: index of the first point that fixes still move; points before a gap in which the
-            heading was lost stay where they are.
+            yaw was lost stay where they are.
     """
 
     points: list[Point] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Live recording on disk: StarIO's own CSV, complete up to the last batch at any moment.
+"""Live recording on disk: a generic CSV, complete up to the last batch at any moment.
 
 Each batch is one unbuffered write of whole lines, so that a killed program loses nothing that it
 accepted. `read_recording` can also read the file while it grows. The last column, the time of

@@ -76,7 +76,7 @@ def cell_recipe(
 def train_cell(
     dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
 ) -> dict[str, object]:
-    """Train a cell's network, resuming from its checkpoint; write the model and `SPARE`.
+    """Train a cell's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
 
     Returns:
         Plain values: errors of the last epoch [m^2], number of steps, windows per step, total and

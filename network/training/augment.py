@@ -156,7 +156,7 @@ class WindowSampler:
         return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
 
     def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
-        """Add swings in W, then rotate each second into its frame H and apply `show`.
+        """Add swings in W, then rotate each second into its frame H and apply `augmented`.
 
         Args:
             imu: (B, 200 K, 6) gyroscope and specific force in W.

@@ -44,7 +44,7 @@ class EpochReport:
     Attributes:
         epoch: its number, from 1.
         training_error: error on its augmented windows.
-        validation_error: the error that selects weights (`ValidationSet.deciding`).
+        validation_error: the error that selects weights (`ValidationSet.selection_error`).
         validation_by_recording: error of each recording, and of each kind of weak truth [m^2/s].
         windows_per_second: training windows of this process, with full or weak truth.
         drawing_share: share of the time spent drawing them while the network waits.

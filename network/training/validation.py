@@ -55,7 +55,7 @@ class ValidationSet:
         legs: held-out streams with weak truth.
         config: recipe that determines how their stretches are drawn.
         chosen_by_legs: whether legs alone select the weights, if there are any.
-        remembers: whether the evaluated networks are recurrent.
+        is_recurrent: whether the evaluated networks are recurrent.
 
     Raises:
         InputError: no stream is longer than a second.

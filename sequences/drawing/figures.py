@@ -88,7 +88,7 @@ def split_at_gaps(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the valid rows of time (N,) and values (N, k), with a row of nan in each gap.
 
-    Gaps are those of `behind_gaps`.
+    Gaps are those of `indices_after_gaps`.
     """
     if valid is not None:
         time, values = time[valid], values[valid]

@@ -34,7 +34,7 @@ class YawDrift:
     Attributes:
         scale: scale error of the gyroscope, positive if it reads too high.
         bias: its bias about the vertical [rad/s].
-        left: root mean square of the residual yaw [rad].
+        residual_rms: root mean square of the residual yaw [rad].
     """
 
     scale: float

@@ -22,8 +22,8 @@ class Fault:
 
     Attributes:
         name: name in the table.
-        spoil: change to the recording.
-        corrupt: change to the network's predictions.
+        modify_samples: change to the recording; None for none.
+        modify_predictions: change to the network's predictions; None for none.
     """
 
     name: str

@@ -109,7 +109,7 @@ def test_a_stream_takes_displacements_as_its_filter_judges_them(
     assert none == 0
     # Both false ones, and the right one after them, against which the second has moved the speed.
     assert two == 3
-    # The accelerometer counts for a little less behind them (`AccelerometerWorth`).
+    # The accelerometer counts for a little less behind them (`AccelNoiseScale`).
     assert np.linalg.norm(spoilt[-1] - right[-1]) < 0.12
 
 
