@@ -1,4 +1,4 @@
-"""Pages in a real browser, headless Chromium; tests skip and say so where it is absent."""
+"""Pages in a real browser, headless Chromium; tests are skipped if it is not installed."""
 
 import shutil
 from collections.abc import Iterator
@@ -15,17 +15,17 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))
 
 @dataclass
 class Shown:
-    """A page and what its console complained of."""
+    """A page with its console's errors and warnings, and its failed requests."""
 
     page: Any
-    complaints: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
     def overflows(self) -> bool:
         """Whether the page is wider than its window."""
         return self.page.evaluate("document.documentElement.scrollWidth > window.innerWidth")
 
 
-@pytest.fixture(scope="module")  # while it is open no other test could run an event loop
+@pytest.fixture(scope="module")  # while it is open no other test can run an event loop
 def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium")
@@ -38,7 +38,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def show(browser, tmp_path: Path):
-    """Open an address; without a network, so that a page that loads anything from afar fails."""
+    """Open an address; `offline`, a page that loads anything from the network fails."""
     opened = []
 
     def show(url: str, size: tuple[int, int] = DESKTOP, offline: bool = False) -> Shown:
@@ -47,15 +47,15 @@ def show(browser, tmp_path: Path):
             viewport={"width": width, "height": height}, has_touch=width < 600, offline=offline
         )
         context.set_default_timeout(20_000)
-        context.set_default_navigation_timeout(120_000)  # a shared core reads plotly slowly
+        context.set_default_navigation_timeout(120_000)  # plotly loads slowly on a shared core
         opened.append(context)
         shown = Shown(context.new_page())
         shown.page.on(
             "console",
-            lambda m: shown.complaints.append(m.text) if m.type in ("error", "warning") else None,
+            lambda m: shown.problems.append(m.text) if m.type in ("error", "warning") else None,
         )
-        shown.page.on("pageerror", lambda error: shown.complaints.append(str(error)))
-        shown.page.on("requestfailed", lambda r: shown.complaints.append(f"failed: {r.url}"))
+        shown.page.on("pageerror", lambda error: shown.problems.append(str(error)))
+        shown.page.on("requestfailed", lambda r: shown.problems.append(f"failed: {r.url}"))
         shown.page.goto(url)
         shown.page.wait_for_selector("body[data-ready=yes]", timeout=120_000)
         return shown

@@ -1,4 +1,4 @@
-"""The live page draws what phones send, steers the server, and agrees with the file it wrote."""
+"""The live page draws what phones send, controls the server, and agrees with its files."""
 
 import importlib.util
 import threading
@@ -62,10 +62,10 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
         assert shown.page.is_visible(f"[data-device='{name}'] .figures")
     assert not shown.page.is_visible("#empty")
     assert not shown.overflows()
-    assert shown.complaints == []
+    assert shown.problems == []
 
 
-def test_buttons_zero_place_and_stop_reach_the_server(show, server, replay):
+def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     url = f"http://127.0.0.1:{server.port}"
     replay(demonstration(), f"{url}/data", 10.0, 4.0, "carla")
     session = server.hub.sessions["carla"]
@@ -87,11 +87,11 @@ def test_buttons_zero_place_and_stop_reach_the_server(show, server, replay):
     shown.page.wait_for_function("() => !window.stario.devices.get('carla').running")
     assert not session.running
     assert not shown.overflows()
-    assert shown.complaints == []
+    assert shown.problems == []
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_page_of_a_server_that_wants_a_token_loads_with_it(show, tmp_path, size):
+def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
     server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0, lines_port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
@@ -101,7 +101,7 @@ def test_page_of_a_server_that_wants_a_token_loads_with_it(show, tmp_path, size)
         shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}", size)
         assert server.token in shown.page.inner_text("#push-url")
         assert not shown.overflows()
-        assert shown.complaints == []
+        assert shown.problems == []
     finally:
         server.stop()
         thread.join()

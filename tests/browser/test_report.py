@@ -1,4 +1,4 @@
-"""The report loads by itself, says what it shows, and its slider moves every cursor."""
+"""The report loads without a network, names units, and its slider moves every cursor."""
 
 import re
 
@@ -27,7 +27,7 @@ def start_of(sequence: ImuSequence, name: str) -> ImuSequence:
 
 @pytest.fixture(scope="module")
 def comparison() -> Comparison:
-    name = "walk </script><b>&"  # a name may hold anything, and must stay text
+    name = "walk </script><b>&"  # a name may contain anything and must be shown as text
     return compare(load_model(), start_of(demonstration(), name), NavigatorConfig())
 
 
@@ -38,9 +38,9 @@ def report(comparison, tmp_path_factory):
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_report_loads_offline_without_complaint_and_fits_the_screen(show, report, size):
+def test_report_loads_offline_without_errors_and_fits_the_screen(show, report, size):
     shown = show(report.as_uri(), size, offline=True)
-    assert shown.complaints == []
+    assert shown.problems == []
     assert not shown.overflows()
     assert shown.page.inner_text("h1") == "walk </script><b>&"
 
@@ -66,10 +66,10 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
         assert len(one["lines"]) == 10
     end = comparison.aligned()["graph"].position_W[-1, 0]
     assert seen[-1]["x"] == pytest.approx(end, abs=0.05)
-    assert shown.complaints == []
+    assert shown.problems == []
 
 
-def test_a_tracks_button_hides_it_on_map_and_panels(show, report):
+def test_the_button_of_a_track_hides_it_on_map_and_panels(show, report):
     shown = show(report.as_uri())
     visible = "() => ['map', 'time'].map(id => document.getElementById(id).data"
     visible += ".filter(t => t.legendgroup === 'ekf' && t.visible !== false).length)"

@@ -1,4 +1,4 @@
-"""What motion weights know: familiar gait lies inside, another gait or sensor outside."""
+"""The known motion of weights: familiar gait lies inside it, another gait or sensor outside."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_RATE, WorldStream
 
 
-def walked(seed: int, rate: float = 1.8, size: float = 1.0, seconds: float = 40.0) -> WorldStream:
-    """A device that bobs at a step rate [Hz] by `size` [m/s^2], with a little of all the rest."""
+def walking_stream(
+    seed: int, rate: float = 1.8, size: float = 1.0, seconds: float = 40.0
+) -> WorldStream:
+    """A device that bobs at a step rate [Hz] by `size` [m/s^2], with a little motion otherwise."""
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 1.0 / WINDOW_RATE)
     imu = 0.1 * rng.standard_normal((len(time), 6))
@@ -42,7 +44,7 @@ def windows(stream: WorldStream) -> np.ndarray:
     return stream.imu_W[: 200 * count].reshape(count, 200, 6).transpose(0, 2, 1)
 
 
-def known_of(*streams: WorldStream) -> KnownMotion:
+def known_motion_of(*streams: WorldStream) -> KnownMotion:
     known = known_motion(streams)
     assert known is not None
     return known
@@ -50,59 +52,59 @@ def known_of(*streams: WorldStream) -> KnownMotion:
 
 @pytest.fixture(scope="module")
 def known() -> KnownMotion:
-    return known_of(*(walked(seed, rate=1.6 + 0.1 * seed) for seed in range(5)))
+    return known_motion_of(*(walking_stream(seed, rate=1.6 + 0.1 * seed) for seed in range(5)))
 
 
-def test_a_short_walk_knows_its_own_gait_and_a_scrap_nothing() -> None:
-    """With a centre for each window every other window, of the same walk even, was strange."""
-    walk = walked(0, seconds=140.0)
-    known = known_of(walk.part(0, 70 * 200))
+def test_a_short_walk_defines_its_known_motion_and_a_shorter_one_does_not() -> None:
+    """With one centre per window, all other windows were unfamiliar, even of the same walk."""
+    walk = walking_stream(0, seconds=140.0)
+    known = known_motion_of(walk.part(0, 70 * 200))
     assert len(known.centres) == 3
     assert np.mean(known.novelty(windows(walk.part(70 * 200, len(walk)))) > 1.0) < 0.2
-    assert np.mean(known.novelty(windows(walked(1, size=4.0))) > 1.0) > 0.9
+    assert np.mean(known.novelty(windows(walking_stream(1, size=4.0))) > 1.0) > 0.9
     assert known_motion([walk.part(0, 50 * 200)]) is None
 
 
-def test_of_familiar_motion_about_one_window_in_twenty_lies_outside(known: KnownMotion) -> None:
-    novelty = known.novelty(windows(walked(99, rate=1.8)))
+def test_few_windows_of_familiar_motion_lie_outside(known: KnownMotion) -> None:
+    novelty = known.novelty(windows(walking_stream(99, rate=1.8)))
     assert np.mean(novelty > 1.0) < 0.25
-    assert known.variance_factor(windows(walked(99))).mean() < 1.2
+    assert known.variance_factor(windows(walking_stream(99))).mean() < 1.2
 
 
 @pytest.mark.parametrize("other", [{"size": 4.0}, {"size": 0.1}, {"rate": 5.0}])
 def test_another_gait_lies_outside_and_widens_the_variance(
     known: KnownMotion, other: dict[str, float]
 ) -> None:
-    strange = windows(walked(1, **other))
-    assert np.mean(known.novelty(strange) > 1.0) > 0.9
-    factors = known.variance_factor(strange)
+    unfamiliar = windows(walking_stream(1, **other))
+    assert np.mean(known.novelty(unfamiliar) > 1.0) > 0.9
+    factors = known.variance_factor(unfamiliar)
     assert factors.mean() > 0.75 * OUTSIDE_VARIANCE
     assert factors.max() <= OUTSIDE_VARIANCE
 
 
-def test_what_is_known_does_not_depend_on_the_windows_yaw(known: KnownMotion) -> None:
-    ours = windows(walked(3, size=1.5))
+def test_novelty_does_not_depend_on_the_yaw_of_windows(known: KnownMotion) -> None:
+    original = windows(walking_stream(3, size=1.5))
     yaw = 1.1
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    turned = np.concatenate([turn @ ours[:, :3], turn @ ours[:, 3:]], axis=1)
-    np.testing.assert_allclose(features(turned), features(ours), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(known.novelty(turned), known.novelty(ours), rtol=1e-3)
+    rotation = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    rotated = np.concatenate([rotation @ original[:, :3], rotation @ original[:, 3:]], axis=1)
+    np.testing.assert_allclose(features(rotated), features(original), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(known.novelty(rotated), known.novelty(original), rtol=1e-3)
 
 
 @pytest.mark.parametrize("rate", [1.5, 2.3])
-def test_the_step_rate_is_the_bobbing_s(rate: float) -> None:
-    np.testing.assert_allclose(step_rates(walked(0, rate=rate).imu_W), rate, atol=0.06)
-    assert len(step_rates(walked(0, size=0.0).imu_W)) == 0
+def test_the_step_rate_is_the_rate_of_bobbing(rate: float) -> None:
+    np.testing.assert_allclose(step_rates(walking_stream(0, rate=rate).imu_W), rate, atol=0.06)
+    assert len(step_rates(walking_stream(0, size=0.0).imu_W)) == 0
 
 
-def test_ranges_tell_speed_and_step_rate(known: KnownMotion) -> None:
+def test_ranges_hold_speed_and_step_rate(known: KnownMotion) -> None:
     assert known.ranges["speed"] == pytest.approx((1.2, 1.2), abs=0.01)
     low, high = known.ranges["step_rate"]
     assert low == pytest.approx(1.6, abs=0.1)
     assert high == pytest.approx(2.0, abs=0.1)
 
 
-def test_it_travels_on_the_card(known: KnownMotion) -> None:
+def test_known_motion_is_stored_on_the_card(known: KnownMotion) -> None:
     card = Card("R-ResNet", sha256="0", known_motion=known)
     assert parse_card(dump_card(card), Path("a.json")).known_motion == known
     assert parse_card(dump_card(replace(card, known_motion=None)), Path("a.json")) == replace(
@@ -116,13 +118,13 @@ def test_it_travels_on_the_card(known: KnownMotion) -> None:
         known_motion_from_dict({})
 
 
-def test_a_model_says_less_of_motion_that_it_does_not_know(known: KnownMotion) -> None:
+def test_a_model_widens_its_covariance_for_unfamiliar_motion(known: KnownMotion) -> None:
     plain = load_model("default")
     plain = DisplacementModel(plain._engine, replace(plain.card, known_motion=None))
     aware = DisplacementModel(plain._engine, replace(plain.card, known_motion=known))
-    strange = windows(walked(1, size=4.0))
-    mean, covariance = plain.predict(strange)
-    same, wider = aware.predict(strange)
+    unfamiliar = windows(walking_stream(1, size=4.0))
+    mean, covariance = plain.predict(unfamiliar)
+    same, wider = aware.predict(unfamiliar)
     np.testing.assert_array_equal(mean, same)
-    factors = known.variance_factor(strange)
+    factors = known.variance_factor(unfamiliar)
     np.testing.assert_allclose(wider, factors[:, None, None] * covariance)

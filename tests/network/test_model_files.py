@@ -1,4 +1,4 @@
-"""Files of weights and their cards: whole ones load, spoilt ones are refused by name."""
+"""Files of weights and their cards: intact ones load, corrupt ones are refused by name."""
 
 import hashlib
 import json
@@ -18,19 +18,19 @@ DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetens
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """A copy of the default weights and their card, to be spoilt."""
+    """A copy of the default weights and their card, to be corrupted."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(DEFAULT.read_bytes())
     card_path(path).write_bytes(card_path(DEFAULT).read_bytes())
     return path
 
 
-def spoil_card(path: Path, **values: object) -> None:
+def change_card(path: Path, **values: object) -> None:
     content = json.loads(card_path(path).read_text(encoding="utf-8"))
     card_path(path).write_text(json.dumps(content | values), encoding="utf-8")
 
 
-def refused(path: Path) -> str:
+def refusal(path: Path) -> str:
     with pytest.raises(WeightsError) as caught:
         load_model(path)
     assert isinstance(caught.value, StarioError)
@@ -61,57 +61,57 @@ def refused(path: Path) -> str:
     ],
 )
 def test_a_card_that_does_not_match_is_refused(model: Path, field: str, value: object) -> None:
-    spoil_card(model, **{field: value})
-    assert field in refused(model)
+    change_card(model, **{field: value})
+    assert field in refusal(model)
 
 
 @pytest.mark.parametrize(
     ("part", "value", "words"),
     [("floor", 0.0, "a covariance of 0"), ("exponent", 1e300, "above 10")],
 )
-def test_a_calibration_that_makes_no_covariance_is_refused(
+def test_a_calibration_that_gives_no_valid_covariance_is_refused(
     model: Path, part: str, value: float, words: str
 ) -> None:
     calibration = json.loads(card_path(DEFAULT).read_text(encoding="utf-8"))["calibration"]
-    spoil_card(model, calibration=calibration | {part: [0.5, 0.5, value]})
-    assert words in refused(model)
+    change_card(model, calibration=calibration | {part: [0.5, 0.5, value]})
+    assert words in refusal(model)
 
 
 @pytest.mark.parametrize("field", ["format", "outputs", "rate", "samples", "frame", "channels"])
-def test_what_a_card_does_not_say_is_not_guessed(model: Path, field: str) -> None:
+def test_a_card_that_lacks_a_field_is_refused(model: Path, field: str) -> None:
     content = json.loads(card_path(model).read_text(encoding="utf-8"))
     del content[field]
     card_path(model).write_text(json.dumps(content), encoding="utf-8")
-    assert f"no {field!r}" in refused(model)
+    assert f"no {field!r}" in refusal(model)
 
 
-def test_the_unspoilt_copy_loads(model: Path) -> None:
+def test_an_intact_copy_loads(model: Path) -> None:
     assert load_model(model).name == "StarIO"
     assert load_model(str(model)).name == "StarIO"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"architecture": "StarIO"}', "\udcff"])
-def test_a_card_that_is_none_is_refused(model: Path, text: str) -> None:
+def test_a_file_that_is_no_card_is_refused(model: Path, text: str) -> None:
     card_path(model).write_bytes(text.encode(errors="surrogateescape"))
-    assert "card" in refused(model)
+    assert "card" in refusal(model)
 
 
 def test_truncated_weights_are_refused(model: Path) -> None:
     model.write_bytes(model.read_bytes()[:-100])
-    assert "truncated" in refused(model)
+    assert "truncated" in refusal(model)
 
 
 @pytest.mark.parametrize("missing", ["weights", "card"])
-def test_a_missing_half_is_refused(model: Path, missing: str) -> None:
+def test_weights_or_a_card_alone_are_refused(model: Path, missing: str) -> None:
     (model if missing == "weights" else card_path(model)).unlink()
-    assert "in one folder" in refused(model)
+    assert "in one folder" in refusal(model)
 
 
-def with_state(path: Path, state: dict[str, torch.Tensor]) -> None:
-    """Other tensors under a card whose checksum is right."""
+def write_weights(path: Path, state: dict[str, torch.Tensor]) -> None:
+    """Write other tensors, with a card of the right checksum."""
     content = safetensors.torch.save(state)
     path.write_bytes(content)
-    spoil_card(path, sha256=hashlib.sha256(content).hexdigest())
+    change_card(path, sha256=hashlib.sha256(content).hexdigest())
 
 
 @pytest.mark.parametrize("change", ["unknown", "missing", "shape", "none"])
@@ -123,6 +123,6 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
         del state["head.7.bias"]
     elif change == "shape":
         state["head.7.bias"] = torch.zeros(2)
-    with_state(model, state if change != "none" else {})
+    write_weights(model, state if change != "none" else {})
     found = {"unknown": "another.weight", "missing": "head.7.bias", "shape": "head.7.bias"}
-    assert found.get(change, "Missing") in refused(model)
+    assert found.get(change, "Missing") in refusal(model)

@@ -10,7 +10,7 @@ def test_one_row_of_outputs_per_window(batch: int, outputs: int) -> None:
     assert StarIO(outputs).eval()(torch.randn(batch, 6, 200)).shape == (batch, outputs)
 
 
-def test_gradients_stay_finite_where_nothing_varies() -> None:
+def test_gradients_are_finite_for_constant_windows() -> None:
     network = StarIO()
     network(torch.zeros(4, 6, 200)).square().sum().backward()
     for name, parameter in network.named_parameters():
@@ -39,7 +39,7 @@ def test_normalised_windows_have_unit_mean_square_at_any_scale() -> None:
     torch.testing.assert_close(square, torch.ones(3), rtol=2e-3, atol=0.0)
 
 
-def test_a_window_does_not_feel_the_others_of_its_batch() -> None:
+def test_a_window_is_independent_of_the_others_in_its_batch() -> None:
     torch.manual_seed(0)
     network = StarIO().eval()
     window = torch.randn(1, 6, 200)

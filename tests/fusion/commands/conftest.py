@@ -1,4 +1,4 @@
-"""Calls of the `stario` command and a recording to call it with."""
+"""Fixtures to call the `stario` command, and a recording for it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from stario.fusion.commands.cli import app, main
 
 
-class Done:
-    """What a call of the command left."""
+class CommandResult:
+    """Exit code and output of one call of the command."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
@@ -34,11 +34,11 @@ def stario(
     tmp_path_factory: pytest.TempPathFactory,
     capsys: pytest.CaptureFixture[str],
 ):
-    """Calls `stario` with arguments, in this process and in an empty folder."""
+    """Call `stario` with arguments, in this process and in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
 
-    def call(*arguments: object) -> Done:
+    def call(*arguments: object) -> CommandResult:
         monkeypatch.setattr(sys, "argv", ["stario", *map(str, arguments)])
         capsys.readouterr()
         code = 0
@@ -47,20 +47,20 @@ def stario(
         except SystemExit as leaving:
             code = int(leaving.code or 0)
         captured = capsys.readouterr()
-        return Done(code, captured.out, captured.err)
+        return CommandResult(code, captured.out, captured.err)
 
     return call
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No figures, which take most of the time, where a test does not look at them."""
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skip figures, which take most of the time, in tests that do not check them."""
     monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda *arguments: [])
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A walk of twelve seconds, which no test writes to."""
+    """A walk of twelve seconds, which no test modifies."""
     path = tmp_path_factory.mktemp("recordings") / "walk.csv"
     result = CliRunner().invoke(
         app, ["simulate", str(path), "--seconds", "12", "--carry", "handheld", "--rate", "100"]

@@ -16,14 +16,14 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 # --- compare and evaluate ----------------------------------------------------------------------
 
 
-def test_compare_speaks_json_and_writes_the_same(stario, recording: Path, tmp_path: Path) -> None:
+def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("compare", recording, "--out", "out", "--json")
     assert done.code == 0
     assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
     assert (tmp_path / "out/walk/plan.png").stat().st_size > 10_000
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
     done = stario("compare", recording)
     assert done.err == ""
@@ -33,7 +33,7 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
     assert "covers" not in done.out
 
 
-def test_the_fusion_is_held_against_its_network(stario, recording: Path) -> None:
+def test_check_fusion_compares_the_fusion_with_its_network(stario, recording: Path) -> None:
     done = stario("check", "fusion", recording, recording, "--json")
     assert done.code == 0
     first, second = json.loads(done.out)
@@ -44,7 +44,7 @@ def test_the_fusion_is_held_against_its_network(stario, recording: Path) -> None
     assert "carry" in refused.err
 
 
-def test_missing_samples_are_told_by_how_far_they_move_the_end(stario, recording: Path) -> None:
+def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recording: Path) -> None:
     done = stario("check", "gaps", recording, "--json")
     assert done.code == 0
     found = json.loads(done.out)
@@ -55,7 +55,7 @@ def test_missing_samples_are_told_by_how_far_they_move_the_end(stario, recording
     assert "within 1% and 3 deg" in shown.out
 
 
-def test_tracks_with_fixes_are_judged(stario, recording: Path) -> None:
+def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> None:
     done = stario("check", "fixes", recording, "--every", "2", "--sigma", "0.1", "--json")
     assert done.code == 0
     (found,) = json.loads(done.out)
@@ -65,8 +65,8 @@ def test_tracks_with_fixes_are_judged(stario, recording: Path) -> None:
     assert "yaw NEES" in shown.out
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_path: Path) -> None:
     walk = read_generic_csv(recording)
     assert walk.truth is not None
     write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
@@ -74,8 +74,8 @@ def test_a_truth_of_a_part_is_said_to_be_one(stario, recording: Path, tmp_path: 
     assert "The truth covers 50% of the track" in done.out
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_compare_accepts_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "walk.csv").write_bytes(recording.read_bytes())
@@ -84,7 +84,7 @@ def test_compare_takes_folders_of_recordings(stario, recording: Path, tmp_path: 
     assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
     stario, recording: Path, tmp_path: Path
 ) -> None:
@@ -112,9 +112,9 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
     stario("evaluate", "blind.csv").assert_one_line_error("truth")
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_batch_goes_on_past_what_fails_and_says_so(
+def test_a_batch_continues_after_failures_and_reports_them(
     stario, recording: Path, tmp_path: Path, jobs: int
 ) -> None:
     walk = read_generic_csv(recording)
@@ -140,11 +140,11 @@ def test_a_batch_goes_on_past_what_fails_and_says_so(
         assert sum(reason in line for line in lines) == 1
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_evaluate_judges_by_groups_against_other_weights(
+@pytest.mark.usefixtures("no_figures")
+def test_evaluate_compares_with_other_weights_by_groups(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    """Weights against themselves; a dozen seconds are too few to tell an error over ten of them."""
+    """Weights against themselves; twelve seconds are too few for an error over ten seconds."""
     (tmp_path / "walks").mkdir()
     stario("simulate", "walks/long.csv", "--seconds", 25, "--carry", "handheld", "--rate", 100)
     done = stario(
@@ -154,21 +154,21 @@ def test_evaluate_judges_by_groups_against_other_weights(
     assert done.code == 0, done.err
     groups = {group["name"]: group for group in json.loads(done.out)["groups"]}
     short, long = groups[recording.parent.name], groups["walks"]
-    alike = {"ratio": 1.0, "low": 1.0, "high": 1.0}
-    assert short["ratios"] == {"rms_1s_m": alike}
-    assert long["ratios"] == {"rms_1s_m": alike, "rms_10s_m": alike}
+    equal = {"ratio": 1.0, "low": 1.0, "high": 1.0}
+    assert short["ratios"] == {"rms_1s_m": equal}
+    assert long["ratios"] == {"rms_1s_m": equal, "rms_10s_m": equal}
     figures = long["medians"]["default"]
     assert figures["length_ratio"] == pytest.approx(1.0, abs=0.2)
     assert figures["rms_1s_m"] < figures["rms_10s_m"] < 10.0 * figures["rms_1s_m"]
-    assert 0.5 < figures["nis_ekf"] < 6.0  # expected is 3 of one whose errors are as it says
-    told = json.loads((tmp_path / "out/groups.json").read_text())["groups"]
-    assert {group["name"]: group for group in told} == groups
+    assert 0.5 < figures["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
+    written = json.loads((tmp_path / "out/groups.json").read_text())["groups"]
+    assert {group["name"]: group for group in written} == groups
 
 
 # --- train -------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path: Path) -> None:
     settings = {"epoch_windows": 64, "batch": 32, "epochs": 1}
     (tmp_path / "tiny.json").write_text(json.dumps(settings))
@@ -190,7 +190,7 @@ def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path:
     stario("run", recording, "--model", weights).assert_one_line_error("model.safetensors")
 
 
-def test_training_goes_on_past_what_fails_and_keeps_its_windows(
+def test_training_continues_after_failures_and_caches_its_windows(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
@@ -212,9 +212,7 @@ def test_training_goes_on_past_what_fails_and_keeps_its_windows(
     assert first == second
 
 
-def test_weights_to_start_from_say_which_network_it_is(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_weights_to_start_from_set_the_network(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
     call = ("train", recording, "--recorded-only", "--config", "tiny.json")
     assert stario(*call, "--model", "R-ResNet", "--out", "first").code == 0
@@ -225,7 +223,7 @@ def test_weights_to_start_from_say_which_network_it_is(
     stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", "R-ResNet")
 
 
-def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_path: Path) -> None:
+def test_training_can_use_recordings_alone(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
     done = stario("train", recording, "--recorded-only", "--config", "tiny.json", "--out", "alone")
     assert done.code == 0, done.err
@@ -233,27 +231,29 @@ def test_a_network_may_learn_from_recordings_alone(stario, recording: Path, tmp_
     assert trained_on == ["recorded, others: 0 min"]  # nothing simulated, no licence known
 
 
-def test_lists_in_the_package_are_not_chosen_from_by_attributes(stario) -> None:
-    """They would all be learned from, whatever the option says."""
+def test_where_is_refused_with_the_packaged_lists(stario) -> None:
+    """Training would use all of their recordings, whatever the option says."""
     stario("train", "--data", "data", "--where", "person=dan").assert_one_line_error(
         "--where: found with --data"
     )
 
 
-def test_a_recording_is_not_learned_from_and_kept(stario, recording: Path, tmp_path: Path) -> None:
+def test_a_recording_cannot_both_train_and_validate(
+    stario, recording: Path, tmp_path: Path
+) -> None:
     (tmp_path / "list.txt").write_text(f"{recording}\n")
     done = stario("train", recording, "--validation", "list.txt", "--generated", 1)
     done.assert_one_line_error("--validation", f"{recording}, which is also trained on")
     assert not (tmp_path / "runs").exists()
 
 
-def test_nothing_is_trained_where_nothing_could_be_read(stario, tmp_path: Path) -> None:
+def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path: Path) -> None:
     stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
     assert not (tmp_path / "runs").exists()
 
 
-def test_run_with_the_graph_names_its_track(
-    stario, recording: Path, tmp_path: Path, undrawn
+def test_run_with_the_graph_writes_its_track(
+    stario, recording: Path, tmp_path: Path, no_figures
 ) -> None:
     done = stario("run", recording, "--backend", "graph", "--out", "out", "--json")
     assert done.code == 0
@@ -263,7 +263,7 @@ def test_run_with_the_graph_names_its_track(
     assert notes[0].startswith("graph of")
 
 
-def test_an_unknown_back_end_is_one_line(stario, recording: Path) -> None:
+def test_an_unknown_back_end_is_a_one_line_error(stario, recording: Path) -> None:
     done = stario("run", recording, "--backend", "ukf")
     assert done.code == 1
     assert "backend: found 'ukf'" in done.err
@@ -278,7 +278,7 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     assert content["scores"][0]["name"] == "walk 0"
 
 
-def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Path) -> None:
+def test_backends_continues_after_failures(stario, recording: Path, tmp_path: Path) -> None:
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     done = stario("check", "backends", "blind.csv", recording, "--json")
     assert done.code == 1
@@ -286,7 +286,7 @@ def test_backends_goes_on_past_what_fails(stario, recording: Path, tmp_path: Pat
     assert [score["name"] for score in json.loads(done.out)["scores"]] == ["walk"]
 
 
-def test_recordings_too_short_to_hold_any_out_are_not_calibrated_by_simulation(
+def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))

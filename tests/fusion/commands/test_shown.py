@@ -1,4 +1,4 @@
-"""`run --report`, `run --view`, `compare --report` and `live` as a user meets them."""
+"""`run --report`, `run --view`, `compare --report` and `live` as users call them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import socket
 import pytest
 
 
-def without(monkeypatch, *packages):
-    """Importing these fails, as where their extra is not installed."""
+def hide_packages(monkeypatch, *packages):
+    """Make imports of these packages fail, as if their extra were not installed."""
     real = builtins.__import__
 
     def missing(name, *arguments, **named):
@@ -21,7 +21,7 @@ def without(monkeypatch, *packages):
     monkeypatch.setattr(builtins, "__import__", missing)
 
 
-def test_run_leaves_a_report_where_it_is_asked_for(stario, recording, tmp_path, undrawn):
+def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_figures):
     assert stario("run", recording, "--out", "plain").code == 0
     assert not (tmp_path / "plain/report.html").exists()
     done = stario("run", recording, "--out", "told", "--report", "--backend", "graph")
@@ -32,14 +32,14 @@ def test_run_leaves_a_report_where_it_is_asked_for(stario, recording, tmp_path, 
     assert "Accuracy against ground truth" in text
 
 
-def test_compare_leaves_a_report_beside_the_tracks(stario, recording, tmp_path, undrawn):
+def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path, no_figures):
     assert stario("compare", recording, "--out", "told", "--report").code == 0
     text = (tmp_path / "told/walk/report.html").read_text()
     for label in ("inertial", "network", "EKF", "factor graph", "truth"):
         assert f"</svg>{label}</button>" in text
 
 
-def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, undrawn, monkeypatch):
+def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):
     pytest.importorskip("rerun", reason="pip install 'stario[view]'")
     opened = []
     monkeypatch.setattr("stario.fusion.report.view.open_view", opened.append)
@@ -57,14 +57,14 @@ def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, undrawn, m
         ("uvicorn", ("live",)),
     ],
 )
-def test_a_missing_extra_is_told_before_anything_is_computed(
+def test_a_missing_extra_is_reported_before_anything_is_computed(
     stario, monkeypatch, package, arguments
 ):
-    without(monkeypatch, package)
+    hide_packages(monkeypatch, package)
     stario(*arguments).assert_one_line_error(package, "not installed", "pip install")
 
 
-def test_live_tells_a_port_that_is_taken(stario):
+def test_live_refuses_a_port_in_use(stario):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         stario("live", "--port", port).assert_one_line_error("port", "--port")
@@ -72,5 +72,5 @@ def test_live_tells_a_port_that_is_taken(stario):
         done.assert_one_line_error("lines-port", "--lines-port")
 
 
-def test_live_tells_what_is_no_address_of_a_phone(stario):
+def test_live_refuses_an_invalid_address_of_a_phone(stario):
     stario("live", "--port", 0, "--phyphox", "ftp://x").assert_one_line_error("phyphox")

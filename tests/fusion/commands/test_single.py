@@ -49,11 +49,11 @@ def test_help_names_every_command() -> None:
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *(f"check {name}" for name in CHECKS)])
-def test_every_command_explains_itself(command: str) -> None:
+def test_every_command_prints_its_help(command: str) -> None:
     result = CliRunner().invoke(app, [*command.split(), "--help"], terminal_width=200)
     assert result.exit_code == 0
     assert f"stario {command}" in result.output.replace("root", "stario")
-    assert " . " not in result.output  # a word in brackets that the formatter swallowed
+    assert " . " not in result.output  # left if the formatter drops a word in brackets
 
 
 @pytest.mark.parametrize(
@@ -68,16 +68,16 @@ def test_every_command_explains_itself(command: str) -> None:
         ["train", "--epochs", "0"],
     ],
 )
-def test_wrong_usage_leaves_with_two(stario, arguments: list[str]) -> None:
+def test_wrong_usage_exits_with_code_2(stario, arguments: list[str]) -> None:
     done = stario(*arguments)
     assert done.code == 2
     assert "Usage" in done.err
 
 
-def test_the_installed_command_keeps_these_codes(tmp_path: Path) -> None:
+def test_the_installed_command_has_the_same_exit_codes(tmp_path: Path) -> None:
     command = Path(sys.executable).with_name("stario")
     if not command.exists():
-        pytest.skip("stario is not installed beside this Python")
+        pytest.skip("stario is not installed next to this Python")
 
     def code(*arguments: str) -> int:
         return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
@@ -85,7 +85,7 @@ def test_the_installed_command_keeps_these_codes(tmp_path: Path) -> None:
     assert [code("--help"), code("run", "missing.csv"), code("nosuch")] == [0, 1, 2]
 
 
-def test_a_bug_is_not_dressed_up_as_an_error_of_the_user(
+def test_a_bug_is_not_reported_as_an_error_of_the_user(
     stario, monkeypatch: pytest.MonkeyPatch, recording: Path
 ) -> None:
     def broken(path: Path, format: str) -> None:
@@ -111,7 +111,7 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
 
 
-def test_run_leaves_a_track_and_says_so(stario, recording: Path, tmp_path: Path) -> None:
+def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
     assert done.err == ""
@@ -122,8 +122,8 @@ def test_run_leaves_a_track_and_says_so(stario, recording: Path, tmp_path: Path)
     assert len(list((tmp_path / "out").iterdir())) == 8
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_run_speaks_json(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_run_prints_json(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--json")
     figures = json.loads(done.out)
     assert figures["recording"] == "walk"
@@ -131,10 +131,8 @@ def test_run_speaks_json(stario, recording: Path, tmp_path: Path) -> None:
     assert (tmp_path / figures["folder"] / "metrics.json").exists()
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_run_needs_no_truth_and_the_track_is_the_same(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_run_gives_the_same_track_without_truth(stario, recording: Path, tmp_path: Path) -> None:
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     assert stario("run", recording, "--out", "seen").code == 0
     done = stario("run", "blind.csv", "--out", "blind", "--json")
@@ -143,25 +141,25 @@ def test_run_needs_no_truth_and_the_track_is_the_same(
     assert seen == blind
 
 
-def write_fixes(path: Path, truth: Trajectory, turn: float = 0.0, late: float = 0.0) -> Path:
-    """The true position of every second, in a world that is turned and on a clock that is late."""
-    R = Rotation.from_rotvec([0.0, 0.0, turn])
+def write_fixes(path: Path, truth: Trajectory, yaw: float = 0.0, delay: float = 0.0) -> Path:
+    """Write true positions once a second, in a rotated world and on a delayed clock."""
+    R = Rotation.from_rotvec([0.0, 0.0, yaw])
     rows = ["t,kind,x,y,z,sx,sy,sz"]
     for t in np.arange(truth.time[0] + 0.5, truth.time[-1], 1.0):
         x, y, z = R.apply(truth.at(np.array([t])).position_W[0])
-        rows.append(f"{t + late},position,{x},{y},{z},0.05,,")
+        rows.append(f"{t + delay},position,{x},{y},{z},0.05,,")
     path.write_text("\ufeff" + "\n".join(rows) + "\n", encoding="utf-8")
     return path
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
+@pytest.mark.usefixtures("no_figures")
+def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     truth = read_generic_csv(recording).truth
     assert truth is not None
-    for turn in (0.0, 1.0):
-        fixes = write_fixes(tmp_path / "fixes.csv", truth, turn)
+    for yaw in (0.0, 1.0):
+        fixes = write_fixes(tmp_path / "fixes.csv", truth, yaw)
         done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
         assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
@@ -172,16 +170,16 @@ def test_a_track_on_fixes_is_measured_as_a_whole_and_not_by_its_first_yaw(
     assert compared["recordings"]["walk"]["tracks"]["ekf"]["ate_m"] < 0.3
 
 
-def test_fixes_of_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
+def test_fixes_on_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
     truth = read_generic_csv(recording).truth
     assert truth is not None
-    fixes = write_fixes(tmp_path / "fixes.csv", truth, late=1.7e9)
+    fixes = write_fixes(tmp_path / "fixes.csv", truth, delay=1.7e9)
     done = stario("run", recording, "--fixes", fixes)
     done.assert_one_line_error("fixes", "1.7e+09", "first sample")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_one_row_of_truth_is_none(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_a_single_row_of_truth_counts_as_none(stario, recording: Path, tmp_path: Path) -> None:
     lines = recording.read_text().splitlines()
     kept = len(lines) // 2
     for k, line in enumerate(lines):
@@ -194,16 +192,16 @@ def test_one_row_of_truth_is_none(stario, recording: Path, tmp_path: Path) -> No
     assert json.loads(done.out)["ekf"]["ate_m"] is None
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_settings_come_from_a_file_and_are_kept(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "slow.toml").write_text("[filter]\nupdate_rate = 2\n")
     assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0
     assert read_config(tmp_path / "a/config.json") == read_config(tmp_path / "slow.toml")
     assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_run_takes_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_run_accepts_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "all").mkdir()
     for name in ("a", "b"):
         (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
@@ -222,7 +220,7 @@ def test_run_takes_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -
 # --- convert -----------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_a_converted_recording_gives_the_same_track(
     stario, recording: Path, tmp_path: Path
 ) -> None:
@@ -233,12 +231,12 @@ def test_a_converted_recording_gives_the_same_track(
     for path, out in ((recording, "a"), ("back.csv", "b")):
         assert stario("run", path, "--out", out).code == 0
     a, b = (read_tum(tmp_path / out / "ekf.tum") for out in "ab")
-    np.testing.assert_allclose(a.position_W, b.position_W, atol=0.01)  # times by whole ns
+    np.testing.assert_allclose(a.position_W, b.position_W, atol=0.01)  # times are rounded to 1 ns
     stario("convert", recording, "there").assert_one_line_error("there", "exists")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_recordings_go_into_an_archive_and_are_chosen_from_it(
+@pytest.mark.usefixtures("no_figures")
+def test_recordings_are_archived_and_selected_from_the_archive(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     done = stario("convert", recording, recording.parent, "all.h5")
@@ -256,8 +254,8 @@ def test_recordings_go_into_an_archive_and_are_chosen_from_it(
     stario("convert", "all.h5", "out.csv").assert_one_line_error("2 recordings", "all.h5:walk")
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_positions_and_waypoints_are_no_pose_truth_and_are_told(stario, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("no_figures")
+def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path: Path) -> None:
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
     taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
     write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=taps)])
@@ -273,12 +271,12 @@ def test_positions_and_waypoints_are_no_pose_truth_and_are_told(stario, tmp_path
     assert find_recordings(tmp_path / "again.h5") == [Path(f"{tmp_path / 'again.h5'}:taps")]
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
-def test_what_the_numbers_mean_can_be_told_to_every_command(
+def test_every_command_accepts_units_axes_and_gravity(
     stario, recording: Path, tmp_path: Path, command: str
 ) -> None:
-    """Rates in degrees, Apple's user acceleration in g, axes turned against the truth's."""
+    """Rates in degrees, Apple's user acceleration in g, axes rotated relative to the truth's."""
     walk = with_axes(read_generic_csv(recording), "-y,x,z")
     upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
     linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
@@ -287,32 +285,32 @@ def test_what_the_numbers_mean_can_be_told_to_every_command(
     )
     target = ["out.csv"] if command == "convert" else []
     stario(command, "odd.csv", *target).assert_one_line_error()
-    words = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
-    done = stario(command, "odd.csv", *target, *words)
+    flags = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
+    done = stario(command, "odd.csv", *target, *flags)
     assert done.code == 0, done.err
 
 
 # --- inspect -----------------------------------------------------------------------------------
 
 
-def test_inspect_names_what_mends_a_recording(stario, recording: Path, tmp_path: Path) -> None:
+def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
     done = stario("inspect", "g.csv", "--out", "out")
     assert done.code == 0
     assert "--accel-unit g" in done.out
     assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
-    mended = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
-    assert mended["problems"] == []
-    assert mended == json.loads((tmp_path / "runs/g/inspection.json").read_text())
-    assert mended["rate_hz"] == pytest.approx(100.0)
+    corrected = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
+    assert corrected["problems"] == []
+    assert corrected == json.loads((tmp_path / "runs/g/inspection.json").read_text())
+    assert corrected["rate_hz"] == pytest.approx(100.0)
 
 
 # --- export ------------------------------------------------------------------------------------
 
 
-def test_export_takes_a_networks_name(stario, tmp_path: Path) -> None:
-    """That of its run; StarIO without one is the default, another is told how to train."""
+def test_export_accepts_the_name_of_a_network(stario, tmp_path: Path) -> None:
+    """Of its run; without one, StarIO is the default and others require training first."""
     pytest.importorskip("onnx")
     done = stario("export", "--model", "StarIO")
     assert (done.code, done.out) == (0, "StarIO.onnx\n")
@@ -331,7 +329,7 @@ def test_export_takes_a_networks_name(stario, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("truth", [True, False])
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_degrees_are_refused_with_the_option_that_helps(
     stario, recording: Path, tmp_path: Path, truth: bool
 ) -> None:
@@ -345,7 +343,7 @@ def test_degrees_are_refused_with_the_option_that_helps(
         assert stario("run", "deg.csv", "--out", "out", "--gyro-unit", "deg/s").code == 0
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("no_figures")
 def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
     sequence = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
@@ -353,8 +351,8 @@ def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_pa
     assert stario("run", "g.csv", "--accel-unit", "g").code == 0
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_gravitys_sign_is_refused_with_the_option_that_helps(
+@pytest.mark.usefixtures("no_figures")
+def test_a_wrong_sign_of_gravity_is_refused_with_the_option_that_helps(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     sequence = read_generic_csv(recording)
@@ -382,7 +380,7 @@ def test_a_broken_file_is_named_in_one_line(
     assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
 
 
-def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: Path) -> None:
+def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Path) -> None:
     content = recording.read_bytes()
     (tmp_path / "cut.csv").write_bytes(content[:50_020] + content[content.index(b"\n", 60_000) :])
     stario("run", "cut.csv").assert_one_line_error("cut.csv", "line ")
@@ -421,7 +419,7 @@ def test_a_line_that_lacks_its_end_is_named(stario, recording: Path, tmp_path: P
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(
+def test_invalid_arguments_give_a_one_line_error(
     stario, recording: Path, arguments: list[str], words: list[str]
 ) -> None:
     done = stario(*(recording if word == "RECORDING" else word for word in arguments))
@@ -442,14 +440,14 @@ def test_what_cannot_be_done_is_said_in_one_line(
         ("train", '{"augmentation": {"magic": 1}}', "augmentation.magic"),
     ],
 )
-def test_a_setting_that_does_not_fit_is_named_in_one_line(
+def test_an_invalid_setting_is_named_in_one_line(
     stario, recording: Path, tmp_path: Path, command: str, content: str, named: str
 ) -> None:
     (tmp_path / "settings.json").write_text(content)
     stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
 
 
-def test_nothing_is_written_over_unasked(stario, recording: Path, tmp_path: Path) -> None:
+def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_path: Path) -> None:
     before = recording.read_bytes()
     stario("convert", recording, recording).assert_one_line_error("also an input", "another file")
     stario("convert", recording, recording, "--overwrite").assert_one_line_error("also an input")
@@ -467,12 +465,12 @@ def test_nothing_is_written_over_unasked(stario, recording: Path, tmp_path: Path
     assert Path("two.h5").read_bytes() == before
 
 
-def test_an_end_that_names_no_layout_is_refused(stario, recording: Path) -> None:
+def test_a_file_extension_without_a_layout_is_refused(stario, recording: Path) -> None:
     stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
     assert not Path("walk.txt").exists()
 
 
-def test_weights_that_are_not_there_are_answered_with_those_that_are(
+def test_unknown_weights_are_refused_with_the_names_of_the_known_ones(
     stario, recording: Path
 ) -> None:
     stario("run", recording, "--model", "nothere").assert_one_line_error(
@@ -480,7 +478,7 @@ def test_weights_that_are_not_there_are_answered_with_those_that_are(
     )
 
 
-def test_a_north_that_nothing_tells_is_said(stario, recording: Path) -> None:
+def test_a_declination_without_a_source_of_north_is_reported(stario, recording: Path) -> None:
     done = stario("run", recording, "--declination", "-6", "--out", "north")
     assert done.code == 0
     assert "north" in done.out

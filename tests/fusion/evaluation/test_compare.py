@@ -1,4 +1,4 @@
-"""Comparison of tracks and the files it leaves."""
+"""Comparison of tracks, and the files it writes."""
 
 import json
 from collections.abc import Callable
@@ -35,8 +35,8 @@ KEYS = {
 Make = Callable[..., Any]
 
 
-class Anything:
-    """The oracle where it knows a window; elsewhere a metre in some direction."""
+class OracleWithFallback:
+    """The oracle for windows that it contains; 1 m along x for all others."""
 
     def __init__(self, oracle: Any) -> None:
         self.oracle = oracle
@@ -50,17 +50,17 @@ class Anything:
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> Anything:
-    return Anything(make_oracle(walk, walk.truth, CONFIG))
+def model(walk: ImuSequence, make_oracle: Make) -> OracleWithFallback:
+    return OracleWithFallback(make_oracle(walk, walk.truth, CONFIG))
 
 
 @pytest.fixture(scope="module")
-def compared(walk: ImuSequence, model: Anything) -> Comparison:
+def compared(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
     return compare(model, walk, CONFIG)
 
 
 @pytest.fixture(scope="module")
-def blind(walk: ImuSequence, model: Anything) -> Comparison:
+def blind(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
     assert walk.truth is not None
     time, position = walk.truth.time[::10], walk.truth.position_W[::10, :2]
     waypoints = PositionTrack(time, position + np.array([5.0, -3.0]), "waypoints")
@@ -77,8 +77,8 @@ def folder(
     return path
 
 
-def test_the_path_is_that_of_the_times_compared_and_level(compared: Comparison) -> None:
-    """A truth that goes on behind the IMU, in a lift: neither counts in the errors."""
+def test_path_length_is_horizontal_and_covers_only_the_compared_times(compared: Comparison) -> None:
+    """The truth rises as in a lift and continues after the IMU data: neither part counts."""
     truth = compared.sequence.truth
     assert truth is not None
     lift = truth.position_W + np.outer(truth.time, [0.0, 0.0, 3.0])
@@ -92,7 +92,7 @@ def test_the_path_is_that_of_the_times_compared_and_level(compared: Comparison) 
     assert other.path_m == pytest.approx(compared.path_m)
 
 
-def test_a_fit_takes_out_what_the_first_pose_turned(compared: Comparison) -> None:
+def test_a_fit_gives_no_larger_ate_than_the_first_pose(compared: Comparison) -> None:
     for name, figures in compared.metrics.items():
         first, fitted = figures["ate_m"], figures["ate_fit_m"]
         assert first is not None
@@ -101,7 +101,7 @@ def test_a_fit_takes_out_what_the_first_pose_turned(compared: Comparison) -> Non
         assert figures["known_positions_m"] is None
 
 
-def test_waypoints_measure_a_track_without_poses(compared: Comparison, blind: Comparison) -> None:
+def test_waypoints_replace_poses_in_the_error(compared: Comparison, blind: Comparison) -> None:
     track, truth = compared.tracks["ekf"].trajectory, compared.sequence.truth
     assert truth is not None
     fitted = evaluate_track(track, truth, alignment="yaw", horizontal=True).ate_m
@@ -110,7 +110,7 @@ def test_waypoints_measure_a_track_without_poses(compared: Comparison, blind: Co
     assert blind.metrics["ekf"]["ate_m"] is None
 
 
-def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> None:
+def test_metrics_json_has_the_documented_keys(folder: Path, walk: ImuSequence) -> None:
     content = json.loads((folder / "metrics.json").read_text())
     assert set(content) == {"recordings", "conventions"}
     assert set(content["recordings"]) == {walk.name, "blind"}
@@ -128,12 +128,12 @@ def test_metrics_json_has_the_keys_promised(folder: Path, walk: ImuSequence) -> 
             assert set(figures) == KEYS
     entry = content["recordings"][walk.name]
     assert entry["duration_s"] == pytest.approx(20.0)
-    level = replace(walk.truth, position_W=walk.truth.position_W * [1.0, 1.0, 0.0])
-    assert entry["path_m"] == pytest.approx(level.path_length(), rel=0.01)
+    horizontal_truth = replace(walk.truth, position_W=walk.truth.position_W * [1.0, 1.0, 0.0])
+    assert entry["path_m"] == pytest.approx(horizontal_truth.path_length(), rel=0.01)
     assert set(content["conventions"]) >= KEYS
 
 
-def test_figures_are_null_where_nobody_can_know_them(folder: Path, walk: ImuSequence) -> None:
+def test_metrics_that_cannot_be_computed_are_null(folder: Path, walk: ImuSequence) -> None:
     content = json.loads((folder / "metrics.json").read_text())["recordings"]
     blind = content["blind"]
     assert blind["path_m"] is None
@@ -142,20 +142,20 @@ def test_figures_are_null_where_nobody_can_know_them(folder: Path, walk: ImuSequ
         assert all(figures[k] is None for k in KEYS - known)
     assert all(v is None for v in blind["tracks"]["network_true_attitude"].values())
     assert blind["tracks"]["ekf"]["nis"] == content[walk.name]["tracks"]["ekf"]["nis"]
-    seen = content[walk.name]["tracks"]
-    assert all(v is not None for k, v in seen["ekf"].items() if k != "known_positions_m")
+    with_truth = content[walk.name]["tracks"]
+    assert all(v is not None for k, v in with_truth["ekf"].items() if k != "known_positions_m")
     for name in ("inertial", "pdr", "network", "network_true_attitude"):
-        unknown = {k for k, v in seen[name].items() if v is None}
+        unknown = {k for k, v in with_truth[name].items() if v is None}
         assert unknown == {"known_positions_m", "nees", "nis"}
 
 
-def test_truth_changes_no_track(compared: Comparison, blind: Comparison) -> None:
+def test_ground_truth_affects_no_track(compared: Comparison, blind: Comparison) -> None:
     for name in ("inertial", "pdr", "network", "ekf"):
         ours, theirs = compared.tracks[name].trajectory, blind.tracks[name].trajectory
         np.testing.assert_array_equal(ours.position_W, theirs.position_W)
 
 
-def test_figures_are_those_of_the_tracks_written(folder: Path, walk: ImuSequence) -> None:
+def test_metrics_match_the_written_tracks(folder: Path, walk: ImuSequence) -> None:
     tracks = json.loads((folder / "metrics.json").read_text())["recordings"][walk.name]["tracks"]
     for name in TRACKS:
         track = read_tum(folder / walk.name / f"{name}.tum")
@@ -165,7 +165,7 @@ def test_figures_are_those_of_the_tracks_written(folder: Path, walk: ImuSequence
     assert len({track["ate_m"] for track in tracks.values()}) == len(TRACKS)
 
 
-def test_arrays_hold_what_tum_cannot(folder: Path, compared: Comparison) -> None:
+def test_npz_holds_covariance_velocity_and_biases(folder: Path, compared: Comparison) -> None:
     with np.load(folder / compared.sequence.name / "ekf.npz", allow_pickle=False) as arrays:
         n = len(arrays["time"])
         assert arrays["covariance"].shape == (n, 15, 15)
@@ -174,7 +174,7 @@ def test_arrays_hold_what_tum_cannot(folder: Path, compared: Comparison) -> None
         np.testing.assert_array_equal(arrays["time"], compared.tracks["ekf"].time)
 
 
-def test_figures_are_pictures(folder: Path, walk: ImuSequence) -> None:
+def test_figures_are_png_files(folder: Path, walk: ImuSequence) -> None:
     names = {p.name for p in (folder / walk.name).glob("*.png")}
     assert names == {"plan.png", "error.png", "innovations.png"}
     assert {p.name for p in (folder / "blind").glob("*.png")} == {"plan.png", "innovations.png"}
@@ -184,11 +184,11 @@ def test_figures_are_pictures(folder: Path, walk: ImuSequence) -> None:
         assert len(content) > 10_000
 
 
-def test_the_configuration_written_can_be_given_to_the_next_run(folder: Path) -> None:
+def test_the_written_configuration_can_be_read_back(folder: Path) -> None:
     assert read_config(folder / "config.json") == CONFIG
 
 
-def test_a_run_leaves_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
+def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
     track = compared.tracks["ekf"]
     aligned = align(track.trajectory, walk.truth, "first")
     files = write_run(
@@ -204,7 +204,7 @@ def test_a_run_leaves_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
     assert health == json.loads(json.dumps(asdict(track.health)))
 
 
-def test_a_folder_that_cannot_be_made_is_a_known_error(
+def test_a_folder_that_cannot_be_created_raises_a_stario_error(
     tmp_path: Path, compared: Comparison
 ) -> None:
     (tmp_path / "file").write_text("in the way")
@@ -212,8 +212,8 @@ def test_a_folder_that_cannot_be_made_is_a_known_error(
         write_comparison(tmp_path / "file" / "out", [compared], CONFIG)
 
 
-def test_truth_that_ends_early_is_compared_as_far_as_it_goes(
-    walk: ImuSequence, model: Anything, compared: Comparison
+def test_truth_that_ends_early_is_compared_up_to_its_end(
+    walk: ImuSequence, model: OracleWithFallback, compared: Comparison
 ) -> None:
     half = replace(walk, truth=walk.truth.slice(0.0, 10.0))
     result = compare(model, half, CONFIG)
@@ -224,11 +224,11 @@ def test_truth_that_ends_early_is_compared_as_far_as_it_goes(
     )
 
 
-def test_truth_too_scarce_for_a_window_costs_one_track_only(
-    walk: ImuSequence, model: Anything, caplog: pytest.LogCaptureFixture
+def test_truth_shorter_than_a_window_loses_only_the_true_attitude_track(
+    walk: ImuSequence, model: OracleWithFallback, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
-    result = compare(model, scarce, CONFIG)
+    short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.8))
+    result = compare(model, short_truth, CONFIG)
     assert set(result.tracks) == {"inertial", "pdr", "network", "ekf", "graph"}
     assert "no track with true attitude" in caplog.text
 
@@ -242,20 +242,20 @@ def test_summary_has_median_and_mean_over_recordings(
         **compared.metrics["ekf"], "ate_m": 8.0}})  # fmt: skip
     ate = compared.metrics["ekf"]["ate_m"]
     scores = [scores_of(comparison) for comparison in (compared, worse, worst)]
-    over = summary(scores)["over_recordings"]["ekf"]["ate_m"]
-    assert over["median"] == pytest.approx(3.0)
-    assert over["mean"] == pytest.approx((ate + 11.0) / 3.0)
+    over_recordings = summary(scores)["over_recordings"]["ekf"]["ate_m"]
+    assert over_recordings["median"] == pytest.approx(3.0)
+    assert over_recordings["mean"] == pytest.approx((ate + 11.0) / 3.0)
     table = summary_table(scores)
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
     assert "3.00" in lines[4]
 
 
-def test_the_table_of_a_recording_without_one_of_the_tracks_has_no_number_there(
-    walk: ImuSequence, model: Anything
+def test_summary_omits_a_track_that_the_recording_lacks(
+    walk: ImuSequence, model: OracleWithFallback
 ) -> None:
-    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.8))
-    comparison = compare(model, scarce, CONFIG)
+    short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.8))
+    comparison = compare(model, short_truth, CONFIG)
     scores = [scores_of(comparison)]
     assert "nan" not in summary_table(scores)
     assert "network_true_attitude" not in {
@@ -263,7 +263,7 @@ def test_the_table_of_a_recording_without_one_of_the_tracks_has_no_number_there(
     }
 
 
-def test_the_demonstration_is_the_same_every_time_and_training_cannot_have_seen_it() -> None:
+def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() -> None:
     first, second = demonstration(), demonstration()
     np.testing.assert_array_equal(first.gyro, second.gyro)
     np.testing.assert_array_equal(first.truth.position_W, second.truth.position_W)

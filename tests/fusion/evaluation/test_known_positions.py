@@ -1,4 +1,4 @@
-"""The error at waypoints does not see a turn or a shift, and sees everything else."""
+"""The error at waypoints ignores a rotation and translation of the track, and nothing else."""
 
 from types import SimpleNamespace
 
@@ -18,37 +18,37 @@ def track(path):
     return SimpleNamespace(time=TIME, trajectory=trajectory)
 
 
-def waypoints(path, every=40, later=0.0):
-    return PositionTrack(TIME[::every] + later, path[::every, :2], "waypoints")
+def waypoints(path, every=40, delay=0.0):
+    return PositionTrack(TIME[::every] + delay, path[::every, :2], "waypoints")
 
 
-def test_a_turned_and_shifted_track_has_no_error():
-    turned = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH)
-    turned += np.array([7.0, -3.0, 1.0])
-    assert position_error(track(turned), waypoints(PATH)) == (pytest.approx(0.0, abs=1e-9), 6)
+def test_a_rotated_and_translated_track_has_no_error():
+    rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH)
+    rotated += np.array([7.0, -3.0, 1.0])
+    assert position_error(track(rotated), waypoints(PATH)) == (pytest.approx(0.0, abs=1e-9), 6)
 
 
-def test_a_track_that_is_too_long_is_off_by_its_excess():
+def test_a_track_ten_percent_too_long_has_a_tenth_of_its_spread_as_error():
     line = np.column_stack([TIME, 0.0 * TIME, 0.0 * TIME])
     error, _ = position_error(track(1.1 * line), waypoints(line))
     assert error == pytest.approx(0.1 * np.std(TIME[::40]))
 
 
-def test_waypoints_beyond_the_track_are_left_out():
-    words = position_error_words(track(PATH), waypoints(PATH, later=19.0))
+def test_waypoints_outside_the_track_are_excluded():
+    words = position_error_words(track(PATH), waypoints(PATH, delay=19.0))
     assert words == "1 of 6 waypoints lie within the track: too few to compare with"
     words = position_error_words(track(PATH), waypoints(PATH))
     assert words.startswith("6 of 6 waypoints lie within the track: 0.00 m rms")
 
 
-def test_positions_are_drawn_where_they_fit_the_track_in_its_own_frame():
-    turned = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
-    shown = placed(track(turned), waypoints(PATH, later=0.0))
-    np.testing.assert_allclose(shown.position_W, turned[::40, :2], atol=1e-9)
-    assert placed(track(PATH), waypoints(PATH, later=100.0)) is None
+def test_placed_positions_are_fitted_to_the_track_in_the_frame_of_the_track():
+    rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
+    shown = placed(track(rotated), waypoints(PATH, delay=0.0))
+    np.testing.assert_allclose(shown.position_W, rotated[::40, :2], atol=1e-9)
+    assert placed(track(PATH), waypoints(PATH, delay=100.0)) is None
 
 
-def test_positions_in_a_gap_of_the_track_are_left_out():
+def test_positions_in_a_gap_of_the_track_are_excluded():
     known = np.r_[0:50, 150:201]
     broken = Trajectory(TIME[known], PATH[known], Rotation.identity(len(known)))
     gapped = SimpleNamespace(time=TIME[known], trajectory=broken)

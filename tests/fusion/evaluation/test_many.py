@@ -1,11 +1,11 @@
-"""Many recordings through one comparison; the cluster is that of the example's test."""
+"""Many recordings in one comparison; the example's test covers the cluster."""
 
 from __future__ import annotations
 
 from stario.fusion.evaluation.many import distinct_name
 
 
-def test_recordings_of_one_name_get_folders_of_their_own() -> None:
+def test_recordings_with_the_same_name_get_distinct_folders() -> None:
     taken: set[str] = set()
     for name in ("walk", "walk", "walk-2", "walk"):
         taken.add(distinct_name(name, taken))

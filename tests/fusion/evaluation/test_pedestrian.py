@@ -26,14 +26,14 @@ RIDI = DATA / "archives/ridi.h5"
 RATE, SIZE = 1.8, 2.0
 
 
-def walked(course: np.ndarray, mount: float = 0.0) -> LevelledStream:
-    """Steps at 1.8 Hz of 4 m/s^2 from crest to trough along a course (N,) [rad] at 200 Hz.
+def walking_stream(course: np.ndarray, mount: float = 0.0) -> LevelledStream:
+    """Return a stream at 200 Hz of steps at 1.8 Hz, 4 m/s^2 from crest to trough.
 
-    The acceleration along the course lags a quarter of a step, as a walker's does.
+    The acceleration along the course lags by a quarter of a step, as in real walking.
 
     Args:
-        course: walked.
-        mount: of the device against it [rad].
+        course: (N,) direction of walking [rad].
+        mount: yaw of the device relative to the course [rad].
     """
     time = np.arange(len(course)) / WINDOW_RATE
     phase = 2.0 * np.pi * RATE * time
@@ -48,8 +48,8 @@ def walked(course: np.ndarray, mount: float = 0.0) -> LevelledStream:
 
 @pytest.mark.parametrize("course", [0.0, 2.0, -2.5])
 @pytest.mark.parametrize("mount", [0.0, 1.3, 3.0])
-def test_straight_steps_add_up(course: float, mount: float) -> None:
-    stream = walked(np.full(6000, course), mount)
+def test_straight_steps_add_up_to_a_straight_path(course: float, mount: float) -> None:
+    stream = walking_stream(np.full(6000, course), mount)
     steps = steps_of(stream)
     assert len(steps.end) == pytest.approx(30.0 * RATE, abs=2)
     np.testing.assert_allclose(
@@ -60,17 +60,17 @@ def test_straight_steps_add_up(course: float, mount: float) -> None:
     assert abs(end) == pytest.approx(steps.lengths().sum(), rel=0.01)
 
 
-def test_a_turn_is_followed_by_the_device_s_heading() -> None:
+def test_a_turn_is_followed_by_the_heading_of_the_device() -> None:
     course = np.where(np.arange(8000) < 4000, 0.0, np.pi / 2.0)
-    path = pedestrian_path(walked(course, mount=-0.7))
+    path = pedestrian_path(walking_stream(course, mount=-0.7))
     for part, direction in ((path[:3800], 1.0), (path[4200:], 1j)):
         moved = (part[-1] - part[0]) / direction
         assert np.angle(moved) == pytest.approx(0.0, abs=0.1)
         assert moved.real > 15.0
 
 
-def test_who_stands_does_not_move() -> None:
-    stream = walked(np.zeros(4000))
+def test_a_standing_pedestrian_does_not_move() -> None:
+    stream = walking_stream(np.zeros(4000))
     rng = np.random.default_rng(0)
     still = 0.05 * rng.standard_normal(stream.imu_N.shape).astype(np.float32)
     still[:, 5] += STANDARD_GRAVITY
@@ -78,14 +78,14 @@ def test_who_stands_does_not_move() -> None:
 
 
 @pytest.mark.skipif(not RIDI.exists(), reason=f"no recordings at {RIDI}")
-def test_of_a_real_walk_the_shape_and_the_length_come_out() -> None:
+def test_a_real_walk_is_reproduced_within_4_percent_of_its_length() -> None:
     sequence = read_recording(Path(f"{RIDI}:hang_body_normal1"))
     assert sequence.truth is not None
     found = evaluate_track(pedestrian_track(sequence).trajectory, sequence.truth, alignment="yaw")
     assert found.ate_m < 0.04 * found.path_m
 
 
-def test_a_gap_leaves_the_track_where_it_was() -> None:
+def test_the_position_is_kept_across_a_gap() -> None:
     time = np.arange(0.0, 20.0, 0.01)
     time = time[(time < 8.0) | (time > 12.0)]
     imu = np.zeros((len(time), 3))
@@ -97,8 +97,8 @@ def test_a_gap_leaves_the_track_where_it_was() -> None:
     assert np.linalg.norm(track.position_W[-1]) > 12.0
 
 
-def test_the_heading_is_carried_over_a_gap() -> None:
-    """Straight on, a quarter turn, straight on; the gap lies in the straight part behind it."""
+def test_the_heading_is_kept_across_a_gap() -> None:
+    """A straight, a quarter turn and another straight; the gap lies in the second straight."""
     time = np.arange(0.0, 40.0, 0.01)
     rate = np.where((time > 10.0) & (time < 12.0), 0.25 * np.pi, 0.0)
     phase = 2.0 * np.pi * RATE * time

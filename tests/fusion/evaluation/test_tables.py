@@ -1,4 +1,4 @@
-"""Networks side by side: what the table says of tracks whose errors are known."""
+"""Comparison table of networks, for tracks with known errors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from stario.sequences.accuracy.metrics import check_convention
 from stario.sequences.errors import InputError, WeightsError
 
 
-class Scaled:
-    """Says of every window that it moved by a share of what its name's network would."""
+class ConstantDisplacement:
+    """A model that predicts a displacement of `drift` metres along x for every window."""
 
     def __init__(self, name: str, drift: float) -> None:
         self.name, self.drift = name, drift
@@ -35,9 +35,9 @@ class Scaled:
 
 
 MODELS = [
-    ("a", Scaled("StarIO", 0.1)),
-    ("b", Scaled("StarIO", 0.3)),
-    ("c", Scaled("R-ResNet", 1.0)),
+    ("a", ConstantDisplacement("StarIO", 0.1)),
+    ("b", ConstantDisplacement("StarIO", 0.3)),
+    ("c", ConstantDisplacement("R-ResNet", 1.0)),
 ]
 
 
@@ -71,7 +71,7 @@ def test_every_network_has_every_track_of_every_recording(table) -> None:
         assert table.values("StarIO", protocol, "ate_m", weights="a").shape == (2,)
 
 
-def test_recordings_of_the_same_name_are_told_apart(read) -> None:
+def test_recordings_with_the_same_name_are_distinguished(read) -> None:
     twice, _ = compare_networks(
         [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
     )
@@ -79,17 +79,17 @@ def test_recordings_of_the_same_name_are_told_apart(read) -> None:
     assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
 
 
-def test_mean_and_spread_are_over_weights_of_means_over_recordings(table) -> None:
+def test_mean_and_spread_are_taken_over_weights_of_recording_means(table) -> None:
     a, b = (table.values("StarIO", "network", "ate_m", weights=w).mean() for w in "ab")
     mean, spread = table.mean_and_spread("StarIO", "network", "ate_m")
     assert mean == pytest.approx((a + b) / 2)
     assert spread == pytest.approx(abs(a - b) / np.sqrt(2))
-    alone, none = table.mean_and_spread("R-ResNet", "network", "ate_m")
-    assert none is None
-    assert alone == pytest.approx(table.values("R-ResNet", "network", "ate_m").mean())
+    single, no_spread = table.mean_and_spread("R-ResNet", "network", "ate_m")
+    assert no_spread is None
+    assert single == pytest.approx(table.values("R-ResNet", "network", "ate_m").mean())
 
 
-def test_ronins_convention_is_smaller_by_the_root_of_two(table, read) -> None:
+def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) -> None:
     ronin, _ = compare_networks(
         [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
     )
@@ -100,13 +100,13 @@ def test_ronins_convention_is_smaller_by_the_root_of_two(table, read) -> None:
         check_convention("tlio")
 
 
-def test_text_names_networks_recordings_and_what_is_meant(table) -> None:
+def test_text_names_networks_recordings_convention_and_units(table) -> None:
     text = table_text(table)
     for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
         assert word in text
 
 
-def test_files_hold_the_same_figures(table, tmp_path: Path) -> None:
+def test_csv_and_json_hold_the_same_figures(table, tmp_path: Path) -> None:
     written = write_table(tmp_path, table)
     assert {path.name for path in written} == {
         "networks.csv",
@@ -128,7 +128,7 @@ def test_files_hold_the_same_figures(table, tmp_path: Path) -> None:
         assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_network_is_found_by_its_name_in_the_folder_of_runs(tmp_path: Path) -> None:
+def test_weights_are_found_by_network_name_in_the_runs_folder(tmp_path: Path) -> None:
     assert weights_named("StarIO", tmp_path) == "default"
     assert weights_named("some/file.onnx", tmp_path) == "some/file.onnx"
     with pytest.raises(WeightsError, match=r"stario train --model 'RNIN'"):

@@ -1,4 +1,4 @@
-"""Tracks without a filter: the IMU alone, and displacements chained."""
+"""Tracks without a filter: the IMU alone, and chained displacements."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +29,7 @@ Make = Callable[..., Any]
 
 
 class TrueAttitudeOracle:
-    """Answers the windows of the true-attitude track, which come in order, ten a second."""
+    """True displacements of the true-attitude track's windows, in order at ten per second."""
 
     def __init__(self, sequence: ImuSequence) -> None:
         self.truth, self.start = sequence.truth, clean_samples(sequence)[0][0]
@@ -51,7 +51,7 @@ def horizontal_errors(trajectory, sequence: ImuSequence) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def from_rest() -> ImuSequence:
-    """A perfect IMU on a walk that begins at rest: its clock is slowed to a stop there."""
+    """A perfect IMU on a walk that begins at rest, since time along it is slowed to a stop."""
     walk = generate_walk(2, 12.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.4, -0.7, 1.1)))
     time = np.arange(0.0, 12.0, 0.005)
     share = np.clip((time - 1.3) / 2.0, 0.0, 1.0)
@@ -61,7 +61,9 @@ def from_rest() -> ImuSequence:
     return simulate_imu(Trajectory(time, position, warped.attitude_WB), 200.0, PERFECT_IMU)
 
 
-def test_inertial_is_strapdown_from_rest(from_rest: ImuSequence, still_model: Any) -> None:
+def test_the_inertial_track_is_strapdown_from_rest(
+    from_rest: ImuSequence, still_model: Any
+) -> None:
     track = inertial_track(Navigator(still_model).observe(from_rest), CONFIG)
     aligned = align(track.trajectory, from_rest.truth, "first")
     errors = pose_errors(aligned, from_rest.truth)
@@ -71,10 +73,10 @@ def test_inertial_is_strapdown_from_rest(from_rest: ImuSequence, still_model: An
     assert turn.magnitude().max() < 1e-3
 
 
-def test_chained_displacements_follow_the_truth_to_centimetres(
+def test_chained_displacements_follow_the_truth_within_40_centimetres(
     make_walk: Make, make_oracle: Make
 ) -> None:
-    """What is lost is what a mean over a second does to a path: its bends get cut."""
+    """The remaining error is due to the mean over a second, which cuts corners."""
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     preprocessed = Navigator(make_oracle(walk, walk.truth, CONFIG)).observe(walk)
     errors = horizontal_errors(network_track(preprocessed).trajectory, walk)
@@ -82,44 +84,44 @@ def test_chained_displacements_follow_the_truth_to_centimetres(
     assert errors.max() < 0.4
 
 
-def test_with_true_attitude_chained_displacements_are_the_truth(make_walk: Make) -> None:
+def test_chained_displacements_with_true_attitude_follow_the_truth(make_walk: Make) -> None:
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     track = network_track_true_attitude(TrueAttitudeOracle(walk), walk, CONFIG)
     errors = horizontal_errors(track.trajectory, walk)
-    # The first half second is held at the first window's mean speed: its error stays.
+    # The first half second has the first window's mean speed; its error persists.
     assert np.median(errors) < 0.1
     steps = np.diff(track.trajectory.position_W[::10], axis=0)
     true = np.diff(walk.truth.at(track.time[::10]).position_W, axis=0)
     assert np.linalg.norm(steps - true, axis=1)[1:-1].mean() < 0.05
 
 
-def test_the_track_with_true_attitude_needs_truth(walk: ImuSequence, still_model: Any) -> None:
+def test_the_track_with_true_attitude_requires_truth(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
         network_track_true_attitude(still_model, walk.without_truth(), CONFIG)
-    scarce = replace(walk, truth=walk.truth.slice(3.0, 3.5))
+    short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.5))
     with pytest.raises(InputError, match="no second without gaps"):
-        network_track_true_attitude(still_model, scarce, CONFIG)
+        network_track_true_attitude(still_model, short_truth, CONFIG)
 
 
-def test_gaps_of_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None:
+def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None:
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     valid = (walk.truth.time < 8.0) | (walk.truth.time > 14.0)
-    holed = replace(walk, truth=replace(walk.truth, valid=valid))
-    seen: list[Any] = []
+    with_gap = replace(walk, truth=replace(walk.truth, valid=valid))
+    recorded: list[Any] = []
 
     class Recorder:
         def predict(self, windows: Any) -> Any:
-            seen.append(windows)
+            recorded.append(windows)
             return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
 
-    tracks = [network_track_true_attitude(Recorder(), w, CONFIG) for w in (walk, holed)]
+    tracks = [network_track_true_attitude(Recorder(), w, CONFIG) for w in (walk, with_gap)]
     np.testing.assert_allclose(tracks[1].time, tracks[0].time)
-    assert np.abs(seen[1] - seen[0]).max() < 0.02
+    assert np.abs(recorded[1] - recorded[0]).max() < 0.02
     turn = tracks[1].trajectory.attitude_WB * tracks[0].trajectory.attitude_WB.inv()
     assert turn.magnitude().max() < 2e-3
 
 
-def test_tracks_without_a_filter_claim_no_uncertainty(walk: ImuSequence, still_model: Any) -> None:
+def test_tracks_without_a_filter_have_no_covariance(walk: ImuSequence, still_model: Any) -> None:
     preprocessed = Navigator(still_model).observe(walk)
     for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
         assert track.covariance is None
@@ -129,11 +131,11 @@ def test_tracks_without_a_filter_claim_no_uncertainty(walk: ImuSequence, still_m
         }  # fmt: skip
 
 
-def test_every_track_passes_through_gaps_of_the_imu(
+def test_every_track_continues_across_gaps_in_the_imu_data(
     walk: ImuSequence, make_oracle: Make, without: Make
 ) -> None:
-    holed = without(walk, (walk.time > 8.0) & (walk.time < 10.0))
-    preprocessed = Navigator(make_oracle(holed, walk.truth, CONFIG)).observe(holed)
+    with_gap = without(walk, (walk.time > 8.0) & (walk.time < 10.0))
+    preprocessed = Navigator(make_oracle(with_gap, walk.truth, CONFIG)).observe(with_gap)
     for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
         assert np.isfinite(track.trajectory.position_W).all()
         assert (np.diff(track.time) > 0).all()

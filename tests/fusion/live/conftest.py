@@ -1,4 +1,4 @@
-"""A phone that pushes a recording, and a navigator whose network is cheap."""
+"""Pushes of a recording as a phone sends them, and a navigator with a cheap network."""
 
 import json
 
@@ -10,7 +10,7 @@ from stario.fusion.live.hub import Hub
 
 
 class SteadyWalk:
-    """Says of every window that the device moved on by its own mean force; cheap, and no zero."""
+    """A cheap network: the displacement depends on the window's mean force and is not zero."""
 
     def predict(self, windows):
         mean = np.asarray(windows, dtype=float)[:, 3:, :].mean(axis=2) * [0.3, 0.3, 0.0]
@@ -31,10 +31,10 @@ def hub(tmp_path, new_navigator):
 
 @pytest.fixture(scope="session")
 def pushes(walk):
-    """The walk's samples as the bodies of pushes, twenty of 100 Hz in each."""
+    """The walk as bodies of pushes, with twenty samples at 100 Hz in each."""
 
     def bodies(device="phone", session="one", offset_ns=10**18, seconds=None):
-        made = []
+        encoded = []
         count = len(walk) if seconds is None else round(100 * seconds)
         for begin in range(0, count, 20):
             rows = slice(begin, min(count, begin + 20))
@@ -46,8 +46,8 @@ def pushes(walk):
                     walk.time[rows].tolist(), values[rows].tolist(), strict=True
                 )
             ]
-            message = {"messageId": len(made), "sessionId": session, "deviceId": device}
-            made.append(json.dumps(message | {"payload": payload}).encode())
-        return made
+            message = {"messageId": len(encoded), "sessionId": session, "deviceId": device}
+            encoded.append(json.dumps(message | {"payload": payload}).encode())
+        return encoded
 
     return bodies

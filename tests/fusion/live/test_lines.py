@@ -1,4 +1,4 @@
-"""Lines over TCP and UDP, and a phone with phyphox, become tracks like any other."""
+"""Lines over TCP and UDP, and samples of a phyphox phone, are recorded like any others."""
 
 import json
 import socket
@@ -18,7 +18,7 @@ from stario.sequences import InputError, read_recording
 
 @pytest.fixture
 def serve(tmp_path, new_navigator):
-    """A running server with its token, as off loopback, or none."""
+    """Start a server, with a token as if it were not on loopback, or without one."""
     running = []
 
     def start(token="", phones=()):
@@ -56,12 +56,12 @@ def samples(server, device):
     return 0 if session is None else session.samples
 
 
-def test_lines_over_tcp_are_recorded_and_wrong_ones_answered(serve, walk):
+def test_lines_over_tcp_are_recorded_and_invalid_ones_get_an_error(serve, walk):
     server = serve()
     lines = lines_of(walk, 300)
     with socket.create_connection(("127.0.0.1", server.lines_port)) as device:
         content = b"".join([*lines[:100], b'{"t": "x"}\n', b"\n", *lines[100:]])
-        for begin in range(0, len(content), 997):  # packets end anywhere
+        for begin in range(0, len(content), 997):  # packets end at arbitrary bytes
             device.sendall(content[begin : begin + 997])
         wait_for(lambda: samples(server, "tcp 127.0.0.1") == 300)
         assert json.loads(device.makefile().readline())["error"].startswith("t: found 'x'")
@@ -69,7 +69,7 @@ def test_lines_over_tcp_are_recorded_and_wrong_ones_answered(serve, walk):
     np.testing.assert_array_equal(recording.gyro, walk.gyro[:300])
 
 
-def test_lines_over_udp_are_recorded_by_the_devices_name(serve, walk):
+def test_lines_over_udp_are_recorded_under_the_name_of_the_device(serve, walk):
     server = serve()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device:
         for line in lines_of(walk, 200, device="drone"):
@@ -102,17 +102,17 @@ CONFIG = {
 
 
 class FakePhone(BaseHTTPRequestHandler):
-    """Answers /config and /get as phyphox does; each question finds a fifth of a second more."""
+    """A server of /config and /get like phyphox; each request finds 0.2 s more of the walk."""
 
-    walk, asked = None, 0
+    walk, requests = None, 0
 
     def do_GET(self):
         url = urlsplit(self.path)
         if url.path == "/config":
             self._send(CONFIG)
             return
-        FakePhone.asked += 1
-        known = slice(0, 20 * FakePhone.asked)
+        FakePhone.requests += 1
+        known = slice(0, 20 * FakePhone.requests)
         t = self.walk.time[known]
         columns = {"gt": t, "acc t": t}
         for k, axis in enumerate("xyz"):
@@ -134,8 +134,8 @@ class FakePhone(BaseHTTPRequestHandler):
         pass
 
 
-def test_a_phone_with_phyphox_is_asked_until_all_is_there(serve, walk):
-    FakePhone.walk, FakePhone.asked = walk, 0
+def test_a_phyphox_phone_is_polled_until_all_samples_are_recorded(serve, walk):
+    FakePhone.walk, FakePhone.requests = walk, 0
     with HTTPServer(("127.0.0.1", 0), FakePhone) as phone:
         threading.Thread(target=phone.serve_forever, daemon=True).start()
         address = f"127.0.0.1:{phone.server_port}"
@@ -153,7 +153,7 @@ def test_an_experiment_without_both_sensors_is_refused():
         Phyphox("file:///etc/passwd")
 
 
-def test_a_server_that_stops_lets_its_viewers_go(serve, caplog):
+def test_a_stopping_server_closes_the_connections_of_its_viewers(serve, caplog):
     server = serve()
     with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/events", timeout=20) as viewer:
         assert viewer.readline().startswith(b"data: ")
@@ -163,7 +163,7 @@ def test_a_server_that_stops_lets_its_viewers_go(serve, caplog):
     assert caplog.records == []
 
 
-def test_only_loopback_goes_without_a_token(tmp_path, new_navigator):
+def test_only_loopback_needs_no_token(tmp_path, new_navigator):
     assert is_loopback("127.0.0.1")
     assert is_loopback("::1")
     assert not is_loopback("0.0.0.0")
@@ -173,14 +173,14 @@ def test_only_loopback_goes_without_a_token(tmp_path, new_navigator):
     server._socket.close()
 
 
-def test_a_port_that_is_taken_is_told(tmp_path, new_navigator):
+def test_a_port_in_use_is_refused(tmp_path, new_navigator):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match="port"):
             LiveServer(new_navigator, tmp_path, port=port)
 
 
-def test_no_packet_ends_the_listening(serve, walk):
+def test_an_invalid_packet_does_not_stop_the_server_from_listening(serve, walk):
     server = serve(token="sesame")
     address = ("127.0.0.1", server.lines_port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
@@ -192,7 +192,7 @@ def test_no_packet_ends_the_listening(serve, walk):
     wait_for(lambda: samples(server, "d") > 50)
 
 
-def test_an_experiment_that_is_cleared_is_followed_from_its_new_start():
+def test_a_cleared_experiment_is_followed_from_its_new_start():
     phone = Phyphox("phone:8080")
     phone._buffers = {"gyro": ("t", "x", "y", "z")}
 

@@ -1,4 +1,4 @@
-"""Sensors with their own clocks become samples at the gyroscope's times, however they arrive."""
+"""Readings of separately clocked sensors become samples at gyroscope times, in any batches."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ def linear(sensor: str, rate: float, offset_ns: int, seconds: float = 2.0, slope
 
 
 def phone(*groups):
-    """Readings as an app sends them: each batch of 0.2 s sensor by sensor."""
+    """Readings as an app sends them: in batches of 0.2 s, each sorted by sensor."""
     readings = [r for group in groups for r in group]
     return sorted(readings, key=lambda r: (r.time_ns // (SECOND // 5), r.sensor))
 
@@ -51,7 +51,7 @@ def test_linear_acceleration_and_gravity_are_added_at_common_times():
         assert f == pytest.approx((6 * s, 4 * s, 6 - 2 * s), abs=1e-9)
 
 
-def test_total_acceleration_is_preferred_and_uncalibrated_serves_where_there_is_nothing_else():
+def test_total_acceleration_is_preferred_and_uncalibrated_is_the_last_resort():
     gyro, raw = linear("gyroscope", 100, 0), linear("gyroscopeuncalibrated", 100, 0, slope=9.0)
     total = linear("totalacceleration", 100, 0)
     others = linear("accelerometer", 100, 0, slope=7.0), linear("gravity", 100, 0, slope=7.0)
@@ -78,12 +78,12 @@ def test_repeated_and_late_readings_are_dropped_and_counted():
     readings = phone(linear("gyroscope", 100, 0), linear("totalacceleration", 100, 0))
     merger = Merger()
     first = merger.add(readings)
-    assert merger.add(readings) == []  # a push that the app sent once more
+    assert merger.add(readings) == []  # the app repeats a push
     assert merger.dropped == {"late": len(readings)}
     assert len(first) == 200
 
 
-def test_a_gap_of_the_accelerometer_is_not_interpolated_over():
+def test_a_gap_of_the_accelerometer_is_not_interpolated():
     accel = [r for r in linear("totalacceleration", 100, 0) if not 0.5 < r.time_ns / SECOND < 1.0]
     merger = Merger()
     times = [t / SECOND for t, _, _ in merger.add(phone(linear("gyroscope", 100, 0), accel))]
@@ -91,7 +91,7 @@ def test_a_gap_of_the_accelerometer_is_not_interpolated_over():
     assert merger.dropped["without acceleration"] == pytest.approx(49, abs=1)
 
 
-def test_memory_stays_small_where_the_accelerometer_falls_silent():
+def test_memory_stays_small_if_the_accelerometer_stops_sending():
     join = Join()
     join.add(1, 0, (0.0, 0.0, 9.8))
     for k in range(1, 20_000):
@@ -101,7 +101,7 @@ def test_memory_stays_small_where_the_accelerometer_falls_silent():
     assert join.alone == 19_999 - len(join._first)
 
 
-def test_what_a_device_does_not_send_is_named():
+def test_a_missing_sensor_is_named():
     merger = Merger()
     merger.add(linear("gyroscope", 100, 0))
     assert "acceleration" in merger.missing
@@ -117,7 +117,7 @@ SENSOR_LOGGER = DATA / "raw/sensor_logger/university_loop"
 @pytest.mark.skipif(
     not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
 )
-def test_a_real_walk_that_is_pushed_is_the_one_read_from_its_files():
+def test_a_pushed_real_walk_equals_the_one_read_from_its_files():
     rows = []
     for file, name in (("Gyroscope", GYRO), ("TotalAcceleration", TOTAL)):
         with (SENSOR_LOGGER / f"{file}.csv").open() as table:
@@ -137,7 +137,7 @@ def test_a_real_walk_that_is_pushed_is_the_one_read_from_its_files():
 @pytest.mark.skipif(
     not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
 )
-def test_a_real_phones_force_points_up_by_its_own_attitude():
+def test_specific_force_points_up_in_the_reported_attitude_of_a_real_phone():
     folder = SENSOR_LOGGER.parent / "shopping_mall_eight"
     payload = []
     for file in ("Gyroscope", "TotalAcceleration", "Orientation"):

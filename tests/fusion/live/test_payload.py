@@ -1,4 +1,4 @@
-"""What devices send is read right, or refused with the field that is wrong; never anything else."""
+"""Messages of devices are read correctly, or refused with the name of the invalid field."""
 
 import json
 
@@ -42,7 +42,7 @@ def changed(message: dict, path: tuple, value: object) -> bytes:
     return json.dumps(copy).encode()
 
 
-def test_push_keeps_every_nanosecond_and_skips_what_no_track_is_made_of():
+def test_push_keeps_nanoseconds_and_skips_sensors_that_are_not_used():
     batch = parse_push(json.dumps(PUSH).encode())
     assert (batch.device, batch.recording) == ("d", "s")
     gyro, gravity = batch.readings
@@ -84,7 +84,7 @@ def test_line_is_a_sample_of_both_sensors_at_one_time():
         (("payload", 1, "time"), 5, "payload: found times"),
     ],
 )
-def test_what_is_wrong_is_named(path, value, field):
+def test_an_invalid_field_is_named(path, value, field):
     with pytest.raises(InputError, match=f"^{field}"):
         parse_push(changed(PUSH, path, value))
 
@@ -92,14 +92,14 @@ def test_what_is_wrong_is_named(path, value, field):
 @pytest.mark.parametrize(
     "body", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b"1" * 10_000, b"null", b"[]", b'"text"']
 )
-def test_no_json_object_is_refused(body):
+def test_a_body_without_a_json_object_is_refused(body):
     for parse in (parse_push, lambda body: parse_line(body, "x")):
         with pytest.raises(InputError):
             parse(body)
 
 
 @given(st.binary() | json_values.map(lambda value: json.dumps(value).encode()))
-def test_anything_else_is_refused_too(body):
+def test_arbitrary_bodies_are_refused(body):
     for parse in (parse_push, lambda body: parse_line(body, "x")):
         with pytest.raises(InputError):
             parse(body)
@@ -109,10 +109,10 @@ PATHS = [("payload", 0, "values", "y"), ("payload", 0, "time"), ("payload", 1), 
 
 
 @given(st.sampled_from(PATHS), json_values)
-def test_one_field_replaced_by_anything_is_read_or_refused(path, value):
-    told = ""
+def test_a_push_with_one_arbitrary_field_is_read_or_refused(path, value):
+    message_of_error = ""
     try:
         batch = parse_push(changed(PUSH, path, value))
     except InputError as error:
-        told = str(error)
-    assert (0 < len(told) < 400) or isinstance(batch, Batch)
+        message_of_error = str(error)
+    assert (0 < len(message_of_error) < 400) or isinstance(batch, Batch)

@@ -1,4 +1,4 @@
-"""The server takes pushes, refuses what is malformed, and draws what `stario run` would find."""
+"""The server accepts pushes, refuses malformed ones, and draws the same track as `stario run`."""
 
 import errno
 import json
@@ -29,13 +29,13 @@ def command(client, device, name, **content):
 
 
 def rerun(session, new_navigator):
-    """The track of the recording that a session wrote, with the fixes that it wrote."""
+    """Run the navigator on the recording and the fixes that a session wrote."""
     fixes = session._file.fixes_path
     known = read_fixes(fixes) if fixes.exists() else ()
     return new_navigator().run(read_recording(session.path), fixes=known)
 
 
-def test_drawn_end_is_that_of_the_recording_written(client, hub, pushes, new_navigator, walk):
+def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navigator, walk):
     taken = [client.post("/data", content=body).json()["samples"] for body in pushes()]
     session = hub.sessions["phone"]
     assert sum(taken) == session.samples == len(walk)
@@ -68,7 +68,7 @@ def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
     assert hub.sessions["phone"].samples == 300
 
 
-def test_stop_ignores_and_start_begins_anew(client, hub, pushes):
+def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
     bodies = pushes(seconds=6.0)
     for body in bodies[:15]:
         client.post("/data", content=body)
@@ -82,7 +82,7 @@ def test_stop_ignores_and_start_begins_anew(client, hub, pushes):
     assert session.samples == 280
 
 
-def test_zero_moves_what_is_drawn_and_not_the_estimate(client, hub, pushes, new_navigator):
+def test_zero_moves_the_drawn_origin_and_not_the_estimate(client, hub, pushes, new_navigator):
     bodies = pushes(seconds=8.0)
     for body in bodies[:30]:
         client.post("/data", content=body)
@@ -96,7 +96,7 @@ def test_zero_moves_what_is_drawn_and_not_the_estimate(client, hub, pushes, new_
     np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-5)
 
 
-def test_fixes_by_tap_move_and_turn_the_whole_drawn_track(client, hub, pushes, new_navigator):
+def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes, new_navigator):
     bodies = pushes()
     for body in bodies[:20]:
         client.post("/data", content=body)
@@ -110,7 +110,7 @@ def test_fixes_by_tap_move_and_turn_the_whole_drawn_track(client, hub, pushes, n
         client.post("/data", content=body)
     walked = np.array(session.drawn.points[-1][1:3]) - [50.0, -20.0]
     assert np.linalg.norm(walked) > 5.0
-    turned = [50.0 - walked[1], -20.0 + walked[0]]  # by a quarter to the left
+    turned = [50.0 - walked[1], -20.0 + walked[0]]  # a quarter turn to the left
     command(client, "phone", "fix", x=turned[0], y=turned[1], sigma=0.1)
     np.testing.assert_allclose(session.drawn.points[-1][1:3], turned, atol=0.5)
     start = np.array(session.drawn.points[len(shape) // 2][1:3])
@@ -123,7 +123,7 @@ def test_fixes_by_tap_move_and_turn_the_whole_drawn_track(client, hub, pushes, n
     assert session.fixes == 2
 
 
-def test_apples_sign_and_g_are_turned_as_the_address_says(client, hub, pushes, walk):
+def test_apples_sign_and_g_are_converted_by_accel_unit_in_the_address(client, hub, pushes, walk):
     for body in pushes(seconds=3.0):
         message = json.loads(body)
         for entry in message["payload"]:
@@ -134,7 +134,7 @@ def test_apples_sign_and_g_are_turned_as_the_address_says(client, hub, pushes, w
     np.testing.assert_allclose(recording.accel, walk.accel[:300], atol=1e-12)
 
 
-def test_a_wrong_unit_is_told_on_the_page_and_the_samples_are_kept(client, hub, pushes):
+def test_a_wrong_unit_is_shown_on_the_page_and_the_samples_are_kept(client, hub, pushes):
     for body in pushes(seconds=3.0):
         client.post("/data?accel_unit=g", content=body)
     session = hub.sessions["phone"]
@@ -142,7 +142,7 @@ def test_a_wrong_unit_is_told_on_the_page_and_the_samples_are_kept(client, hub, 
     assert len(read_recording(session.path)) == 300
 
 
-BAD = st.one_of(
+MALFORMED = st.one_of(
     st.binary(max_size=60),
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
@@ -162,7 +162,7 @@ BAD = st.one_of(
 )  # fmt: skip
 
 
-def test_a_thousand_malformed_pushes_leave_a_replay_as_it_is(client, hub, pushes, walk, tmp_path):
+def test_a_thousand_malformed_pushes_do_not_affect_a_replay(client, hub, pushes, walk, tmp_path):
     bodies = iter(pushes())
     sent, refused = [], []
 
@@ -170,13 +170,13 @@ def test_a_thousand_malformed_pushes_leave_a_replay_as_it_is(client, hub, pushes
         max_examples=1000, deadline=None, database=None, derandomize=True,
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
-    @given(BAD)
-    def push(bad):
-        answer = client.post("/data", content=bad)
+    @given(MALFORMED)
+    def push(malformed):
+        answer = client.post("/data", content=malformed)
         refused.append(answer.status_code)
         if answer.status_code == 400:
             assert answer.json()["error"]
-        else:  # a payload that is empty is none to refuse
+        else:  # an empty payload is valid
             assert answer.json() == {"samples": 0}
         if len(refused) % 10 == 0 and (body := next(bodies, None)) is not None:
             sent.append(client.post("/data", content=body).json()["samples"])
@@ -194,22 +194,22 @@ def test_a_thousand_malformed_pushes_leave_a_replay_as_it_is(client, hub, pushes
     np.testing.assert_allclose(end, undisturbed.state.p_W, atol=1e-5)
 
 
-def test_a_full_disk_is_told_to_the_phone_and_harms_no_other(client, hub, pushes, monkeypatch):
+def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monkeypatch):
     for device in ("full", "phone"):
         for body in pushes(device=device, seconds=2.0):
             client.post("/data", content=body)
 
-    def no_room(*arguments):
+    def disk_full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(hub.sessions["full"]._file, "append", no_room)
+    monkeypatch.setattr(hub.sessions["full"]._file, "append", disk_full)
     bodies = [pushes(device=device, seconds=4.0)[10] for device in ("full", "phone")]
     full, phone = (client.post("/data", content=body) for body in bodies)
     assert (full.status_code, "No space" in full.json()["error"]) == (507, True)
     assert phone.json() == {"samples": 20}
 
 
-def test_behind_a_gap_fixes_leave_what_was_drawn_before(client, hub, pushes):
+def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, pushes):
     bodies = pushes()
     for part in (bodies[:20], bodies[20:60]):
         for body in part:
@@ -220,13 +220,13 @@ def test_behind_a_gap_fixes_leave_what_was_drawn_before(client, hub, pushes):
     before = list(session.drawn.points)
     for body in pushes(offset_ns=10**18 + 30 * 10**9)[60:90]:  # half a minute is missing
         client.post("/data", content=body)
-    assert session.drawn.points[-1][9] > 30.0  # degrees: the direction is lost
+    assert session.drawn.points[-1][9] > 30.0  # yaw sigma [deg]: the direction is lost
     command(client, "phone", "fix", x=30.0, y=30.0, sigma=0.1)
     assert session.drawn.points[: len(before)] == before
     np.testing.assert_allclose(session.drawn.points[-1][1:3], [30.0, 30.0], atol=0.5)
 
 
-def test_too_large_too_many_and_elsewhere_are_refused(client, hub, pushes):
+def test_oversized_pushes_surplus_devices_and_foreign_requests_are_refused(client, hub, pushes):
     answer = client.post("/data", content=b" " * (MOST_BYTES + 1))
     assert (answer.status_code, "bytes" in answer.json()["error"]) == (400, True)
     body = pushes(seconds=0.2)[0]
@@ -245,7 +245,7 @@ def test_too_large_too_many_and_elsewhere_are_refused(client, hub, pushes):
         assert command(client, "phone1", "fix", **values).status_code == 400
 
 
-def test_off_loopback_nothing_goes_without_the_token(hub, pushes):
+def test_every_request_off_loopback_needs_the_token(hub, pushes):
     body = pushes(seconds=0.2)[0]
     with TestClient(live_app(hub, "secret"), base_url="http://192.168.0.2:8000") as client:
         for answer in (
@@ -264,10 +264,10 @@ def test_off_loopback_nothing_goes_without_the_token(hub, pushes):
         assert client.post("/data", content=body, headers=bearer).status_code == 200
         assert client.get("/").status_code == 401
         assert client.get("/?token=secret").status_code == 200
-        assert client.get("/live.js").status_code == 200  # by the cookie that the page set
+        assert client.get("/live.js").status_code == 200  # authorised by the page's cookie
 
 
-def test_viewers_are_sent_what_is_new_and_all_of_it_after_a_change(client, hub, pushes):
+def test_viewers_get_new_points_and_after_a_change_the_whole_track(client, hub, pushes):
     bodies = pushes(seconds=6.0)
     for body in bodies[:15]:
         client.post("/data", content=body)
@@ -300,9 +300,9 @@ def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, 
     assert drawn.points[-1][0] == pytest.approx(navigator.state.time)
 
 
-@pytest.mark.parametrize(("unit", "told"), [("m/s2", True), ("-m/s2", False)])
-def test_apples_sign_that_is_not_told_shows_by_the_phones_own_attitude(
-    client, hub, walk, pushes, unit, told
+@pytest.mark.parametrize(("unit", "detected"), [("m/s2", True), ("-m/s2", False)])
+def test_undeclared_apple_sign_is_detected_by_the_attitude_of_the_phone(
+    client, hub, walk, pushes, unit, detected
 ):
     attitude = walk.truth.at(walk.time[:300]).attitude_WB.as_quat()
     for k, body in enumerate(pushes(seconds=3.0)):
@@ -315,10 +315,10 @@ def test_apples_sign_that_is_not_told_shows_by_the_phones_own_attitude(
         message["payload"].append({"name": "orientation", "time": time, "values": quat})
         assert client.post(f"/data?accel_unit={unit}", content=json.dumps(message)).is_success
     problem = hub.sessions["phone"].status()["problem"]
-    assert ("accel_unit=-m/s2" in problem) == told
+    assert ("accel_unit=-m/s2" in problem) == detected
 
 
-def test_lines_may_be_posted_and_are_taken_all_or_none(client, hub, walk):
+def test_posted_lines_are_accepted_all_or_none(client, hub, walk):
     rows = zip(walk.time[:150].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
     lines = [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
     ndjson = {"content-type": "application/x-ndjson"}
@@ -330,7 +330,7 @@ def test_lines_may_be_posted_and_are_taken_all_or_none(client, hub, walk):
 
 @pytest.mark.parametrize("lag", [0, 2])
 def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator, walk, lag):
-    """Its samples may come a little after those of the gyroscope, as with real phones."""
+    """Its samples may arrive slightly later than those of the gyroscope, as with real phones."""
     turned = walk.truth.at(walk.time).attitude_WB
     field = turned.apply([18.0, 5.0, -43.0], inverse=True)
     entries = [
@@ -357,7 +357,7 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
     )
 
 
-def test_a_line_that_is_wrong_is_told_by_its_number(client):
+def test_an_invalid_line_is_reported_with_its_number(client):
     lines = [{"device": "rig", "t": t, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for t in (1, 2)]
     lines[1]["gyro"] = [0, 0]
     body = "\n".join(map(json.dumps, lines))

@@ -1,4 +1,4 @@
-"""A live recording can be read at any moment, whatever became of the program that wrote it."""
+"""A live recording can be read at any moment, even if the program that wrote it was killed."""
 
 import json
 import logging
@@ -23,7 +23,7 @@ SAMPLES = [
 ]
 
 
-def test_recording_reads_back_to_the_bit_while_it_is_open(tmp_path):
+def test_recording_reads_back_exactly_while_it_is_open(tmp_path):
     file = LiveFile(tmp_path / "new", "my phone/..\\x")
     file.append(SAMPLES[:15], 1.7e9)
     file.append(SAMPLES[15:], 1.7e9)
@@ -35,14 +35,14 @@ def test_recording_reads_back_to_the_bit_while_it_is_open(tmp_path):
     file.close()
 
 
-def test_recordings_of_one_second_do_not_overwrite_each_other(tmp_path):
+def test_recordings_begun_in_the_same_second_do_not_overwrite_each_other(tmp_path):
     files = [LiveFile(tmp_path, "phone") for _ in range(3)]
     assert len({file.path for file in files}) == 3
     for file in files:
         file.close()
 
 
-def test_recording_cut_at_any_byte_keeps_every_whole_sample(tmp_path, caplog):
+def test_recording_truncated_at_any_byte_keeps_every_complete_sample(tmp_path, caplog):
     file = LiveFile(tmp_path, "phone")
     file.append(SAMPLES, 1.7e9)
     file.close()
@@ -54,13 +54,13 @@ def test_recording_cut_at_any_byte_keeps_every_whole_sample(tmp_path, caplog):
         file.path.write_bytes(content[:cut])
         whole = content[:cut].count(b"\n") - 1
         recording = read_recording(file.path)
-        # Beyond the last column's comma all data of the line are there.
+        # Once the last column's comma is written, the line's data are complete.
         assert len(recording) - whole in (0, 1)
         np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES[: len(recording)]])
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-def test_a_killed_server_leaves_all_that_it_acknowledged(tmp_path, pushes):
+def test_a_killed_server_leaves_all_samples_that_it_acknowledged(tmp_path, pushes):
     command = "from stario.fusion.commands.cli import main; main()"
     options = ["live", "--port", "0", "--out", str(tmp_path)]
     with subprocess.Popen(
@@ -96,7 +96,7 @@ def _push_on(url, bodies):
 
 
 class NearlyFull:
-    """A disk that takes a part of what is written, then all again."""
+    """A file on a full disk, which writes only a part until `full` is cleared."""
 
     def __init__(self, file):
         self.file, self.full = file, True
@@ -108,7 +108,7 @@ class NearlyFull:
         return getattr(self.file, name)
 
 
-def test_what_a_full_disk_cuts_is_taken_back(tmp_path):
+def test_a_partial_write_on_a_full_disk_is_undone(tmp_path):
     file = LiveFile(tmp_path, "phone")
     file.append(SAMPLES[:10], 1.7e9)
     file._file = NearlyFull(file._file)
@@ -121,7 +121,7 @@ def test_what_a_full_disk_cuts_is_taken_back(tmp_path):
     file.close()
 
 
-def test_a_push_that_could_not_be_written_is_not_lost(tmp_path, new_navigator, pushes, monkeypatch):
+def test_a_push_that_was_not_written_can_be_repeated(tmp_path, new_navigator, pushes, monkeypatch):
     session = Session("phone", tmp_path, new_navigator)
     *before, second = [parse_push(body) for body in pushes(seconds=2.0)]
     for batch in before:

@@ -1,4 +1,4 @@
-"""The health report in words: what stands out, and what to do about it."""
+"""Findings of the health report, with advice."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BAGS = DATA / "raw" / "rosbag"
 UNFAMILIAR = "60% of the windows move unlike anything the weights were trained on"
 
 
-def test_what_stands_out_comes_with_what_to_do() -> None:
+def test_every_warning_comes_with_advice() -> None:
     good = findings(Health(samples={"used": 1000}, updates=100, mean_nis=3.0))
     assert [finding.level for finding in good] == ["good"]
     noted = findings(Health(mean_nis=3.0, notes=[UNFAMILIAR]))
@@ -49,7 +49,7 @@ SHAKEN = Health(
 )
 
 
-def test_one_dropped_sample_of_thousands_is_not_none() -> None:
+def test_one_dropped_sample_among_thousands_is_not_reported_as_none() -> None:
     (found,) = [
         finding.text
         for finding in findings(Health(samples={"used": 9999, "not finite": 1}, updates=100))
@@ -58,20 +58,20 @@ def test_one_dropped_sample_of_thousands_is_not_none() -> None:
     assert found == "Fewer than 0.1% of the samples were dropped (1 not finite)."
 
 
-def test_only_sensor_weights_and_filter_together_condemn_the_data() -> None:
+def test_a_track_is_distrusted_only_if_sensor_weights_and_filter_all_warn() -> None:
     [verdict] = health_lines(SHAKEN)
     assert verdict.startswith("! This track cannot be trusted")
     assert "3 spike, 9 saturated" in verdict
     assert "17%" in verdict
-    for agrees in ({"flagged": {"spike": 1}}, {"gated": 3}, {"notes": []}):
-        lines = health_lines(replace(SHAKEN, **agrees))
+    for unremarkable in ({"flagged": {"spike": 1}}, {"gated": 3}, {"notes": []}):
+        lines = health_lines(replace(SHAKEN, **unremarkable))
         assert not any("trusted" in line for line in lines)
         assert any(line.startswith("! ") for line in lines)
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason=f"no recordings at {BAGS}")
-def test_a_board_shaken_by_hand_gets_one_line_and_one_turned_by_hand_does_not() -> None:
-    """Beyond the 2 g of its accelerometer for seconds; the other was moved within its range."""
+def test_a_board_shaken_beyond_its_range_is_distrusted_and_one_turned_by_hand_is_not() -> None:
+    """The first exceeds the 2 g of its accelerometer for seconds, the second stays within it."""
     navigator = Navigator(load_model("default"))
     shaken = navigator.run(read_recording(BAGS / "sparkfun_razor.bag")).health
     turned = navigator.run(read_recording(BAGS / "phidgets_imu_upside_down.bag")).health

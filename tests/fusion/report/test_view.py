@@ -1,4 +1,4 @@
-"""What rerun's viewer opens holds track, attitude, covariance and sensors, with their units."""
+"""The file for rerun's viewer holds track, attitude, covariance and sensors, with their units."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def track(walk, still_model):
 
 
 def test_file_holds_every_quantity_over_time(tmp_path, walk, track):
-    reader = pytest.importorskip("rerun.chunk", reason="of rerun 0.41 or newer").RrdReader
+    reader = pytest.importorskip("rerun.chunk", reason="requires rerun 0.41 or newer").RrdReader
     path = write_view(tmp_path / "track.rrd", walk, track, track.trajectory)
     entities = {str(chunk.entity_path) for chunk in reader(str(path)).stream()}
     for name in ("world/track", "world/truth", "world/device", "NIS", "bias", "force", "yaw"):

@@ -1,4 +1,4 @@
-"""Cells of the table: filled once, gone on with after a kill, filled in where something is new."""
+"""Cells of the table: filled once, resumed after a kill, and only new ones are filled later."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def cell(dataset: DataSet, network: str = "DeepILS", seed: int = 0, steps: int =
     return Cell(dataset, network, seed, cell_recipe(RECIPE, network, seed, steps))
 
 
-def test_a_cell_leaves_model_errors_and_tracks(
+def test_a_filled_cell_writes_model_errors_and_tracks(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=2)
@@ -69,7 +69,7 @@ def test_a_cell_leaves_model_errors_and_tracks(
     )
 
 
-def test_where_only_waypoints_are_real_they_alone_choose(
+def test_without_recorded_poses_the_legs_alone_select_the_weights(
     dataset: DataSet, make_walk: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen: list[bool] = []
@@ -100,7 +100,7 @@ def test_where_only_waypoints_are_real_they_alone_choose(
     assert chosen == [True, False]
 
 
-def test_a_killed_cell_goes_on_and_ends_the_same(
+def test_a_killed_cell_resumes_and_gives_the_same_model(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
@@ -123,15 +123,15 @@ def test_a_killed_cell_goes_on_and_ends_the_same(
     assert len(json.loads((folder / "log.json").read_text())) == 2
 
 
-def test_what_is_filled_is_kept_and_a_new_network_or_seed_fills_in(
+def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
-    whole = cells_module.train_cell
+    original = cells_module.train_cell
 
     def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
         trained.append(f"{recipe.architecture} {recipe.seed}")
-        return whole(dataset, recipe, *rest)
+        return original(dataset, recipe, *rest)
 
     monkeypatch.setattr(cells_module, "train_cell", counted)
     first = [cell(dataset, steps=1), Cell(dataset, "pdr", 0, None)]
@@ -158,7 +158,7 @@ def test_what_is_filled_is_kept_and_a_new_network_or_seed_fills_in(
     assert sorted(row.rank.rank for row in table.rows if row.rank) == [1, 2]
 
 
-def test_cells_of_another_recipe_are_refused_and_other_steps_stand_beside(
+def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=1)
@@ -171,7 +171,7 @@ def test_cells_of_another_recipe_are_refused_and_other_steps_stand_beside(
     assert filled_cells([cell(dataset, steps=2)], tmp_path) == {}
 
 
-def test_the_order_is_what_matters_first_and_steps_are_equal(dataset: DataSet) -> None:
+def test_the_most_important_cells_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
     names = ("tyrex", "oxiod", "all")
     sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
     cells = table_cells(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
@@ -188,7 +188,7 @@ def test_the_order_is_what_matters_first_and_steps_are_equal(dataset: DataSet) -
         table_cells(sets, RECIPE, networks=["Nobody"])
 
 
-def test_a_cell_travels_to_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
+def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
     work = partial(fill_cell, out=Path("out"), reading=reading)
     sent = pickle.loads(pickle.dumps((work, cell(dataset))))
     assert sent[1] == cell(dataset)
@@ -200,7 +200,7 @@ def test_an_unknown_backend_is_refused() -> None:
         backend("mpi")
 
 
-def test_the_command_leaves_tables_and_figures(
+def test_the_command_writes_tables_and_figures(
     dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = dataset.training[0].parent

@@ -1,4 +1,4 @@
-"""Ranks and ratios of networks whose errors are known."""
+"""Ranks and ratios of networks with known errors."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from stario.fusion.table.published import published
 from stario.fusion.table.ranks import ranks
 
 
-def errors(scale: float, own: float = 0.0, seed: int = 0) -> list[tuple[str, str, np.ndarray]]:
-    """Twelve recordings of two sets, hard and easy ones, with noise of a network's own."""
+def errors(scale: float, noise: float = 0.0, seed: int = 0) -> list[tuple[str, str, np.ndarray]]:
+    """Errors on twelve recordings of two sets, easy and hard, with noise of a network's own."""
     common, rng = np.random.default_rng(9), np.random.default_rng(seed)
     found = []
     for k in range(12):
-        sums = common.lognormal(0.0, 1.5, 6) * scale**2 * np.exp(own * rng.standard_normal(6))
+        sums = common.lognormal(0.0, 1.5, 6) * scale**2 * np.exp(noise * rng.standard_normal(6))
         found.append((f"set {k % 2}", str(k), np.stack([sums, np.full(6, 1.0)], axis=1)))
     return found
 
 
-def test_a_network_twice_as_wrong_is_surely_so_however_hard_recordings_differ() -> None:
+def test_twice_the_error_is_certain_however_much_recordings_differ_in_difficulty() -> None:
     found = ranks({"StarIO": [errors(1.0)], "worse": [errors(2.0)]}, "StarIO")
     assert found["StarIO"].ratio is None
     ratio = found["worse"].ratio
@@ -28,7 +28,7 @@ def test_a_network_twice_as_wrong_is_surely_so_however_hard_recordings_differ() 
     assert [(found[n].rank, found[n].low, found[n].high) for n in found] == [(1, 1, 1), (2, 2, 2)]
 
 
-def test_what_differs_by_chance_alone_may_have_either_rank() -> None:
+def test_networks_that_differ_by_chance_alone_may_have_either_rank() -> None:
     runs = {name: [errors(1.0, 0.7, seed)] for seed, name in enumerate(["StarIO", "a", "b"])}
     found = ranks(runs, "StarIO")
     assert all(rank.low < rank.high for rank in found.values())
@@ -36,7 +36,7 @@ def test_what_differs_by_chance_alone_may_have_either_rank() -> None:
     assert ranks(runs, "StarIO") == found
 
 
-def test_seeds_are_averaged_and_only_recordings_in_common_count() -> None:
+def test_seeds_are_averaged_over_common_recordings_only() -> None:
     half = errors(2.0)[:6]
     found = ranks({"StarIO": [errors(1.0)], "two": [errors(1.0)[:6], half]}, "StarIO")
     ratio = found["two"].ratio
@@ -45,7 +45,7 @@ def test_seeds_are_averaged_and_only_recordings_in_common_count() -> None:
     assert ranks({"a": [errors(1.0)], "b": [[]]}, "a") == {}
 
 
-def test_the_papers_figures_are_found_by_network() -> None:
+def test_published_figures_are_found_by_set_and_network() -> None:
     assert published("ridi", "StarIO") == (2.033, 2.274)
     assert published("oxiod", "R-ResNet") == (4.336, 1.595)
     assert published("ridi", "pdr") is None

@@ -1,4 +1,4 @@
-"""Which recordings train, validate and test."""
+"""Split of recordings into training, validation and test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stario.sequences.errors import InputError
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
 
-def test_a_set_is_split_once_and_the_same_by_a_seed() -> None:
+def test_a_split_is_disjoint_complete_and_determined_by_the_seed() -> None:
     recordings = [ListEntry(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
     first, again, other = (sets._split("a", recordings, seed) for seed in (3, 3, 4))
     assert first == again
@@ -26,7 +26,7 @@ def test_a_set_is_split_once_and_the_same_by_a_seed() -> None:
     assert "seed 3" in first.words
 
 
-def test_two_phones_on_one_walk_stay_together() -> None:
+def test_two_phones_on_one_walk_are_in_the_same_part() -> None:
     recordings = [
         ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
     ]
@@ -37,7 +37,7 @@ def test_two_phones_on_one_walk_stay_together() -> None:
             assert all(walks.count(walk) == 2 for walk in walks)
 
 
-def test_two_phones_on_one_walk_validate_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_phones_on_one_walk_are_validated_together(monkeypatch: pytest.MonkeyPatch) -> None:
     phones = [
         ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
     ]
@@ -52,7 +52,7 @@ def test_two_phones_on_one_walk_validate_together(monkeypatch: pytest.MonkeyPatc
 
 
 @needs_data
-def test_sets_that_matter_come_first_and_no_part_meets_another() -> None:
+def test_the_main_sets_come_first_and_parts_of_a_set_are_disjoint() -> None:
     found = development_sets(DATA, 0, 2)
     assert tuple(one.name for one in found[:3]) == FIRST
     assert {one.name for one in found} == {*FIRST, "tyrex", "kipd", "ilc"}
@@ -67,14 +67,14 @@ def test_sets_that_matter_come_first_and_no_part_meets_another() -> None:
 
 
 @needs_data
-def test_all_together_tests_people_and_places_that_it_has_not_met() -> None:
+def test_the_combined_set_is_tested_on_held_out_people_and_places() -> None:
     [together] = development_sets(DATA, 0, 2, [ALL])
     learned = [*together.training, *together.validation]
     assert not any("Thibaud" in str(path) or ":dan_" in str(path) for path in learned)
     assert not any("site2" in str(path) for path in learned)
     tested = [one.group for one in together.test]
     assert {"tyrex", "ridi", "kipd", "ilc", "rocip", "oxiod"} <= set(tested)
-    assert tested.count("tyrex") == 2  # at most so many of Thibaud's 41
+    assert tested.count("tyrex") == 2  # at most two of Thibaud's 41
     known = learned_from(DATA)
     assert not known["first-stage"] & {one.path for one in together.test}
     assert known["default"] >= {one.path for one in together.test}

@@ -14,7 +14,7 @@ def windows(count: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_row_per_window_and_a_window_does_not_feel_the_others(name: str) -> None:
+def test_output_has_one_row_per_window_independent_of_other_windows(name: str) -> None:
     torch.manual_seed(0)
     network = build_network(name).eval()
     batch = windows(3)
@@ -25,14 +25,14 @@ def test_one_row_per_window_and_a_window_does_not_feel_the_others(name: str) -> 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_parameter_learns_and_stays_finite_where_nothing_varies(name: str) -> None:
+def test_every_gradient_is_nonzero_and_finite_even_with_a_constant_window(name: str) -> None:
     torch.manual_seed(0)
     network = build_network(name)
     for module in network.modules():
         if isinstance(module, nn.Dropout):
             module.p = 0.0
     batch = torch.cat([windows(3), torch.zeros(1, 6, 200)])
-    # Only a chain of windows uses the weights of a state that is no longer zero.
+    # Recurrent weights act only on a nonzero state, that is in a series of windows.
     network(batch.unflatten(0, (2, 2)) if name == "RNIN" else batch).square().sum().backward()
     for key, parameter in network.named_parameters():
         assert parameter.grad is not None, key
@@ -41,7 +41,7 @@ def test_every_parameter_learns_and_stays_finite_where_nothing_varies(name: str)
 
 
 @pytest.mark.parametrize("name", ["TLIO", "RNIN"])
-def test_two_heads_learn_apart(name: str) -> None:
+def test_the_two_heads_are_trained_separately(name: str) -> None:
     network = build_network(name)
     network(windows(4))[:, :3].square().sum().backward()
     for key, parameter in network.named_parameters():
@@ -56,7 +56,7 @@ def rnin() -> Rnin:
     return Rnin().eval()
 
 
-def test_rnin_remembers_the_windows_before(rnin: Rnin) -> None:
+def test_rnin_output_depends_on_previous_windows(rnin: Rnin) -> None:
     with torch.inference_mode():
         first, state = rnin.step(windows(1, seed=1), rnin.first_state(windows(1)))
         after = rnin.step(windows(1, seed=2), state)[0]
@@ -65,17 +65,17 @@ def test_rnin_remembers_the_windows_before(rnin: Rnin) -> None:
     assert float((after - alone).abs().max()) > 1e-4
 
 
-def test_rnin_runs_a_chain_at_once_as_step_by_step(rnin: Rnin) -> None:
-    chains = windows(2 * 5).unflatten(0, (2, 5))
+def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step(rnin: Rnin) -> None:
+    series = windows(2 * 5).unflatten(0, (2, 5))
     with torch.inference_mode():
-        at_once = rnin(chains)
-        state = rnin.first_state(chains[:, 0])
+        at_once = rnin(series)
+        state = rnin.first_state(series[:, 0])
         for k in range(5):
-            outputs, state = rnin.step(chains[:, k], state)
+            outputs, state = rnin.step(series[:, k], state)
             torch.testing.assert_close(outputs, at_once[:, k], rtol=1e-4, atol=1e-6)
 
 
-def test_the_noise_layer_takes_a_weighted_copy_of_the_raw_window_off() -> None:
+def test_the_noise_layer_subtracts_a_weighted_copy_of_the_raw_window() -> None:
     layer = NoiseLayer(4)
     features, raw = torch.randn(3, 4), torch.randn(3, 4)
     with torch.no_grad():

@@ -22,11 +22,11 @@ TABLE = {
     "StarIO": (2_761_650, 25_124_210),
 }
 UNCOUNTED = {"I-IMUNet": 2 * 1200, "StarIO without MSGCU": 8 * 2 * 2, "StarIO": 8 * 2 * 2}
-"""Parameters outside any module with a rule: the noise layer; mu and xi of two wings a block."""
+"""Parameters outside modules with a counting rule: noise layer; mu and xi of two wings a block."""
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_counts_are_those_of_the_table(name: str) -> None:
+def test_counts_match_the_table(name: str) -> None:
     assert table_cost(name) == Cost(*TABLE[name])
     network = build_network(name, architecture(name).table_outputs)
     assert sum(p.numel() for p in network.parameters()) == TABLE[name][0] + UNCOUNTED.get(name, 0)
@@ -36,7 +36,7 @@ def test_counts_are_those_of_the_table(name: str) -> None:
 def test_counts_agree_with_the_paper(name: str) -> None:
     published = ARCHITECTURES[name]
     found = table_cost(name)
-    # The paper leaves StarIO's widths open; without the MSGCU the closest is 0.4 % off.
+    # The paper does not specify StarIO's widths; without the MSGCU the closest is 0.4 % off.
     parameters = 4.2e-3 if name == "StarIO without MSGCU" else 0.0
     flops = {"StarIO without MSGCU": 1.5e-3, "StarIO": 1e-4}.get(name, 0.0)
     assert found.parameters / 1e6 == pytest.approx(published.parameters, rel=parameters, abs=5e-4)
@@ -60,7 +60,7 @@ def test_a_module_that_runs_twice_counts_twice_and_its_parameters_once() -> None
     assert cost(twice) == Cost(200 * 200, 2 * 6 * 200 * 200)
 
 
-def test_counting_leaves_no_trace() -> None:
+def test_counting_does_not_change_the_network() -> None:
     network = build_network("DeepILS", 2)
     assert cost(network) == cost(network)
     assert not any(module._forward_hooks for module in network.modules())

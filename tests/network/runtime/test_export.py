@@ -21,14 +21,14 @@ from stario.network.runtime.export import export_onnx  # noqa: E402
 CALIBRATION = Calibration((1.5, 1.5, 0.7), (1.2, 1.2, 0.9), (0.02, 0.02, 0.01))
 
 
-def fresh(name: str) -> DisplacementModel:
+def untrained(name: str) -> DisplacementModel:
     torch.manual_seed(0)
     return DisplacementModel(
         TorchEngine(DisplacementNetwork(build_network(name))), Card(name, calibration=CALIBRATION)
     )
 
 
-def some_windows(count: int) -> FloatArray:
+def random_windows(count: int) -> FloatArray:
     windows = np.random.default_rng(count).standard_normal((count, 6, 200)).astype(np.float32)
     windows[:, 5] += STANDARD_GRAVITY
     return windows
@@ -42,7 +42,7 @@ def assert_parity(model: DisplacementModel, path: Path) -> DisplacementModel:
     export_onnx(model, path)
     exported = load_model(path)
     for count in (1, 3, 70):
-        windows = some_windows(count)
+        windows = random_windows(count)
         for found, expected in zip(exported.predict(windows), model.predict(windows), strict=True):
             assert_close(found, expected)
     return exported
@@ -51,28 +51,28 @@ def assert_parity(model: DisplacementModel, path: Path) -> DisplacementModel:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("export") / "rnin.onnx"
-    export_onnx(fresh("RNIN"), path)
+    export_onnx(untrained("RNIN"), path)
     return path
 
 
-def test_a_star_network_exported_gives_the_same_numbers(
+def test_an_exported_stario_network_gives_the_same_predictions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Tracing takes a second for every block: two different ones here, all of them in slow tests.
+    # Tracing takes a second per block: two different ones here, all of them in slow tests.
     monkeypatch.setattr("stario.network.stario.BLOCKS", (1, 0, 0, 1))
-    exported = assert_parity(fresh("StarIO"), tmp_path / "star.onnx")
+    exported = assert_parity(untrained("StarIO"), tmp_path / "star.onnx")
     assert exported.card.calibration == CALIBRATION
     assert exported.name == "StarIO"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["default", *ARCHITECTURES])
-def test_every_network_exported_gives_the_same_numbers(name: str, tmp_path: Path) -> None:
-    assert_parity(load_model() if name == "default" else fresh(name), tmp_path / "model.onnx")
+def test_every_exported_network_gives_the_same_predictions(name: str, tmp_path: Path) -> None:
+    assert_parity(load_model() if name == "default" else untrained(name), tmp_path / "model.onnx")
 
 
-def test_a_network_that_remembers_does_so_in_both_engines(exported: Path) -> None:
-    windows, model = some_windows(6), fresh("RNIN")
+def test_a_recurrent_network_keeps_its_state_in_both_engines(exported: Path) -> None:
+    windows, model = random_windows(6), untrained("RNIN")
     for found, expected in zip(
         load_model(exported).stateful_inference(2).predict(windows),
         model.stateful_inference(2).predict(windows),
@@ -82,7 +82,7 @@ def test_a_network_that_remembers_does_so_in_both_engines(exported: Path) -> Non
     assert_close(load_model(exported).predict(windows)[0], model.predict(windows)[0])
 
 
-def test_the_file_says_what_its_windows_are(exported: Path) -> None:
+def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> None:
     session = ort.InferenceSession(exported)
     assert [(n.name, n.shape) for n in session.get_inputs()] == [
         ("windows", ["batch", 6, 200]),
@@ -95,7 +95,7 @@ def test_the_file_says_what_its_windows_are(exported: Path) -> None:
     assert '"architecture": "RNIN"' in metadata["stario_card"]
 
 
-def test_a_file_that_is_none_of_ours_is_refused(exported: Path, tmp_path: Path) -> None:
+def test_truncated_absent_and_foreign_files_are_refused(exported: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(exported.read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"broken\.onnx: graph"):
@@ -111,26 +111,26 @@ def test_a_file_that_is_none_of_ours_is_refused(exported: Path, tmp_path: Path) 
         load_model(broken)
 
 
-def test_an_exported_file_cannot_be_trained(exported: Path, tmp_path: Path) -> None:
+def test_an_exported_model_cannot_be_exported_again(exported: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="an exported graph"):
         export_onnx(load_model(exported), tmp_path / "again.onnx")
 
 
-def test_a_model_that_remembers_depends_on_the_order_of_windows(tmp_path: Path) -> None:
-    model = fresh("RNIN")
+def test_a_recurrent_model_depends_on_the_order_of_windows(tmp_path: Path) -> None:
+    model = untrained("RNIN")
     save_model(tmp_path / "rnin.safetensors", model.training_form, model.card)
     loaded = load_model(tmp_path / "rnin.safetensors")
-    windows = some_windows(6)
+    windows = random_windows(6)
     at_once = loaded.stateful_inference(3).predict(windows)[0]
-    track = loaded.stateful_inference(3)
-    process_each = np.concatenate([track.predict(windows[k : k + 1])[0] for k in range(6)])
-    assert np.array_equal(at_once, process_each)
-    # The first window of each series is alone, the others are not.
+    stateful = loaded.stateful_inference(3)
+    one_by_one = np.concatenate([stateful.predict(windows[k : k + 1])[0] for k in range(6)])
+    assert np.array_equal(at_once, one_by_one)
+    # The first window of each series has no predecessor, the others do.
     alone = loaded.predict(windows)[0]
     np.testing.assert_allclose(at_once[:3], alone[:3], atol=1e-5)
     assert (np.abs(at_once[3:] - alone[3:]).max(axis=1) > 1e-5).all()
 
 
-def test_a_model_without_memory_is_its_own_along_a_track() -> None:
-    model = fresh("I-MobileNet")
+def test_a_model_without_memory_is_its_own_stateful_inference() -> None:
+    model = untrained("I-MobileNet")
     assert model.stateful_inference(10) is model

@@ -18,8 +18,8 @@ from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import world_streams
 
 
-def live_in(network: nn.Module) -> None:
-    """Give every norm parameters and statistics that differ from what they start with."""
+def randomise_norms(network: nn.Module) -> None:
+    """Replace the initial parameters and statistics of every norm by random ones."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm1d):
             nn.init.uniform_(module.weight, 0.5, 1.5)
@@ -30,11 +30,11 @@ def live_in(network: nn.Module) -> None:
             module.running_var.uniform_(0.3, 2.0)
 
 
-def lived_in(gated_unit: bool = True, seed: int = 0) -> DisplacementNetwork:
-    """A StarIO whose every parameter and statistic differs from what it starts with."""
+def randomised_network(gated_unit: bool = True, seed: int = 0) -> DisplacementNetwork:
+    """A StarIO whose norms, mu and xi all differ from their initial values."""
     torch.manual_seed(seed)
     network = DisplacementNetwork(StarIO(gated_unit=gated_unit))
-    live_in(network)
+    randomise_norms(network)
     for name, parameter in network.named_parameters():
         if name.endswith((".mu", ".xi")):
             nn.init.uniform_(parameter, -1.5, 1.5)
@@ -48,7 +48,7 @@ def random_windows(batch: int) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def walked_windows() -> Tensor:
+def walk_windows() -> Tensor:
     (stream,) = world_streams(simulate_imu(generate_walk(3, duration=8.0), seed=3))
     return torch.from_numpy(windows_of(stream, 20)[0])
 
@@ -64,22 +64,24 @@ def assert_same(network: DisplacementNetwork, windows: Tensor) -> None:
 @pytest.mark.parametrize("batch", [1, 2, 64])
 @pytest.mark.parametrize("gated_unit", [True, False])
 def test_both_forms_agree_on_random_windows(batch: int, gated_unit: bool) -> None:
-    assert_same(lived_in(gated_unit), random_windows(batch))
+    assert_same(randomised_network(gated_unit), random_windows(batch))
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_both_forms_agree_on_walks(walked_windows: Tensor, seed: int) -> None:
-    assert_same(lived_in(seed=seed), walked_windows)
+def test_both_forms_agree_on_walks(walk_windows: Tensor, seed: int) -> None:
+    assert_same(randomised_network(seed=seed), walk_windows)
 
 
-def test_both_forms_agree_at_rest_and_under_violence() -> None:
+def test_both_forms_agree_at_rest_and_under_violent_motion() -> None:
     rest = torch.zeros(1, 6, 200)
     rest[:, 5] = STANDARD_GRAVITY
-    assert_same(lived_in(), torch.cat([rest, 30.0 * random_windows(2), torch.zeros(1, 6, 200)]))
+    assert_same(
+        randomised_network(), torch.cat([rest, 30.0 * random_windows(2), torch.zeros(1, 6, 200)])
+    )
 
 
 def test_both_forms_clamp_log_sigma() -> None:
-    network = lived_in()
+    network = randomised_network()
     head = network.network.head[-1]  # type: ignore[index, union-attr]
     assert isinstance(head, nn.Linear)
     with torch.no_grad():
@@ -89,16 +91,16 @@ def test_both_forms_clamp_log_sigma() -> None:
     assert (log_sigma[:, 2] == 3.0).all()
 
 
-def test_the_windows_are_left_as_they_are() -> None:
+def test_inference_does_not_modify_its_windows() -> None:
     windows = random_windows(3)
     before = windows.clone()
     with torch.inference_mode():
-        inference_form(lived_in())(windows)
+        inference_form(randomised_network())(windows)
     assert torch.equal(windows, before)
 
 
-def test_later_training_does_not_reach_the_inference_form() -> None:
-    network, windows = lived_in(), random_windows(2)
+def test_later_training_does_not_affect_the_inference_form() -> None:
+    network, windows = randomised_network(), random_windows(2)
     fast = inference_form(network)
     with torch.no_grad():
         before = fast(windows)[0].clone()
@@ -112,12 +114,12 @@ def test_both_forms_of_every_other_network_agree(name: str) -> None:
     torch.manual_seed(0)
     network = DisplacementNetwork(build_network(name))
     with torch.no_grad():
-        live_in(network)
+        randomise_norms(network)
     assert_same(network.eval(), random_windows(3))
 
 
-def test_batches_of_any_size_in_any_order() -> None:
-    network, windows = lived_in(), random_windows(7)
+def test_results_do_not_depend_on_the_size_of_batches() -> None:
+    network, windows = randomised_network(), random_windows(7)
     fast = inference_form(network)
     with torch.inference_mode():
         whole = fast(windows)[0]
@@ -126,16 +128,16 @@ def test_batches_of_any_size_in_any_order() -> None:
             torch.testing.assert_close(torch.cat(parts), whole, rtol=0.0, atol=1e-5)
 
 
-def test_an_answer_stays_when_the_next_one_is_asked() -> None:
-    fast = inference_form(lived_in())
+def test_a_result_is_not_overwritten_by_the_next_call() -> None:
+    fast = inference_form(randomised_network())
     first = fast(random_windows(2))[0]
     kept = first.clone()
     fast(3.0 * random_windows(2))
     assert torch.equal(first, kept)
 
 
-def test_threads_do_not_disturb_each_other() -> None:
-    fast = inference_form(lived_in())
+def test_threads_do_not_affect_each_other() -> None:
+    fast = inference_form(randomised_network())
     batches = [random_windows(2) * scale for scale in (0.5, 1.0, 2.0, 3.0)]
     alone = [fast(batch)[0] for batch in batches]
     with ThreadPoolExecutor(4) as pool:
@@ -143,23 +145,23 @@ def test_threads_do_not_disturb_each_other() -> None:
     assert all(torch.equal(together[k], alone[k % 4]) for k in range(40))
 
 
-def test_the_inference_form_travels_to_another_process() -> None:
-    fast, windows = inference_form(lived_in()), random_windows(2)
+def test_the_inference_form_can_be_pickled() -> None:
+    fast, windows = inference_form(randomised_network()), random_windows(2)
     expected = fast(windows)[0]
     assert torch.equal(pickle.loads(pickle.dumps(fast))(windows)[0], expected)
 
 
 def test_speed_of_both_forms_is_measured_for_each_batch() -> None:
-    speeds = network_speed(lived_in(), batches=(1, 4), runs=2)
+    speeds = network_speed(randomised_network(), batches=(1, 4), runs=2)
     assert [speed.batch for speed in speeds] == [1, 4]
     for speed in speeds:
         assert 0.0 < speed.inference_form_least <= speed.inference_form
         assert 0.0 < speed.training_form_least <= speed.training_form
     with pytest.raises(InputError, match="at least 1"):
-        network_speed(lived_in(), runs=0)
+        network_speed(randomised_network(), runs=0)
 
 
 @pytest.mark.slow
-def test_the_inference_form_is_the_faster_one() -> None:
-    for speed in network_speed(lived_in(), runs=10):
+def test_the_inference_form_is_faster() -> None:
+    for speed in network_speed(randomised_network(), runs=10):
         assert speed.inference_form_least < speed.training_form_least

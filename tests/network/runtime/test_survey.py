@@ -9,22 +9,22 @@ from stario.network.runtime.survey import measured, survey, survey_table
 from stario.sequences.errors import InputError
 
 
-def test_peak_is_what_lives_at_once() -> None:
+def test_peak_memory_is_the_most_that_is_allocated_at_once() -> None:
     def work() -> torch.Tensor:
         a = torch.zeros(1000) + 1.0  # two at once
         b = a * 2.0
         del a
-        c = torch.cat([b, b])  # b and twice its size
+        c = torch.cat([b, b])  # b and a tensor twice as large
         del b
-        return c.view(-1)[:10]  # a view takes nothing
+        return c.view(-1)[:10]  # a view allocates nothing
 
     assert peak_bytes(work) == 3 * 4000
     assert peak_bytes(lambda: None) == 0
 
 
-def test_rows_count_time_and_weigh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_hold_counts_times_and_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 2, 64: 1})
-    # Exporting takes long and is tested elsewhere.
+    # Exporting is slow and tested elsewhere.
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     names = ["I-IMUNet", "StarIO"]
     rows = survey(names, tmp_path)
@@ -32,7 +32,7 @@ def test_rows_count_time_and_weigh(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert [row.numel for row in rows] == [3_661_618, 2_761_682]
     for row in rows:
         weights = 4 * sum(p.numel() for p in build_network(row.name).parameters())
-        # Weights with their norms folded in, and not much beside them for a single window.
+        # Weights with folded norms, and little more for a single window.
         assert 0.97 * weights < 1e6 * row.peak_memory_mb < 1.3 * weights
         assert row.milliseconds["onnxruntime"] is None
         times = row.milliseconds["torch"]

@@ -15,17 +15,17 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, world_streams
 
-NOTHING = Augmentation(
+YAW_ONLY = Augmentation(
     speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,
     accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
 )  # fmt: skip
-"""No range at all, at any yaw; one in two is the mirror image."""
+"""No augmentation except any yaw, and a mirror image of one window in two."""
 
 TO_MIRROR_IMAGE = np.diag([1.0, -1.0, 1.0])
 
 
 def path(speed: float = 1.0, yaw: float = 0.0, mirrored: bool = False) -> Trajectory:
-    """A device on a smooth path that never repeats; traversed faster, turned or mirrored."""
+    """A smooth trajectory that never repeats, at a given speed, rotated by a yaw or mirrored."""
     u = np.arange(0.0, 16.0, 0.01)
     position = np.stack(
         [
@@ -38,14 +38,14 @@ def path(speed: float = 1.0, yaw: float = 0.0, mirrored: bool = False) -> Trajec
     turn = np.stack([np.sin(1.1 * u), 0.8 * np.cos(1.7 * u), 0.9 * u + np.sin(2.3 * u)], axis=1)
     R_WB = Rotation.from_rotvec(turn).as_matrix()
     if mirrored:
-        # A mirror image of the world seen by a device with a mirrored y axis of its own.
+        # The mirror image of the world, seen by a device whose own y axis is mirrored.
         position, R_WB = position @ TO_MIRROR_IMAGE, TO_MIRROR_IMAGE @ R_WB @ TO_MIRROR_IMAGE
     R = Rotation.from_rotvec([0.0, 0.0, yaw])
     return Trajectory(u / speed, R.apply(position), R * Rotation.from_matrix(R_WB))
 
 
 def stream_of(trajectory: Trajectory, name: str = "path") -> WorldStream:
-    """What a perfect IMU measures on the way."""
+    """The measurements of a perfect IMU along a trajectory."""
     recording = simulate_imu(trajectory, errors=PERFECT_IMU, name=name)
     (stream,) = world_streams(recording, attitude="true")
     return stream
@@ -56,7 +56,7 @@ STREAM = stream_of(path())
 
 @dataclass
 class Drawn:
-    """A drawn window (6, 200) with its displacement, and what undoes its yaw and mirror image."""
+    """A drawn window (6, 200) with its displacement, start, and the yaw and mirroring applied."""
 
     window: FloatArray
     displacement: FloatArray
@@ -73,19 +73,19 @@ class Drawn:
         return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
-def drawn(sampler: WindowSampler, references: FloatArray, count: int) -> list[Drawn]:
-    """Draw windows, find where each begins and how it was turned from the window alone.
+def draw_windows(sampler: WindowSampler, references: FloatArray, count: int) -> list[Drawn]:
+    """Draw windows; determine from each window alone where it begins and how it was rotated.
 
     Args:
-        sampler: to draw from.
-        references: (K, 6, 200) windows from every start.
-        count: of the windows.
+        sampler: source of the windows.
+        references: (K, 6, 200) windows at every start.
+        count: number of windows.
     """
     found = []
     for window, displacement in zip(
         *(t.double().numpy() for t in sampler.batch(count)), strict=True
     ):
-        # Neither a yaw nor a mirror image touches the vertical acceleration and the turn rate.
+        # Yaw and mirroring keep the vertical acceleration and the size of the yaw rate.
         distance = np.square(references[:, 5] - window[5])
         distance += np.square(np.abs(references[:, 2]) - np.abs(window[2]))
         start = int(np.argmin(distance.sum(axis=1)))
@@ -101,15 +101,15 @@ def windows_at_every_start(stream: WorldStream) -> tuple[FloatArray, FloatArray]
     return windows.astype(np.float64), displacements.astype(np.float64)
 
 
-def test_without_ranges_windows_are_those_of_the_navigator_turned_or_mirrored() -> None:
+def test_without_ranges_windows_are_rotated_or_mirrored_windows_of_the_navigator() -> None:
     windows, displacements = windows_at_every_start(STREAM)
-    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=0), windows, 32)
+    draws = draw_windows(WindowSampler([STREAM], [1.0], YAW_ONLY, seed=0), windows, 32)
     assert {d.mirrored for d in draws} == {True, False}
-    plain = WindowSampler([STREAM], [1.0], replace(NOTHING, mirrored=0.0), seed=0)
-    draws += (unmirrored := drawn(plain, windows, 32))
+    plain = WindowSampler([STREAM], [1.0], replace(YAW_ONLY, mirrored=0.0), seed=0)
+    draws += (unmirrored := draw_windows(plain, windows, 32))
     assert {d.mirrored for d in unmirrored} == {False}
     for d in draws:
-        # Angular rate is an axial vector: a mirror image turns its sign over.
+        # Angular rate is an axial vector: a mirror image reverses its sign.
         axial = d.turn * np.linalg.det(d.turn)
         np.testing.assert_allclose(d.window[:3], axial @ windows[d.start, :3], atol=1e-5)
         np.testing.assert_allclose(d.window[3:], d.turn @ windows[d.start, 3:], atol=1e-5)
@@ -117,9 +117,9 @@ def test_without_ranges_windows_are_those_of_the_navigator_turned_or_mirrored() 
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_turned_window_is_a_window_of_the_turned_world(mirrored: bool) -> None:
+def test_a_rotated_window_is_a_window_of_the_rotated_world(mirrored: bool) -> None:
     references = windows_at_every_start(STREAM)[0]
-    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=1), references, 32)
+    draws = draw_windows(WindowSampler([STREAM], [1.0], YAW_ONLY, seed=1), references, 32)
     some = [d for d in draws if d.mirrored is mirrored][:3]
     assert len(some) == 3
     for d in some:
@@ -129,11 +129,11 @@ def test_a_turned_window_is_a_window_of_the_turned_world(mirrored: bool) -> None
 
 
 @pytest.mark.parametrize("speed", [0.8, 1.25, 1.6])
-def test_a_replayed_window_is_one_of_the_same_path_traversed_at_that_speed(speed: float) -> None:
+def test_a_replayed_window_is_one_of_the_same_path_at_that_speed(speed: float) -> None:
     windows, displacements = windows_at_every_start(stream_of(path(speed=speed)))
-    replay = Augmentation(**{**vars(NOTHING), "speeds": (speed, speed), "replayed": 1.0})
-    # Starts on the recording's grid fall between the samples of the faster one: take near ones.
-    draws = drawn(WindowSampler([STREAM], [1.0], replay, seed=2), windows, 64)
+    replay = Augmentation(**{**vars(YAW_ONLY), "speeds": (speed, speed), "replayed": 1.0})
+    # Starts on the recording's grid fall between samples of the replay: take only near ones.
+    draws = draw_windows(WindowSampler([STREAM], [1.0], replay, seed=2), windows, 64)
     near = [d for d in draws if np.abs(d.window[5] - windows[d.start, 5]).max() < 2e-3]
     assert len(near) >= 5
     for d in near:
@@ -143,15 +143,15 @@ def test_a_replayed_window_is_one_of_the_same_path_traversed_at_that_speed(speed
         np.testing.assert_allclose(d.displacement, d.turn @ displacements[d.start], atol=2e-3)
 
 
-def test_yaw_covers_the_circle_and_leaves_no_direction_favoured() -> None:
+def test_yaw_is_uniform_over_the_circle() -> None:
     references = windows_at_every_start(STREAM)[0]
-    draws = drawn(WindowSampler([STREAM], [1.0], NOTHING, seed=3), references, 256)
+    draws = draw_windows(WindowSampler([STREAM], [1.0], YAW_ONLY, seed=3), references, 256)
     quadrants = np.bincount([int((d.yaw + np.pi) // (np.pi / 2)) % 4 for d in draws], minlength=4)
     assert quadrants.min() > 256 / 4 - 4 * np.sqrt(256 * 3 / 16)
 
 
 def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
-    """A device at rest, or in a lift at constant speed [m/s]: the IMU shows gravity alone."""
+    """A device at rest, or in a lift at constant speed [m/s]: the IMU measures gravity alone."""
     imu_W = np.zeros((length, 6), np.float32)
     imu_W[:, 5] = STANDARD_GRAVITY
     position_W = np.zeros((length, 3), np.float32)
@@ -160,15 +160,15 @@ def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
 
 
 def facing(length: int) -> NDArray[np.float32]:
-    """Of a level device that heads along x."""
+    """Facing vectors of a level device that heads along x."""
     return np.tile(np.float32([1.0, 0.0]), (length, 1))
 
 
 def only(**ranges: object) -> Augmentation:
-    return Augmentation(**{**vars(NOTHING), **ranges})  # type: ignore[arg-type]
+    return Augmentation(**{**vars(YAW_ONLY), **ranges})  # type: ignore[arg-type]
 
 
-def test_tilt_turns_gravity_and_never_beyond_its_limit() -> None:
+def test_tilt_rotates_gravity_by_no_more_than_its_limit() -> None:
     windows, _ = WindowSampler([resting("rest")], [1.0], only(tilt=0.1), seed=0).batch(256)
     gravity = windows[:, 3:, 0].double()
     np.testing.assert_allclose(gravity.norm(dim=1), STANDARD_GRAVITY, rtol=1e-6)
@@ -209,19 +209,19 @@ def test_the_same_seed_draws_the_same_windows() -> None:
     assert not torch.equal(first[0], first[2])
 
 
-def test_weights_are_per_second_of_a_stream() -> None:
-    # A short lift that goes up and a long one that goes down, the short one three times as dear.
+def test_weights_are_per_second_of_stream() -> None:
+    # A short lift up and a long lift down; the short one has three times the weight.
     streams = [resting("up", 1201, climb=1.0), resting("down", 4201, climb=-1.0)]
-    _, displacement = WindowSampler(streams, [3.0, 1.0], NOTHING, seed=0).batch(2000)
+    _, displacement = WindowSampler(streams, [3.0, 1.0], YAW_ONLY, seed=0).batch(2000)
     share = float((displacement[:, 2] > 0.0).double().mean())
     assert share == pytest.approx(3 * 5 / (3 * 5 + 20), abs=0.05)
 
 
-def test_no_window_reaches_over_the_end_of_its_stream() -> None:
+def test_no_window_extends_past_the_end_of_its_stream() -> None:
     streams = [resting(str(k), 400, climb=1.0) for k in range(8)]
     ranges = only(speeds=(0.6, 1.8), replayed=0.5)
     _, displacement = WindowSampler(streams, [1.0] * 8, ranges, seed=0).batch(2000)
-    # One that did would fall by the height of a stream.
+    # A window that did would fall by the height of a stream.
     assert float(displacement[:, 2].min()) > 0.59
     assert float(displacement[:, 2].max()) < 1.81
 
@@ -232,7 +232,7 @@ def test_a_stream_shorter_than_the_fastest_window_is_refused() -> None:
 
 
 def mapped(stream: WorldStream, folder: Path) -> WorldStream:
-    """The same stream in files that are not read until they are used."""
+    """The same stream in memory-mapped files."""
     for name in ("imu_W", "position_W", "facing_W"):
         np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
     imu_W, position_W, facing_W = (
@@ -252,11 +252,11 @@ def test_memory_mapped_streams_give_the_same_windows(tmp_path: Path) -> None:
             assert torch.equal(expected, found)
 
 
-def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
+def test_ten_hours_on_disk_are_not_loaded_into_memory(tmp_path: Path) -> None:
     statm = Path("/proc/self/statm")
     if not statm.exists():
-        pytest.skip("this system does not say how much memory is resident")
-    rows = 10 * 3600 * 200  # 260 MB; a file of zeros that takes no room on the disk
+        pytest.skip("this system does not report resident memory")
+    rows = 10 * 3600 * 200  # 317 MB in files of zeros that take no space on the disk
     imu_W, position_W, facing_W = (
         np.memmap(tmp_path / str(width), np.float32, "w+", shape=(rows, width))
         for width in (6, 3, 2)
@@ -269,55 +269,55 @@ def test_ten_hours_on_disk_are_not_loaded(tmp_path: Path) -> None:
     assert int(statm.read_text().split()[1]) - before < 25_000  # pages of 4 kB
 
 
-def test_windows_in_a_row_follow_each_other_and_are_varied_as_one() -> None:
+def test_successive_windows_are_contiguous_and_share_one_augmentation() -> None:
     ranges = only(gyro_bias=0.05, accel_bias=0.2, tilt=0.1)
     sampler = WindowSampler([resting("lift", 2400, climb=1.0)], [1.0], ranges, 0, successive=5)
     windows, displacement = sampler.batch(16)
     assert windows.shape == (16, 5, 6, 200)
-    # One tilt and one bias for all of a row, another for the next row.
+    # One tilt and one bias for all windows of a row, others for the next row.
     torch.testing.assert_close(windows, windows[:, :1].expand_as(windows))
     assert float((windows[0] - windows[1]).abs().max()) > 1e-3
     torch.testing.assert_close(displacement[..., 2], torch.ones(16, 5), atol=1e-4, rtol=0.0)
 
 
-def test_windows_in_a_row_are_those_of_the_path_turned() -> None:
+def test_successive_windows_are_those_of_the_rotated_path() -> None:
     windows, displacements = windows_at_every_start(STREAM)
-    rows, moved = WindowSampler([STREAM], [1.0], NOTHING, 3, successive=4).batch(6)
+    rows, moved = WindowSampler([STREAM], [1.0], YAW_ONLY, 3, successive=4).batch(6)
     for row, moves in zip(rows.double().numpy(), moved.double().numpy(), strict=True):
         distance = np.square(windows[:, 5] - row[0, 5])
         start = int(np.argmin(distance.sum(axis=1)))
         for k in range(4):
-            there = start + k * WINDOW_SAMPLES
-            # Neither a yaw nor a mirror image touches the vertical and the length of a way.
-            np.testing.assert_allclose(row[k, 5], windows[there, 5], atol=1e-5)
-            np.testing.assert_allclose(moves[k, 2], displacements[there, 2], atol=1e-5)
-            lengths = [np.linalg.norm(d[:2]) for d in (moves[k], displacements[there])]
+            index = start + k * WINDOW_SAMPLES
+            # Yaw and mirroring keep vertical components and lengths.
+            np.testing.assert_allclose(row[k, 5], windows[index, 5], atol=1e-5)
+            np.testing.assert_allclose(moves[k, 2], displacements[index, 2], atol=1e-5)
+            lengths = [np.linalg.norm(d[:2]) for d in (moves[k], displacements[index])]
             assert lengths[0] == pytest.approx(lengths[1], abs=1e-5)
 
 
-def test_a_swing_goes_on_from_one_window_to_the_next() -> None:
+def test_a_swing_continues_from_one_window_to_the_next() -> None:
     swinging = only(swung=1.0, swing_rate=2.5, lever=0.35)
     windows, displacement = WindowSampler(
         [resting("rest", 2400)], [1.0], swinging, 0, successive=3
     ).batch(8)
-    # Each window has a heading of its own, which touches neither the vertical nor lengths.
-    told = torch.stack([*(windows[:, :, k] for k in (2, 5)), windows[:, :, :2].norm(dim=2)])
-    seam = (told[:, :, 1:, 0] - told[:, :, :-1, -1]).abs().max()
+    # Each window has its own heading, which affects neither vertical components nor lengths.
+    invariant = torch.stack([*(windows[:, :, k] for k in (2, 5)), windows[:, :, :2].norm(dim=2)])
+    seam = (invariant[:, :, 1:, 0] - invariant[:, :, :-1, -1]).abs().max()
     assert float(displacement.norm(dim=-1).max()) > 0.05
     assert float(seam) < 0.2  # a sample's change, not a jump to another swing
 
 
-def test_a_window_looks_the_same_whichever_way_the_device_points() -> None:
-    """Shown in the device's heading frame, a path and its turned copy give the same batch."""
+def test_windows_do_not_depend_on_where_the_device_points() -> None:
+    """In the device's heading frame, a path and its rotated copy give the same batch."""
     plain = only(any_yaw=0.0, yaw=0.0)
-    turned = stream_of(path(yaw=2.0))
-    first, second = (WindowSampler([s], [1.0], plain, seed=4).batch(16) for s in (STREAM, turned))
+    rotated = stream_of(path(yaw=2.0))
+    first, second = (WindowSampler([s], [1.0], plain, seed=4).batch(16) for s in (STREAM, rotated))
     for a, b in zip(first, second, strict=True):
         torch.testing.assert_close(a, b, atol=5e-3, rtol=1e-3)
 
 
-def test_swinging_a_device_turns_its_heading_along() -> None:
-    """At rest and swung about the vertical the rate is all there is to see; H turns with it."""
+def test_a_swing_rotates_the_heading_of_the_device() -> None:
+    """The heading of a level device rotates by the mean vertical component of the swing's angle."""
     generator = torch.Generator().manual_seed(0)
     swings = sample_swing(64, 1.0, 2.0, 0.0, generator)
     level = torch.zeros(64, 1, 10, 2)

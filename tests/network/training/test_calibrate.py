@@ -8,7 +8,7 @@ TRUE_SCALE = np.array([1.7, 1.7, 0.4])
 
 
 def errors_and_log_sigmas(count: int = 20_000) -> tuple[FloatArray, FloatArray]:
-    """Gaussian errors whose deviation is TRUE_SCALE times what the network believes."""
+    """Gaussian errors whose deviation is TRUE_SCALE times the network's sigma."""
     rng = np.random.default_rng(0)
     log_sigma = rng.uniform(np.log(0.1), np.log(1.0), (count, 3))
     return TRUE_SCALE * np.exp(log_sigma) * rng.standard_normal((count, 3)), log_sigma
@@ -41,7 +41,7 @@ def test_horizontal_axes_share_their_factor() -> None:
     assert x == y
 
 
-def test_a_few_wild_errors_do_not_rule() -> None:
+def test_a_few_outliers_do_not_determine_the_scale() -> None:
     error, log_sigma = errors_and_log_sigmas()
     error[::200] *= 1000.0
     np.testing.assert_allclose(calibrate(error, log_sigma).scale, TRUE_SCALE, rtol=0.15)

@@ -20,28 +20,28 @@ def stream(name: str, samples: int) -> WorldStream:
 
 
 def test_the_last_fifth_of_each_recording_is_held_out() -> None:
-    recordings = of([stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], [])
+    recordings = recordings_of([stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], [])
     first, last = (list(chain(*(r.streams for r in part))) for part in split_off(recordings))
     assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
     assert [(s.name, len(s)) for s in last] == [("a", 2000), ("b", 1000)]
     assert last[0].imu_W[0, 0] == 2000  # where the first part ends
 
 
-def test_scraps_too_short_to_cut_windows_from_are_lost() -> None:
-    first, last = split_off(of([stream("a", 1500)]))
+def test_parts_too_short_for_windows_are_dropped() -> None:
+    first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
     assert not last[0].streams
 
 
-def test_kinds_of_streams_make_up_their_shares() -> None:
-    recorded = of([stream("a", 3000), stream("a", 1000)])
+def test_recorded_and_generated_streams_get_their_shares() -> None:
+    recorded = recordings_of([stream("a", 3000), stream("a", 1000)])
     material = mix_sources(recorded, [stream("c", 700)], {SIMULATED: 0.05})
     drawn = np.array([len(s) for s in material.streams]) * material.weights
     assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
     assert material.words[0].startswith("recorded")
 
 
-def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> None:
+def test_named_sources_get_their_shares_whatever_their_length() -> None:
     recorded = [
         RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
         RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
@@ -57,8 +57,8 @@ def test_sources_that_are_named_make_up_their_shares_whatever_their_length() -> 
         mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
 
 
-def drawn(material: TrainingData, reach: int = 1) -> dict[str, float]:
-    """Share of the windows that are drawn from streams of each name."""
+def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
+    """Share of drawn windows by name of stream."""
     found: dict[str, float] = {}
     for one, weight in zip(material.streams, material.weights, strict=True):
         starts = max(0, len(one) - reach + 1)
@@ -66,21 +66,21 @@ def drawn(material: TrainingData, reach: int = 1) -> dict[str, float]:
     return {name: value / sum(found.values()) for name, value in found.items()}
 
 
-def test_what_is_named_but_absent_leaves_its_share_to_the_other_recordings() -> None:
+def test_the_share_of_an_absent_source_goes_to_the_other_recordings() -> None:
     recorded = [
         RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
         RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
     ]
     shares = {"ridi": 0.2, "kipd": 0.5, SIMULATED: 0.1}
-    found = drawn(mix_sources(recorded, [moving("c", 1.0)], shares))
+    found = drawn_shares(mix_sources(recorded, [moving("c", 1.0)], shares))
     assert found["c"] == pytest.approx(0.1)
     assert found["x"] == pytest.approx(0.9 * 0.4)
-    alone = drawn(mix_sources(recorded[:1], [moving("c", 1.0)], shares))
+    alone = drawn_shares(mix_sources(recorded[:1], [moving("c", 1.0)], shares))
     assert alone["c"] == pytest.approx(0.1)
 
 
-def test_shares_are_of_the_windows_that_can_be_drawn() -> None:
-    """Of stretches hardly longer than a window few are: they are drawn the more often."""
+def test_shares_count_the_windows_that_can_be_drawn() -> None:
+    """Stretches hardly longer than a window hold few windows, which are drawn more often."""
     whole = moving("y", 1.0)
     recorded = [
         RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
@@ -88,12 +88,12 @@ def test_shares_are_of_the_windows_that_can_be_drawn() -> None:
         RecordingStreams(Path("a/tyrex.h5:w"), [moving("w", 1.0).part(0, 300)]),
     ]
     shares = {"ridi": 0.3, "kipd": 0.3, "tyrex": 0.4}
-    found = drawn(mix_sources(recorded, [], shares, reach=361), reach=361)
+    found = drawn_shares(mix_sources(recorded, [], shares, reach=361), reach=361)
     assert found == {"x": pytest.approx(0.5), "y": pytest.approx(0.5), "w": 0.0}
 
 
 def test_shares_that_leave_nothing_are_refused() -> None:
-    recorded = of([moving("x", 1.0)])
+    recorded = recordings_of([moving("x", 1.0)])
     for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
         with pytest.raises(ConfigError, match="shares: found 0 for every"):
             mix_sources([] if generated else recorded, generated, given)
@@ -102,13 +102,13 @@ def test_shares_that_leave_nothing_are_refused() -> None:
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
-def of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
+def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
     return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 
 
-def test_lively_recordings_are_drawn_more_often() -> None:
+def test_recordings_with_more_motion_are_drawn_more_often() -> None:
     calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = mix_sources(of([calm], [lively]), [])
+    material = mix_sources(recordings_of([calm], [lively]), [])
     assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
     assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 

@@ -1,4 +1,4 @@
-"""A swing's rate, acceleration and displacement belong to one motion."""
+"""Angular rate, acceleration and displacement of a swing are those of one motion."""
 
 import pytest
 import torch
@@ -14,18 +14,18 @@ def at_rest(size: int) -> torch.Tensor:
     return imu
 
 
-def drawn(size: int, share: float = 1.0) -> Swing:
-    drawn = sample_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
-    angle = Sines(*(value.double() for value in vars(drawn.angle).values()))
-    return Swing(drawn.axis.double(), drawn.lever.double(), angle)
+def draw_swing(size: int, share: float = 1.0) -> Swing:
+    swing = sample_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
+    angle = Sines(*(value.double() for value in vars(swing.angle).values()))
+    return Swing(swing.axis.double(), swing.lever.double(), angle)
 
 
 def test_acceleration_integrates_to_the_displacement() -> None:
-    swing = drawn(64)
+    swing = draw_swing(64)
     imu, displacement = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
-    # The velocity a window begins with is omega x r.
+    # The initial velocity of a window is omega x r.
     now = torch.zeros(1, dtype=torch.float64)
-    lever = turned(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
+    lever = rotated(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
     velocity = torch.linalg.cross(imu[:, 0, :3], lever)
     accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
@@ -37,38 +37,38 @@ def test_acceleration_integrates_to_the_displacement() -> None:
     assert (moved - displacement[:, 0]).abs().max() < 2e-3
 
 
-def test_rate_and_lever_belong_to_one_rotation() -> None:
+def test_rate_and_acceleration_belong_to_one_rotation() -> None:
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
-    swing = drawn(64)
+    swing = draw_swing(64)
     imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
-    lever = turned(swing.lever, swing.axis, alpha)
+    lever = rotated(swing.lever, swing.axis, alpha)
     gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     velocity = torch.linalg.cross(gyro, lever)
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
 
 
 def test_no_swing_is_faster_than_its_bound() -> None:
-    swing = drawn(512)
+    swing = draw_swing(512)
     time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
     assert 1.5 < swing.angle.at(time)[1].abs().max() <= 2.5
 
 
-def test_what_is_not_swung_stays_as_it_is() -> None:
+def test_windows_without_a_swing_are_unchanged() -> None:
     imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     displacement = torch.ones(16, 1, 3, dtype=torch.float64)
-    after, moved = apply_swing(imu, displacement, drawn(16, share=0.0))
+    after, moved = apply_swing(imu, displacement, draw_swing(16, share=0.0))
     assert torch.allclose(after, imu, atol=1e-12)
     assert torch.equal(moved, displacement)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.75])
-def test_the_share_of_swung_windows(share: float) -> None:
-    swing = drawn(4000, share)
+def test_the_share_of_swung_windows_is_as_requested(share: float) -> None:
+    swing = draw_swing(4000, share)
     assert (swing.angle.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
 
 
-def turned(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+def rotated(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     skew = torch.linalg.cross(
         axis[:, None, :].expand(-1, 3, -1), torch.eye(3, dtype=axis.dtype).expand(len(axis), 3, 3)
     ).mT

@@ -57,7 +57,7 @@ def launched(script: Path, folder: Path, processes: int, network: str, stop: int
     return done.returncode
 
 
-def reports(folder: Path) -> list[float]:
+def epoch_errors(folder: Path) -> list[float]:
     """Training and validation error of each epoch."""
     log = json.loads((folder / "log.json").read_text())
     return [r[name] for r in log for name in ("training_error", "validation_error")]
@@ -65,32 +65,32 @@ def reports(folder: Path) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("network", "tolerance"), [("plain", 1e-4), ("TLIO", 0.25)])
-def test_two_processes_train_as_one_does(network: str, tolerance: float, tmp_path: Path) -> None:
-    """To rounding without batch norms; these see half a batch each."""
+def test_two_processes_train_like_one(network: str, tolerance: float, tmp_path: Path) -> None:
+    """Equal up to rounding without batch norms, which see half a batch in each process."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     one, two, again = (tmp_path / name for name in ("one", "two", "again"))
     launched(script, one, 1, network)
     launched(script, two, 2, network)
-    assert reports(two) == pytest.approx(reports(one), rel=tolerance)
-    # Killed in the second epoch and launched again: the same as without.
+    assert epoch_errors(two) == pytest.approx(epoch_errors(one), rel=tolerance)
+    # Killed in the second epoch and launched again: the same as without a kill.
     assert launched(script, again, 2, network, stop=6) != 0
-    assert len(reports(again)) == 2
+    assert len(epoch_errors(again)) == 2
     launched(script, again, 2, network)
     weights = [safetensors.torch.load_file(f / "model.safetensors") for f in (two, again)]
     for name, value in weights[0].items():
         torch.testing.assert_close(weights[1][name], value, rtol=1e-4, atol=1e-6)
 
 
-def test_without_a_launcher_there_is_one_process_that_leads() -> None:
-    with workers("cpu", 7) as these:
-        assert these.is_leader
-        assert these.mean(3.0) == these.broadcast(3.0) == 3.0
+def test_without_a_launcher_the_only_process_is_the_leader() -> None:
+    with workers("cpu", 7) as group:
+        assert group.is_leader
+        assert group.mean(3.0) == group.broadcast(3.0) == 3.0
         batch = torch.arange(7)
-        assert torch.equal(these.share(batch), batch)
+        assert torch.equal(group.share(batch), batch)
 
 
-def test_a_batch_that_cannot_be_shared_out_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(ConfigError, match="7 for 2 processes"), workers("cpu", 7):
         pass

@@ -1,4 +1,4 @@
-"""The recipe: what it refuses, its rate over the steps, its loss."""
+"""The recipe: its refusals, its learning rate over the steps, its loss."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from stario.network.training.config import (
 from stario.sequences.errors import ConfigError
 
 
-def test_the_rate_warms_up_and_falls() -> None:
+def test_the_learning_rate_warms_up_and_decays() -> None:
     config = TrainingConfig(epochs=100, epoch_windows=128, batch=16, warm_up=0.1, rate=1.0)
     rates = [learning_rate(config, step) for step in range(config.steps)]
     peak = int(np.argmax(rates))
@@ -27,14 +27,14 @@ def test_the_rate_warms_up_and_falls() -> None:
     assert 0.0 < rates[-1] < 0.02
 
 
-def test_the_loss_is_least_at_the_true_sigma() -> None:
+def test_the_loss_is_minimal_at_the_true_sigma() -> None:
     squared = torch.full((1, 3), 0.09)
     log_sigma = torch.full((1, 3), math.log(0.3), requires_grad=True)
     loss_with_sigma(squared, log_sigma).backward()
     torch.testing.assert_close(log_sigma.grad, torch.zeros(1, 3), atol=1e-6, rtol=0.0)
 
 
-def test_sigma_takes_nothing_from_the_mean() -> None:
+def test_sigma_does_not_affect_the_gradient_of_the_mean() -> None:
     """The mean's gradient is that of the squared error, whatever sigma is."""
     for sigma in (0.01, 1.0):
         squared = torch.full((1, 3), 0.04, requires_grad=True)
@@ -62,13 +62,13 @@ def test_sigma_takes_nothing_from_the_mean() -> None:
         ({"augmentation": {"speeds": ["slow", "fast"]}}, "augmentation.speeds"),
     ],
 )
-def test_a_recipe_that_does_not_fit_is_refused(values: dict[str, object], field: str) -> None:
+def test_an_invalid_recipe_is_refused(values: dict[str, object], field: str) -> None:
     with pytest.raises(ConfigError) as caught:
         training_config(values)
     assert caught.value.field == field
 
 
-def test_a_recipe_survives_json() -> None:
+def test_a_recipe_survives_a_round_trip_through_json() -> None:
     values = json.loads(json.dumps({"batch": 8, "augmentation": {"speeds": [0.7, 1.5]}}))
     config = training_config(values)
     assert config.batch == 8

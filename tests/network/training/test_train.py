@@ -43,13 +43,13 @@ TINY = TrainingConfig(
 
 
 def swaying(name: str, phase: float, seconds: float = 20.0) -> WorldStream:
-    """A device on a swing of period 2 s, whose acceleration tells its displacement."""
+    """A device on a swing of period 2 s, whose acceleration determines its displacement."""
     t = np.arange(round(200 * seconds)) / 200.0
-    way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
+    position = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
     imu_W = np.zeros((len(t), 6), np.float32)
-    imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, STANDARD_GRAVITY]
+    imu_W[:, 3:] = -(np.pi**2) * position + [0.0, 0.0, STANDARD_GRAVITY]
     facing_W = np.tile(np.float32([1.0, 0.0]), (len(t), 1))
-    return WorldStream(name, imu_W, way.astype(np.float32), facing_W)
+    return WorldStream(name, imu_W, position.astype(np.float32), facing_W)
 
 
 STREAMS = [swaying("a", 0.3), swaying("b", 1.2)]
@@ -70,7 +70,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Epoch
 
 @pytest.fixture
 def model(finished: tuple[Path, list[EpochReport]], tmp_path: Path) -> Path:
-    """A copy of the trained model and its card, to be spoilt."""
+    """A copy of the trained model and its card."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(finished[0].read_bytes())
     card_path(path).write_bytes(card_path(finished[0]).read_bytes())
@@ -81,14 +81,14 @@ def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
     reports = finished[1]
     assert [r.epoch for r in reports] == [1, 2, 3, 4]
     assert reports[-1].training_error < 0.75 * reports[0].training_error
-    # Far better than to say that nothing moves.
+    # Far better than a prediction of no motion.
     displacement = windows_of(VALIDATION[0], 20)[1]
     assert reports[-1].validation_error < 0.5 * np.mean(np.sum(displacement**2, axis=1))
     assert list(reports[-1].validation_by_recording) == ["c", "d"]
 
 
-def test_an_epoch_tells_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that goes on by a second whenever it is read."""
+def test_an_epoch_reports_its_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr("stario.network.training.run.perf_counter", lambda: float(next(clock)))
     reports: list[EpochReport] = []
@@ -97,7 +97,7 @@ def test_an_epoch_tells_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert reports[0].drawing_share == 0.5
 
 
-def test_the_model_predicts_what_it_was_validated_on(
+def test_the_model_reproduces_its_validation_error(
     finished: tuple[Path, list[EpochReport]],
 ) -> None:
     path, reports = finished
@@ -109,22 +109,22 @@ def test_the_model_predicts_what_it_was_validated_on(
         error = np.mean(np.sum((model.predict(windows)[0] - truth) ** 2, axis=1))
         kept = model.card.figures["validation_mse_m2"][stream.name]
         assert error == pytest.approx(kept, rel=1e-3)
-        # What is kept is the best epoch of the likelihood's, not the last one of all.
+        # The best epoch trained with the likelihood is kept, not the last epoch.
         assert any(kept == r.validation_by_recording[stream.name] for r in reports[2:])
 
 
-def test_sigma_is_calibrated_as_it_is_predicted(tmp_path: Path) -> None:
-    """Validated on what is strange to the weights: predictions are widened, and yet as they err.
+def test_sigma_is_calibrated_with_the_widening_for_unfamiliar_motion(tmp_path: Path) -> None:
+    """On unfamiliar validation data, covariances are widened and still match the errors.
 
-    A squared error counts up to 25 of its variances, as in the calibration.
+    Squared errors are limited to 25 variances, as in the calibration.
     """
     streams = [swaying("a", 0.3, 40.0), swaying("b", 1.2, 40.0)]
-    strange = swaying("c", 0.8, 30.0)
-    strange.imu_W[:, :3] = np.random.default_rng(0).standard_normal((6000, 3))
-    path = train(replace(TINY, epochs=2), streams, [1.0, 1.0], [strange], tmp_path)
+    unfamiliar = swaying("c", 0.8, 30.0)
+    unfamiliar.imu_W[:, :3] = np.random.default_rng(0).standard_normal((6000, 3))
+    path = train(replace(TINY, epochs=2), streams, [1.0, 1.0], [unfamiliar], tmp_path)
     model = load_model(path)
     assert model.card.known_motion is not None
-    windows, truth = windows_of(strange, 20)
+    windows, truth = windows_of(unfamiliar, 20)
     assert model.card.known_motion.variance_factor(windows).min() == OUTSIDE_VARIANCE
     mean, covariance = model.predict(windows)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
@@ -132,8 +132,8 @@ def test_sigma_is_calibrated_as_it_is_predicted(tmp_path: Path) -> None:
     assert normalised[:, :2].mean() == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_likelihood_teaches_sigma(finished: tuple[Path, list[EpochReport]]) -> None:
-    """Squared error alone leaves the weights that give sigma without a gradient."""
+def test_only_the_likelihood_trains_sigma(finished: tuple[Path, list[EpochReport]]) -> None:
+    """The squared error alone gives the weights of sigma no gradient."""
     path, _ = finished
     with safetensors.safe_open(path.parent / "checkpoint.safetensors", framework="pt") as file:
         moment = file.get_tensor(f"optimiser.{_index_of_last_bias(file)}.exp_avg")
@@ -169,20 +169,20 @@ def test_a_killed_and_resumed_run_gives_the_same_weights(
         assert torch.equal(resumed[name], value), name
 
 
-@pytest.mark.parametrize(("spoilt", "kept"), [({3}, {4}), ({4}, {3}), ({3, 4}, {1, 2})])
+@pytest.mark.parametrize(("without_error", "kept"), [({3}, {4}), ({4}, {3}), ({3, 4}, {1, 2})])
 def test_an_epoch_without_a_finite_error_is_never_the_best(
     finished: tuple[Path, list[EpochReport]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    spoilt: set[int],
+    without_error: set[int],
     kept: set[int],
 ) -> None:
-    """The likelihood begins with epoch 3; with nothing of its own it keeps what was before."""
-    whole, epoch = ValidationSet.errors, count(1)
+    """The likelihood begins with epoch 3; an earlier epoch is kept if it has no finite error."""
+    original, epoch = ValidationSet.errors, count(1)
 
     def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
-        found = whole(self, *arguments)
-        return found | {"c": math.nan} if next(epoch) in spoilt else found
+        found = original(self, *arguments)
+        return found | {"c": math.nan} if next(epoch) in without_error else found
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
     model = load_model(run(tmp_path))
@@ -190,14 +190,14 @@ def test_an_epoch_without_a_finite_error_is_never_the_best(
     assert model.card.figures["validation_mse_m2"] in choice
 
 
-def test_of_a_short_run_the_epoch_that_learned_sigma_is_kept(
+def test_a_short_run_keeps_the_epoch_that_trained_sigma(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sigma joins within the second of two epochs, whose error is the larger one here."""
-    whole, epoch = ValidationSet.errors, count(1)
+    """Training of sigma begins within the second of two epochs, which has the larger error here."""
+    original, epoch = ValidationSet.errors, count(1)
 
     def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
-        return whole(self, *arguments) | {"c": float(next(epoch))}
+        return original(self, *arguments) | {"c": float(next(epoch))}
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
     path = run(tmp_path, replace(TINY, epochs=2, epoch_windows=32, likelihood_from=0.6))
@@ -206,15 +206,15 @@ def test_of_a_short_run_the_epoch_that_learned_sigma_is_kept(
     assert all(torch.equal(state[f"averaged.network.{k}"], v) for k, v in kept.items())
 
 
-def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(tmp_path: Path) -> None:
-    spoilt = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
+def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path: Path) -> None:
+    corrupted = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
 
-    def spoil(report: EpochReport) -> None:
-        for stream in spoilt:
+    def corrupt(report: EpochReport) -> None:
+        for stream in corrupted:
             stream.imu_W[:] = np.nan
 
     with pytest.raises(InputError, match=r"loss: found nan .* in step 9.*`rate` below 0\.001"):
-        train(TINY, spoilt, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=spoil)
+        train(TINY, corrupted, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=corrupt)
     state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
     assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
     assert not (tmp_path / "model.safetensors").exists()
@@ -223,7 +223,7 @@ def test_a_loss_that_is_not_finite_stops_before_it_spoils_anything(tmp_path: Pat
     assert [r.epoch for r in reports] == [2, 3, 4]
 
 
-def test_a_finished_run_is_not_trained_on(
+def test_a_finished_run_is_not_trained_further(
     finished: tuple[Path, list[EpochReport]], tmp_path: Path
 ) -> None:
     checkpoint = tmp_path / "checkpoint.safetensors"
@@ -234,7 +234,7 @@ def test_a_finished_run_is_not_trained_on(
     assert path.read_bytes() == finished[0].read_bytes()
 
 
-def test_a_finished_run_says_that_nothing_is_trained(
+def test_a_finished_run_logs_that_all_epochs_are_done(
     finished: tuple[Path, list[EpochReport]], caplog: pytest.LogCaptureFixture
 ) -> None:
     run(finished[0].parent, trained_on=["swings"])
@@ -284,7 +284,7 @@ def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
         train(TINY, [], [], VALIDATION, tmp_path)
 
 
-def test_stretches_too_short_for_the_fastest_replay_are_left_out(
+def test_stretches_too_short_for_the_fastest_replay_are_skipped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     fast = replace(TINY, epochs=1, epoch_windows=16, augmentation=Augmentation(speeds=(0.6, 1.8)))
@@ -295,7 +295,7 @@ def test_stretches_too_short_for_the_fastest_replay_are_left_out(
         train(fast, [short], [1.0], VALIDATION, tmp_path / "b")
 
 
-def test_a_checkpoint_from_before_windows_in_a_row_goes_on(
+def test_a_checkpoint_without_the_setting_successive_is_resumed(
     finished: tuple[Path, list[EpochReport]], tmp_path: Path
 ) -> None:
     path = finished[0].parent / "checkpoint.safetensors"
@@ -312,27 +312,27 @@ def test_a_checkpoint_from_before_windows_in_a_row_goes_on(
     assert run(tmp_path, trained_on=["swings"]).read_bytes() == finished[0].read_bytes()
 
 
-def test_a_network_that_remembers_learns_from_windows_in_a_row(tmp_path: Path) -> None:
+def test_a_recurrent_network_is_trained_on_successive_windows(tmp_path: Path) -> None:
     values = {"architecture": "RNIN", "epochs": 1, "epoch_windows": 40, "batch": 20}
     config = training_config({**values, "device": "cpu", "likelihood_from": 0.0})
     assert config.successive == 10
-    # A step changes the weights that only a state which is not zero reaches.
+    # A step changes the weights that act only on a nonzero state.
     path = run(tmp_path / "row", config)
     assert load_model(path).stateful_inference(2) is not None
     first = DisplacementNetwork(build_network_of(config)).state_dict()
     last = safetensors.torch.load_file(path)
     change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
     assert float(change.abs().max()) > 0.0
-    # Streams shorter than ten seconds cannot give any.
+    # Streams shorter than ten seconds hold no ten successive windows.
     with pytest.raises(InputError, match="streams: found none with 3601 samples"):
         train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
 
 
 @pytest.mark.parametrize(("dense", "stride", "minutes"), [(200, 40, 7), (140, 50, 7), (15, 200, 4)])
-def test_hours_are_validated_a_second_apart_by_a_network_that_remembers(
+def test_long_validation_data_are_thinned_by_minutes_for_recurrent_networks(
     monkeypatch: pytest.MonkeyPatch, dense: int, stride: int, minutes: int
 ) -> None:
-    """Of seven minutes in two recordings the first and every so many are asked."""
+    """Of seven minutes in two recordings, the first of each and every n-th after it are used."""
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
     cpu = torch.device("cpu")
@@ -351,7 +351,7 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
     return build_network(config.architecture)
 
 
-def test_a_last_stage_starts_from_weights_and_takes_a_calibration_over(
+def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     model: Path, tmp_path: Path
 ) -> None:
     first = load_model(model)

@@ -1,4 +1,4 @@
-"""The leg loss: what it does not see (yaw), what it sees (length), and what it weighs how."""
+"""The leg loss: its invariance to yaw, its sensitivity to length, and its weights."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def truth_of(walk: ImuSequence) -> Trajectory:
     return walk.truth
 
 
-def known(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
-    """The walk with positions in place of poses, on a map that is turned."""
+def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
+    """The walk with positions in place of poses, on a map rotated by a yaw [rad]."""
     time = np.arange(1.0, 58.0, every)
     position = truth_of(WALK).at(time).position_W
     c, s = np.cos(yaw), np.sin(yaw)
-    turned = position @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    rotated = position @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
     columns = 2 if kind == "waypoints" else 3
-    track = PositionTrack(time, turned[:, :columns], kind)  # type: ignore[arg-type]
+    track = PositionTrack(time, rotated[:, :columns], kind)  # type: ignore[arg-type]
     return replace(WALK, truth=None, positions=track)
 
 
@@ -63,14 +63,14 @@ def batch_of(recording: ImuSequence, augmentation: Augmentation = PLAIN) -> LegB
 
 
 class Truth:
-    """The true displacements of stretches, found by their windows, as the network would answer."""
+    """True displacements of stretches, found by their windows, as a network would predict them."""
 
     def __init__(self, recording: ImuSequence) -> None:
         [self.stream] = leg_streams(recording)
         [self.world] = world_streams(WALK, attitude="true")
 
     def __call__(self, batch: LegBatch) -> torch.Tensor:
-        """(S, K, 3) in the frame that each window is shown in."""
+        """Return (S, K, 3) displacements, each in the frame of its window."""
         found = []
         for windows, R_NH in zip(batch.windows, batch.R_NH, strict=True):
             begin = self._begin(windows[0].numpy())
@@ -81,13 +81,13 @@ class Truth:
         return torch.tensor(np.stack(found), dtype=torch.float32)
 
     def _begin(self, window: FloatArray) -> float:
-        """The vertical force tells where a window begins, whichever way it is turned."""
+        """Return where a window begins [s], from the vertical force, which no yaw changes."""
         found = np.flatnonzero(np.abs(self.stream.imu_N[:-200, 5] - window[5, 0]) < 1e-4)
         off = [np.abs(self.stream.imu_N[k : k + 200, 5] - window[5]).max() for k in found]
         return float(found[np.argmin(off)]) / 200.0
 
     def _R_NW(self, begin: float) -> FloatArray:
-        """Yaw between the levelled frame and the world, from one of the gyroscope's vectors."""
+        """Return the rotation from the world to the levelled frame, from the horizontal force."""
         k = round(begin * 200)
         part = slice(k, k + 2000)
         a, b = (x[part, 3] + 1j * x[part, 4] for x in (self.world.imu_W, self.stream.imu_N))
@@ -97,14 +97,14 @@ class Truth:
 
 
 @pytest.mark.parametrize(("kind", "every"), [("positions", 0.1), ("waypoints", 4.0)])
-def test_true_displacements_leave_no_residual_on_a_turned_map(kind: str, every: float) -> None:
-    recording = known(kind, every, yaw=2.0)
+def test_true_displacements_leave_no_residual_on_a_rotated_map(kind: str, every: float) -> None:
+    recording = with_positions(kind, every, yaw=2.0)
     for augmentation in (PLAIN, replace(PLAIN, yaw=0.5, any_yaw=0.3)):
         batch = batch_of(recording, augmentation)
         assert int(batch.known.sum(1).min()) >= 2
-        told_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
-        residual = leg_residuals(told_N, batch)
-        # Ends within a window are reached as if its speed were even, which a start is not.
+        predicted_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+        residual = leg_residuals(predicted_N, batch)
+        # Ends within a window are interpolated at constant speed, which a start does not have.
         size = residual[..., :2].norm(dim=-1)[batch.known]
         assert float(size.median()) < 0.1
         assert float(size.max()) < 0.6
@@ -112,39 +112,39 @@ def test_true_displacements_leave_no_residual_on_a_turned_map(kind: str, every: 
         assert longest > 2.0
 
 
-def test_a_third_too_short_is_seen_and_a_turn_of_all_is_not() -> None:
-    recording = known("positions", 0.1)
+def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation() -> None:
+    recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
-    told_H = Truth(recording)(batch)
-    told_N = (batch.R_NH @ told_H[..., None])[..., 0]
-    whole = leg_residuals(told_N, batch)[..., :2].norm(dim=-1).mean()
-    short = leg_residuals(0.67 * told_N, batch)[..., :2].norm(dim=-1).mean()
+    predicted_H = Truth(recording)(batch)
+    predicted_N = (batch.R_NH @ predicted_H[..., None])[..., 0]
+    whole = leg_residuals(predicted_N, batch)[..., :2].norm(dim=-1).mean()
+    short = leg_residuals(0.67 * predicted_N, batch)[..., :2].norm(dim=-1).mean()
     c, s = np.cos(1.0), np.sin(1.0)
     R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    turned = leg_residuals(told_N @ R.T, batch)[..., :2].norm(dim=-1).mean()
+    rotated = leg_residuals(predicted_N @ R.T, batch)[..., :2].norm(dim=-1).mean()
     assert float(short) > 5.0 * float(whole)
-    assert float(turned) == pytest.approx(float(whole), rel=1e-3)
+    assert float(rotated) == pytest.approx(float(whole), rel=1e-3)
 
 
-def test_the_gradient_points_to_longer_displacements_and_not_to_a_turn() -> None:
-    recording = known("positions", 0.1)
+def test_the_gradient_lengthens_displacements_that_are_too_short() -> None:
+    recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
     factor = torch.tensor(0.67, requires_grad=True)
-    told = factor * Truth(recording)(batch)
-    loss, plain = leg_loss(told, torch.zeros_like(told), batch)
+    predicted = factor * Truth(recording)(batch)
+    loss, plain = leg_loss(predicted, torch.zeros_like(predicted), batch)
     loss.backward()
     assert float(plain) > 0.0
     assert factor.grad is not None
     assert float(factor.grad) < 0.0
 
 
-def turned(told_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+def rotated(predicted_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     c, s = angle.cos(), angle.sin()
-    x, y, z = told_N.unbind(-1)
+    x, y, z = predicted_N.unbind(-1)
     return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
 
 
-def test_velocity_changes_as_the_accelerometer_says() -> None:
+def test_the_velocity_change_is_determined_from_the_accelerometer() -> None:
     [world] = world_streams(WALK, attitude="true")
     accel_W = torch.from_numpy(world.imu_W[: SECONDS * 200, 3:5]).view(1, SECONDS, 200, 2)
     position = torch.from_numpy(world.position_W[: SECONDS * 200 + 1 : 200, :2])
@@ -155,15 +155,15 @@ def test_velocity_changes_as_the_accelerometer_says() -> None:
     assert float((velocity_change(accel_W)[0] - changes).norm(dim=-1).max()) < 0.02
 
 
-def test_the_accelerometer_turns_back_who_walks_another_way() -> None:
-    recording = known("positions", 0.1)
+def test_the_direction_loss_rotates_displacements_back_to_the_true_direction() -> None:
+    recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
-    told_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
-    right = float(direction_loss(told_N, batch))
+    predicted_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+    right = float(direction_loss(predicted_N, batch))
     losses = []
     for degrees in (-90.0, 90.0, -130.0, 130.0, -170.0, 170.0):
         angle = torch.tensor(np.radians(degrees), dtype=torch.float32, requires_grad=True)
-        loss = direction_loss(turned(told_N, angle), batch)
+        loss = direction_loss(rotated(predicted_N, angle), batch)
         loss.backward()
         assert angle.grad is not None
         assert float(angle.grad) * degrees > 0.0
@@ -185,7 +185,7 @@ def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
 
 
 def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
-    recording = known("positions", 0.1)
+    recording = with_positions("positions", 0.1)
     assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W.copy()
     position[time > 30.0] += [5.0, 0.0, 0.0]
@@ -198,8 +198,8 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
 
 
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])
-def test_a_slow_track_has_legs_but_across_its_gaps(every: float, legs: int) -> None:
-    recording = known("positions", every)
+def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every: float, legs: int) -> None:
+    recording = with_positions("positions", every)
     assert recording.positions is not None
     [whole] = leg_streams(recording)
     assert len(whole.start) == pytest.approx(legs, abs=1)
@@ -211,8 +211,8 @@ def test_a_slow_track_has_legs_but_across_its_gaps(every: float, legs: int) -> N
     assert len(cut.start) < len(whole.start)
 
 
-def test_two_processes_share_the_stretches_out_and_three_cannot() -> None:
-    batch, cpu = batch_of(known("positions", 0.1)), torch.device("cpu")
+def test_stretches_are_divided_among_two_processes_but_not_among_three() -> None:
+    batch, cpu = batch_of(with_positions("positions", 0.1)), torch.device("cpu")
     halves = [batch.shared(Workers(rank, 2, cpu)) for rank in (0, 1)]
     for name, value in vars(batch).items():
         parts = [getattr(half, name) for half in halves]
@@ -225,9 +225,9 @@ def test_a_recording_without_positions_has_no_legs() -> None:
         leg_streams(WALK)
 
 
-def test_a_network_learns_its_scale_from_positions_alone(tmp_path: Path) -> None:
-    """Windows with full truth say nothing moves; the legs say how far it went."""
-    [legs] = leg_streams(known("positions", 0.1))
+def test_training_with_legs_reduces_the_error_at_positions(tmp_path: Path) -> None:
+    """Legs are trained together with windows of full truth from the same walk."""
+    [legs] = leg_streams(with_positions("positions", 0.1))
     assert isinstance(legs, LegStream)
     streams = world_streams(WALK)
     config = TrainingConfig(
@@ -244,30 +244,30 @@ def test_a_network_learns_its_scale_from_positions_alone(tmp_path: Path) -> None
     assert (tmp_path / "checkpoint.safetensors").exists()
 
 
-def test_a_network_that_remembers_learns_from_stretches_in_rows(tmp_path: Path) -> None:
-    """Its memory runs through a stretch; one that is no whole number of rows is refused."""
-    [legs] = leg_streams(known("positions", 0.1))
+def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path: Path) -> None:
+    """Its state is kept through a stretch, which must be a whole number of rows."""
+    [legs] = leg_streams(with_positions("positions", 0.1))
     streams = world_streams(WALK)
     values = {"architecture": "RNIN", "epochs": 1, "batch": 20, "epoch_windows": 20}
     config = training_config({**values, "track_stretches": 1, "likelihood_from": 0.0})
-    weights, shown = [1.0] * len(streams), []
+    weights, shapes = [1.0] * len(streams), []
     run = partial(train, config, streams, weights, streams, legs=[legs], validation_legs=[legs])
     with pytest.MonkeyPatch.context() as patch:
-        whole = DisplacementNetwork.forward
+        original = DisplacementNetwork.forward
         patch.setattr(
             DisplacementNetwork,
             "forward",
-            lambda self, windows: shown.append(tuple(windows.shape)) or whole(self, windows),
+            lambda self, windows: shapes.append(tuple(windows.shape)) or original(self, windows),
         )
         run(tmp_path / "rows")
-    assert shown[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
-    assert (48, 10, 6, 200) in shown
+    assert shapes[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
+    assert (48, 10, 6, 200) in shapes
     with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
         train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])
 
 
-def test_positions_nobody_knows_or_of_another_clock_make_no_legs() -> None:
-    recording = known("positions", 0.1)
+def test_invalid_positions_and_those_of_another_clock_make_no_legs() -> None:
+    recording = with_positions("positions", 0.1)
     assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W
     nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
@@ -277,32 +277,35 @@ def test_positions_nobody_knows_or_of_another_clock_make_no_legs() -> None:
     assert abs(len(stream.start) - len(usual.start)) <= 1
 
 
-def test_a_share_is_a_share() -> None:
+def test_a_share_outside_0_to_1_is_refused() -> None:
     for share in (-0.1, 1.5, "half"):
         with pytest.raises(ConfigError, match="shares, simulated"):
             TrainingConfig(shares={"simulated": share})  # type: ignore[dict-item]
 
 
-def test_short_walks_choose_weights_by_themselves() -> None:
-    [legs] = leg_streams(known("positions", 0.1))
+def test_legs_of_short_walks_can_select_the_weights_alone() -> None:
+    [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
     held_out = ValidationSet(
         world_streams(WALK), torch.device("cpu"), [part], TrainingConfig(), chosen_by_legs=True
     )
-    assert list(held_out.legs) == ["positions"]  # eight seconds, though twelve are learned from
+    assert list(held_out.legs) == ["positions"]  # of eight seconds, though training uses twelve
     errors = {"walk": 5.0, "positions": 0.25}
     assert held_out.selection_error(errors) == 0.25
-    besides = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
-    assert besides.selection_error(errors) == 2.625
+    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
+    assert combined.selection_error(errors) == 2.625
 
 
 def sampler_of(streams: list[LegStream], seconds: int) -> LegSampler:
     return LegSampler(streams, seconds, PLAIN, torch.Generator().manual_seed(0))
 
 
-def test_stretches_begin_where_two_legs_follow(caplog: pytest.LogCaptureFixture) -> None:
-    """Legs of ten seconds fit twice into twenty one only where a stretch begins at a waypoint."""
-    [far], [near] = leg_streams(known("waypoints", 10.0)), leg_streams(known("waypoints", 6.0))
+def test_stretches_begin_where_two_complete_legs_follow(caplog: pytest.LogCaptureFixture) -> None:
+    """Two legs of ten seconds fit into 21 s only if the stretch begins at a waypoint."""
+    [far], [near] = (
+        leg_streams(with_positions("waypoints", 10.0)),
+        leg_streams(with_positions("waypoints", 6.0)),
+    )
     assert int(sampler_of([far], 21).batch(32).known.sum(1).min()) == 2
     assert not caplog.text
     both = sampler_of([far, near], 15).batch(32)
@@ -311,18 +314,18 @@ def test_stretches_begin_where_two_legs_follow(caplog: pytest.LogCaptureFixture)
     assert float(both.seconds[both.known].max()) == pytest.approx(6.0)
 
 
-def test_waypoints_too_far_apart_to_teach_are_refused_with_the_seconds_that_would_do() -> None:
-    legs = leg_streams(known("waypoints", 25.0))
+def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> None:
+    legs = leg_streams(with_positions("waypoints", 25.0))
     expected = r"waypoints: found one every 25.0 s .*two legs within 20 s.*`waypoint_seconds`.* 51$"
     with pytest.raises(InputError, match=expected):
         sampler_of(legs, 20)
     assert int(sampler_of(legs, 51).batch(4).known.sum()) == 8
 
 
-def test_validation_goes_without_legs_that_tell_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    """Their error would be 0, the best of all."""
+def test_validation_skips_legs_without_information(caplog: pytest.LogCaptureFixture) -> None:
+    """Their error would be 0, the best possible."""
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), leg_streams(known("waypoints", 25.0)),
+        world_streams(WALK), torch.device("cpu"), leg_streams(with_positions("waypoints", 25.0)),
         TrainingConfig(), chosen_by_legs=True,
     )  # fmt: skip
     assert held_out.legs == {}

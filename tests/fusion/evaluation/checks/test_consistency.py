@@ -1,6 +1,6 @@
-"""Monte Carlo: does the filter know how wrong it is?
+"""Monte Carlo test of the filter's consistency.
 
-The average NEES of N runs of an honest filter follows chi-square with 15 N degrees of freedom,
+The average NEES of N runs of a consistent filter follows chi-square with 15 N degrees of freedom,
 divided by N.
 """
 
@@ -19,7 +19,7 @@ from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PHONE_IMU
 
-# A first speed that is unknown by metres meets a yaw that is unknown by degrees beyond first order.
+# Initial errors of metres per second and degrees of yaw interact beyond first order.
 CONFIG = NavigatorConfig(noise=ImuNoise(), filter=FilterConfig(velocity_sigma=0.1))
 PHONE = NavigatorConfig(
     noise=PHONE_IMU.noise,
@@ -31,7 +31,7 @@ PHONE = NavigatorConfig(
 )
 
 
-def assert_honest(result: Consistency) -> None:
+def assert_consistent(result: Consistency) -> None:
     low, high = result.nees_bounds
     assert low < result.nees < high
     assert low < result.nees_end < high
@@ -40,14 +40,14 @@ def assert_honest(result: Consistency) -> None:
 
 
 def test_nees_of_a_short_walk_is_within_its_bounds() -> None:
-    assert_honest(consistency(CONFIG, runs=12, seconds=40.0))
+    assert_consistent(consistency(CONFIG, runs=12, seconds=40.0))
 
 
 @pytest.mark.slow
 def test_nees_of_five_minutes_is_within_its_bounds() -> None:
     result = consistency(CONFIG, seconds=300.0)
     assert 12.7 < result.nees < 17.5
-    assert_honest(result)
+    assert_consistent(result)
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_nees_of_half_an_hour_with_a_phone_is_within_its_bounds() -> None:
     assert 0.5 < result.yaw < 1.7
 
 
-def test_the_analytic_walk_is_its_own_dead_reckoning() -> None:
+def test_dead_reckoning_reproduces_the_analytic_walk() -> None:
     walk = analytic_walk(5.0, np.random.default_rng(0), STANDARD_GRAVITY)
     R, v, p, zero = walk.R_WB[0], walk.velocity_W[0], walk.position_W[0], np.zeros(3)
     for k in range(0, len(walk.time) - 1, 20):
@@ -71,7 +71,7 @@ def test_the_analytic_walk_is_its_own_dead_reckoning() -> None:
     np.testing.assert_allclose(exp_so3(zero), np.eye(3))
 
 
-def test_runs_come_from_the_seed() -> None:
+def test_runs_are_determined_by_the_seed() -> None:
     first, again = (consistency(CONFIG, runs=2, seconds=5.0, seed=3) for _ in range(2))
     assert first == again
     assert first != consistency(CONFIG, runs=2, seconds=5.0, seed=4)
@@ -81,20 +81,20 @@ def test_runs_come_from_the_seed() -> None:
     "settings",
     [{"update_rate": 1}, {"update_rate": 10, "covariance_scale": 1.0}],
 )
-def test_every_way_of_measuring_knows_how_wrong_it_is(settings: dict[str, Any]) -> None:
+def test_the_filter_is_consistent_at_either_update_rate(settings: dict[str, Any]) -> None:
     config = replace(CONFIG, filter=replace(CONFIG.filter, **settings))
     result = consistency(config, runs=6, seconds=20.0)
-    # Chi-square with 90 degrees of freedom, over six runs: 0.999 of it lies below 22.9.
+    # Chi-square with 90 degrees of freedom, divided by six runs: 99.9 % lies below 22.9.
     assert 9.0 < result.nees_end < 22.9
     assert 2.0 < result.nis < 3.6
 
 
-def test_the_report_names_what_is_expected() -> None:
+def test_the_report_states_the_expected_nees() -> None:
     lines = consistency(CONFIG, runs=1, seconds=2.0).lines()
     assert any("expected 15" in line for line in lines)
 
 
 @pytest.mark.parametrize(("runs", "seconds"), [(0, 10.0), (1, 1.5), (1, np.nan)])
-def test_nothing_to_run_is_refused(runs: int, seconds: float) -> None:
+def test_an_invalid_number_of_runs_or_duration_is_refused(runs: int, seconds: float) -> None:
     with pytest.raises(InputError, match="at least 1 run"):
         consistency(CONFIG, runs=runs, seconds=seconds)

@@ -1,4 +1,4 @@
-"""Any sequence of faults leaves finite states, sound covariances and time that increases."""
+"""Any sequence of faults leaves finite states, valid covariances and increasing times."""
 
 from __future__ import annotations
 
@@ -48,32 +48,32 @@ WALK = st.lists(
 )
 
 
-class Moody:
-    """A network that says what the fault of the moment makes it say."""
+class FaultyNetwork:
+    """A network whose predictions depend on the current fault."""
 
     def __init__(self) -> None:
-        self.mood, self.size = "", 0.0
+        self.fault, self.size = "", 0.0
 
     def predict(self, windows):
         n = len(windows)
         mean = np.tile([0.5, 0.0, 0.0], (n, 1))
         covariance = np.tile(0.01 * np.eye(3), (n, 1, 1))
-        if self.mood == "network not finite":
+        if self.fault == "network not finite":
             mean[:] = np.nan if self.size > 0.0 else np.inf
-        elif self.mood == "network far off":
+        elif self.fault == "network far off":
             mean += 1e3 * self.size
-        elif self.mood == "network too sure":
+        elif self.fault == "network too sure":
             covariance *= 1e-12
-        elif self.mood == "covariance without meaning":
+        elif self.fault == "covariance without meaning":
             covariance *= np.nan if self.size > 0.5 else -1.0
         return mean, covariance
 
 
 class Stream:
-    """Drives a navigator through faults and holds every state against what must hold."""
+    """A navigator that is driven through faults, with a check of every state."""
 
     def __init__(self, backend: str) -> None:
-        self.model = Moody()
+        self.model = FaultyNetwork()
         self.backend: Any = backend
         self.navigator = Navigator(self.model, CONFIG, backend=self.backend)
         self.rng = np.random.default_rng(0)
@@ -85,7 +85,7 @@ class Stream:
         if state is not None:
             assert state.time > self.newest
             self.newest = state.time
-            assert_sound(state)
+            assert_valid(state)
 
     def samples(self, count: int, fault: str, size: float) -> None:
         for _ in range(count):
@@ -108,8 +108,8 @@ class Stream:
                 accel[:] = 0.0
             self.push(time, gyro, accel)
 
-    def take(self, fault: str, count: int, size: float) -> None:
-        self.model.mood, self.model.size = fault, size
+    def inject(self, fault: str, count: int, size: float) -> None:
+        self.model.fault, self.model.size = fault, size
         n, at = self.navigator, self.now - 0.3
         eye = np.eye(3)
         if fault == "gap":
@@ -137,10 +137,10 @@ class Stream:
             self.navigator.restore(data)
         self.samples(count, fault, size)
         if self.navigator.state is not None:
-            assert_sound(self.navigator.state)
+            assert_valid(self.navigator.state)
 
 
-def assert_sound(state: NavState) -> None:
+def assert_valid(state: NavState) -> None:
     for name in ("time", "R_WB", "v_W", "p_W", "b_g", "b_a", "covariance"):
         assert np.isfinite(getattr(state, name)).all(), name
     np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-6)
@@ -163,9 +163,9 @@ def test_no_sequence_of_faults_breaks_a_stream(backend: str, examples: int) -> N
         try:
             stream.samples(80, "fine", 0.0)
             for fault, count, size in walk:
-                stream.take(fault, count, size)
+                stream.inject(fault, count, size)
         except InputError as error:
-            # The only one a stream of samples may raise: no gravity in its first second.
+            # The only error that a stream of samples may raise: no gravity in its first second.
             assert "first second" in str(error)  # noqa: PT017
         health = stream.navigator.health
         assert health.lines()

@@ -1,4 +1,4 @@
-"""The table of faults: none raises, none leaves a state that is not finite."""
+"""Table of faults: none raises an error or leaves a state that is not finite."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_fault_ends_in_finite_states(results: dict[str, FaultResult]) -> N
         ("accelerometer clipped", "saturated"),
     ],
 )
-def test_what_happened_is_reported(results: dict[str, FaultResult], fault: str, words: str) -> None:
+def test_every_fault_is_reported(results: dict[str, FaultResult], fault: str, words: str) -> None:
     assert words in results[fault].reported
 
 
@@ -52,11 +52,11 @@ def test_what_happened_is_reported(results: dict[str, FaultResult], fault: str, 
     "fault",
     ["one NaN in gyro", "5% of samples dropped", "20% of samples dropped", "190 Hz", "500 Hz"],
 )
-def test_small_faults_cost_little(results: dict[str, FaultResult], fault: str) -> None:
+def test_small_faults_add_little_error(results: dict[str, FaultResult], fault: str) -> None:
     assert results[fault].error_with < results[fault].error_without + 0.3
 
 
-def test_behind_a_gap_sigma_covers_the_error(results: dict[str, FaultResult]) -> None:
+def test_sigma_covers_the_error_after_a_gap(results: dict[str, FaultResult]) -> None:
     after = results["gap of 3 s"]
     assert after.end_error < 2.0 * after.end_sigma
     assert after.end_sigma > results["none"].end_sigma
@@ -89,7 +89,7 @@ def test_faults_are_drawn_from_the_seed() -> None:
             )
 
 
-def test_five_false_seconds_cost_little_with_either_back_end() -> None:
+def test_five_seconds_of_false_displacements_cost_little_with_either_back_end() -> None:
     sequence, config = matched_walk(60.0, seed=1)
     block = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
     for result in run_faults(sequence, config, only=block):

@@ -1,4 +1,4 @@
-"""The table that holds the fusion against its network."""
+"""Table that compares the fusion with its network."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,23 +26,23 @@ def test_ratios_are_geometric_means_by_group() -> None:
     assert pooled.split()[:2] == ["all", "3"]
 
 
-def test_a_fusion_with_a_true_network_is_as_good_at_waypoints_as_at_poses(
+def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     poses = fusion_gain(oracle, walk, CONFIG, "walks", ("ekf",))
     every = slice(None, None, 500)
     at = walk.truth.time[every], walk.truth.position_W[every, :2]
-    tapped = replace(walk, truth=None, positions=PositionTrack(*at, "waypoints"))
-    waypoints = fusion_gain(oracle, tapped, CONFIG, "walks", ("ekf",))
+    at_waypoints = replace(walk, truth=None, positions=PositionTrack(*at, "waypoints"))
+    waypoints = fusion_gain(oracle, at_waypoints, CONFIG, "walks", ("ekf",))
     assert poses.fused_m["ekf"] < 0.5
     assert waypoints.fused_m["ekf"] == pytest.approx(poses.fused_m["ekf"], abs=0.2)
 
 
-def test_without_truth_there_is_nothing_to_judge(walk: ImuSequence, still_model: Any) -> None:
+def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
         fusion_gain(still_model, replace(walk, truth=None), CONFIG, "walks")
-    # A mean over a group would be not-a-number for one tap within the track.
-    tapped = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
+    # A group's mean would be NaN with a single waypoint within the track.
+    at_waypoints = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
     with pytest.raises(InputError, match="fewer than 2 within the track"):
-        fusion_gain(still_model, replace(walk, truth=None, positions=tapped), CONFIG, "walks")
+        fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG, "walks")

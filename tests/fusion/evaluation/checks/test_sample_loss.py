@@ -1,4 +1,4 @@
-"""Missing samples move a track's end by little, and the table says how far."""
+"""Missing samples move a track's end little, and the table reports how far."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 
-def test_a_tenth_of_a_second_and_one_sample_in_twenty_hardly_move_the_end(
+def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
     walk: ImuSequence,
 ) -> None:
     found = end_shifts(load_model("default"), walk, NavigatorConfig(), "walks")
     assert len(found) == 7
     assert {one.recording for one in found} == {walk.name}
     *gaps, dropped = found
-    # Twelve seconds of a simulated walk: a path so short that a turn at a gap counts for much.
+    # On the short path of a simulated walk of 20 s, a turn at a gap has a large effect.
     assert max(one.metres for one in gaps) < 0.1
     assert max(one.degrees for one in gaps) < 15.0
     assert 0.0 < dropped.metres < 0.01
     assert dropped.degrees < 0.5
 
 
-def test_a_device_that_lies_still_has_no_path(walk: ImuSequence, still_model: Any) -> None:
+def test_a_stationary_recording_is_refused(walk: ImuSequence, still_model: Any) -> None:
     force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
     still = replace(walk, gyro=0.0 * walk.gyro, accel=force, truth=None)
     with pytest.raises(InputError, match="metre"):
         end_shifts(still_model, still, NavigatorConfig(), "table")
 
 
-def test_the_table_counts_ends_that_stay_in_both() -> None:
+def test_the_table_counts_ends_within_both_limits() -> None:
     values = [(0.005, 1.0), (0.02, 1.0), (0.005, 4.0), (0.0, 0.0)]
     table = end_shift_table([EndShift("a", "set", "gap", *pair) for pair in values])
     row = table.splitlines()[1].split()

@@ -1,4 +1,4 @@
-"""Tracks with fixes, judged by their truth."""
+"""Tracks with fixes, evaluated against ground truth."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,7 @@ from stario.sequences.sequence import ImuSequence
 Make = Callable[..., Any]
 
 
-def test_fixes_of_the_truth_hold_a_track_to_it(walk: ImuSequence, make_oracle: Make) -> None:
+def test_true_fixes_keep_a_track_near_the_truth(walk: ImuSequence, make_oracle: Make) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     found = track_with_fixes(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
     assert found.applied > 0.8
@@ -26,14 +26,14 @@ def test_fixes_of_the_truth_hold_a_track_to_it(walk: ImuSequence, make_oracle: M
     assert row[-1] == "100.0%"
 
 
-def test_fixes_err_as_much_as_they_say(walk: ImuSequence) -> None:
+def test_errors_of_fixes_match_their_stated_sigma(walk: ImuSequence) -> None:
     fixes = true_fixes(walk.truth, 0.05, 0.2, seed=1)
     at = walk.truth.at(np.array([fix.time for fix in fixes])).position_W
     error = np.array([fix.value for fix in fixes]) - at
     assert np.sqrt((error**2).mean()) == pytest.approx(0.2, rel=0.1)
 
 
-def test_without_poses_there_is_nothing_to_judge_by(walk: ImuSequence, still_model: Any) -> None:
+def test_missing_poses_and_too_few_fixes_are_refused(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="truth"):
         track_with_fixes(still_model, replace(walk, truth=None), CONFIG, "walks")
     with pytest.raises(InputError, match="fixes"):

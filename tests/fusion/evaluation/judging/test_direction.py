@@ -8,8 +8,8 @@ from stario.sequences.windows import WINDOW_SAMPLES
 
 
 @pytest.fixture(scope="module")
-def walked():
-    """A simulated walk's levelled stream, and its true displacements in the stream's frame N."""
+def stream_and_truth():
+    """Levelled stream of a simulated walk, and its true displacements in the stream's frame N."""
     sequence = simulate_imu(generate_walk(3, 90.0), 200.0, PHONE_IMU, 3)
     (stream,) = levelled_streams(sequence)
     truth = sequence.truth
@@ -19,28 +19,28 @@ def walked():
     return stream, (end.position_W - begin.position_W) @ R_WN
 
 
-def test_true_displacements_go_where_the_accelerometer_says(walked):
-    found = direction(*walked)
+def test_true_displacements_agree_in_direction_with_the_accelerometer(stream_and_truth):
+    found = direction(*stream_and_truth)
     assert abs(found.turn) < 3.0 * found.sigma < np.radians(45.0)
 
 
 @pytest.mark.parametrize("degrees", [-120.0, 45.0, 180.0])
-def test_turned_displacements_are_told_their_turn(walked, degrees):
-    stream, displacement = walked
+def test_the_rotation_of_rotated_displacements_is_found(stream_and_truth, degrees):
+    stream, displacement = stream_and_truth
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turned = displacement @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    away = np.exp(1j * (direction(stream, turned).turn + np.radians(degrees)))
-    assert np.angle(away) == pytest.approx(direction(*walked).turn, abs=1e-9)
+    rotated = displacement @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
+    rotated_back = np.exp(1j * (direction(stream, rotated).turn + np.radians(degrees)))
+    assert np.angle(rotated_back) == pytest.approx(direction(*stream_and_truth).turn, abs=1e-9)
 
 
-def test_noise_has_no_direction_and_says_so(walked):
-    stream, displacement = walked
+def test_the_direction_of_noise_has_a_large_sigma(stream_and_truth):
+    stream, displacement = stream_and_truth
     noise = np.random.default_rng(0).normal(size=displacement.shape)
-    assert direction(stream, noise).sigma > 3.0 * direction(*walked).sigma
+    assert direction(stream, noise).sigma > 3.0 * direction(*stream_and_truth).sigma
 
 
-def test_stretches_add_up_and_nothing_has_no_direction(walked):
-    stream, displacement = walked
+def test_directions_of_stretches_add_up_and_an_empty_one_is_undefined(stream_and_truth):
+    stream, displacement = stream_and_truth
     once = direction(stream, displacement)
     twice = once + once
     assert twice.turn == pytest.approx(once.turn)

@@ -1,4 +1,4 @@
-"""Networks alone judged by groups, by a stub that answers the truth, or a known share of it."""
+"""Judging of networks alone by groups, with a stub that predicts a known share of the truth."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
 
 
 class Stub:
-    """Answers with the true displacements of a recording's windows, scaled and turned, in order."""
+    """Predictor of the true displacements of successive windows, scaled and rotated."""
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
         [piece] = prepare(walk, Path("walk")).pieces
@@ -63,14 +63,14 @@ class Stub:
         steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
         steps = np.pad(steps, (0, piece.stream.window_count - len(steps)), "edge")
-        steps = np.exp(-1j * piece.stream.headings) * steps  # as it is shown them
-        self.displacement_N = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
-        self.given = 0
+        steps = np.exp(-1j * piece.stream.headings) * steps  # in the windows' frames
+        self.displacement_H = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
+        self.served = 0
 
     def predict(self, windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        first, self.given = self.given, self.given + len(windows)
+        first, self.served = self.served, self.served + len(windows)
         covariance = np.broadcast_to(0.01 * np.eye(3), (len(windows), 3, 3))
-        return self.displacement_N[first : self.given], covariance
+        return self.displacement_H[first : self.served], covariance
 
 
 def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
@@ -78,9 +78,9 @@ def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> R
     return recording_errors(prepared, predictions(stub, prepared))
 
 
-def test_of_poses_nine_tenths_of_the_truth_is_told_as_such(walk: ImuSequence) -> None:
+def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: ImuSequence) -> None:
     stub = Stub(walk)
-    size = float(np.sqrt(np.mean(np.sum(stub.displacement_N**2, axis=1))))
+    size = float(np.sqrt(np.mean(np.sum(stub.displacement_H**2, axis=1))))
     found = errors_of(walk, Stub(walk, 0.9))
     assert found.kind == "poses"
     assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
@@ -91,7 +91,7 @@ def test_of_poses_nine_tenths_of_the_truth_is_told_as_such(walk: ImuSequence) ->
     assert np.sqrt(sums[0] / sums[1]) == pytest.approx(found.figures["rms_1s_m"])
 
 
-def test_of_poses_the_truth_has_no_error_and_a_turn_shows_in_displacements_alone(
+def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(
     walk: ImuSequence,
 ) -> None:
     exact = errors_of(walk, Stub(walk)).figures
@@ -104,7 +104,7 @@ def test_of_poses_the_truth_has_no_error_and_a_turn_shows_in_displacements_alone
     assert turned["rms_1s_m"] > 0.3
 
 
-def test_of_positions_the_yaw_is_fitted_and_nothing_compared_across_a_jump(
+def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(
     walk: ImuSequence,
 ) -> None:
     smooth = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
@@ -118,24 +118,24 @@ def test_of_positions_the_yaw_is_fitted_and_nothing_compared_across_a_jump(
     assert jumped.blocks["10"][:, 1].sum() < smooth.blocks["10"][:, 1].sum()
 
 
-def test_positions_once_a_second_are_judged_as_well(walk: ImuSequence) -> None:
+def test_positions_at_1_hz_give_the_same_errors(walk: ImuSequence) -> None:
     assert walk.truth is not None
     time = np.arange(1.0, 74.0)
     track = PositionTrack(time, walk.truth.at(time).position_W, "positions")
     slow = replace(walk, truth=None, positions=track)
     found = errors_of(slow, Stub(walk, 0.9, yaw=2.0))
     assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
-    often = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
-    assert found.figures["rms_10s_m"] == pytest.approx(often.figures["rms_10s_m"], rel=0.05)
+    frequent = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
+    assert found.figures["rms_10s_m"] == pytest.approx(frequent.figures["rms_10s_m"], rel=0.05)
 
 
-def test_of_waypoints_residuals_follow_a_fit_of_yaw_and_position(walk: ImuSequence) -> None:
+def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> None:
     exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
     short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
     assert exact.figures["ate_fit_m"] < 0.1
     assert exact.figures["length_ratio"] == pytest.approx(1.0, abs=0.02)
     assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
-    # Scaled about its centre, a track is off by a tenth of the waypoints' spread about theirs.
+    # A track scaled about its centre has an error of a tenth of the waypoints' spread.
     time = np.arange(1.0, 70.0, 8.0)
     assert walk.truth is not None
     xy = walk.truth.at(time).position_W[:, :2]
@@ -159,7 +159,7 @@ def test_a_recording_without_truth_is_refused(walk: ImuSequence) -> None:
         ("ilc.h5:site2_F1_5dd35c7527889b0006b76852", "waypoints", 65.2, "ate_fit_percent"),
     ],
 )
-def test_of_real_recordings_the_steps_come_near_the_truth(
+def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
     name: str, kind: str, path_m: float, error: str
 ) -> None:
     path = Path(f"{ARCHIVES}/{name}")
@@ -171,7 +171,7 @@ def test_of_real_recordings_the_steps_come_near_the_truth(
     assert found.figures[error] < 15.0
 
 
-def test_what_was_prepared_is_found_again(walk: ImuSequence, tmp_path: Path) -> None:
+def test_prepared_recordings_are_cached(walk: ImuSequence, tmp_path: Path) -> None:
     path = tmp_path / "walk.csv"
     path.write_text("stands for the recording")
     read: list[Path] = []
@@ -194,7 +194,7 @@ def test_what_was_prepared_is_found_again(walk: ImuSequence, tmp_path: Path) -> 
     assert len(read) == 2
 
 
-def test_the_interval_of_a_ratio_grows_as_groups_differ() -> None:
+def test_the_interval_of_a_ratio_widens_as_groups_differ() -> None:
     rng = np.random.default_rng(0)
     theirs = rng.uniform(1.0, 2.0, (6, 4, 5))
 
@@ -205,9 +205,9 @@ def test_the_interval_of_a_ratio_grows_as_groups_differ() -> None:
         }
         return {"set": groups}
 
-    alike = paired_ratio(strata(np.full(6, 0.8)))
-    assert alike is not None
-    assert (alike.ratio, alike.low, alike.high) == pytest.approx((0.8, 0.8, 0.8))
+    equal = paired_ratio(strata(np.full(6, 0.8)))
+    assert equal is not None
+    assert (equal.ratio, equal.low, equal.high) == pytest.approx((0.8, 0.8, 0.8))
     spread = paired_ratio(strata(np.array([0.5, 0.6, 0.8, 0.8, 1.0, 1.28])))
     assert spread is not None
     assert spread.ratio == pytest.approx(0.793, abs=0.01)
@@ -215,7 +215,7 @@ def test_the_interval_of_a_ratio_grows_as_groups_differ() -> None:
     assert paired_ratio({"set": {"g": []}}) is None
 
 
-def test_steps_are_judged_like_a_network(walk: ImuSequence) -> None:
+def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -> None:
     found = errors_of(walk, PedestrianDeadReckoning())
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
@@ -241,7 +241,7 @@ def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     return judged
 
 
-def test_rows_compare_weights_by_group_and_over_all(walk: ImuSequence) -> None:
+def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence) -> None:
     rows = {row.name: row for row in rows_of(judged_pair(walk), "person", "ours", "theirs")}
     assert list(rows) == ["a", "b", "all"]
     assert rows["a"].ratios["rms_1s_m"].ratio == pytest.approx(0.25, rel=0.01)
@@ -272,7 +272,7 @@ def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path
     assert (tmp_path / "groups.png").stat().st_size > 10_000
 
 
-def test_two_groups_decide_nothing() -> None:
+def test_two_groups_are_too_few_for_a_verdict() -> None:
     better = Interval(0.8, 0.7, 0.9)
     rows = [Row(name, 5, 1.0, {}, {"rms_10s_m": better}) for name in ("a", "b")]
     rows.append(Row(POOLED, 5, 1.0, {}, {"rms_10s_m": better}, pooled=True))
