@@ -1,4 +1,4 @@
-"""A ROS 2 node around StarIO, a skeleton to start from: ROS is needed only to run as a node.
+"""Skeleton of a ROS 2 node around StarIO; ROS is needed only to run it as a node.
 
     subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
                            mounting works, as the device is levelled by gravity)

@@ -29,7 +29,7 @@ MAX_SIGMA = 5.0
 """Upper limit of sigma [m]: nobody walks further in a second."""
 
 _STEEPEST = 10.0
-"""Largest accepted exponent, beyond any that a calibration finds."""
+"""Largest accepted exponent, larger than any calibration yields."""
 
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 
@@ -39,7 +39,7 @@ class Calibration:
     """Calibration of a network's log standard deviations, fitted on validation recordings.
 
     sigma = sqrt((scale * exp(exponent * log_sigma))^2 + floor^2), each per axis x, y, z of the
-    window's frame (x and y share their values, because the frame's yaw is arbitrary).
+    window's frame (x and y share their values).
 
     Attributes:
         scale: factors on the network's sigma.
@@ -63,7 +63,7 @@ class Card:
 
     Attributes:
         architecture: a name in `architectures.ARCHITECTURES`.
-        outputs: number of outputs: 3 displacements [m], then 3 log standard deviations.
+        outputs: number of outputs: displacement x, y, z [m], then 3 log standard deviations.
         rate: sampling rate of a window [Hz].
         samples: number of samples of a window.
         frame: frame of the window and the displacement.
@@ -74,6 +74,7 @@ class Card:
         recipe: the command and settings that produced the weights.
         figures: results on named recordings.
         known_motion: summary of the training windows, None if there is none.
+        format: version of the card's format.
     """
 
     architecture: str
@@ -115,7 +116,7 @@ def read_card(weights: Path) -> Card:
     path = card_path(weights)
     for needed in (weights, path):
         if not needed.is_file():
-            raise WeightsError(needed, "file", "nothing there", "weights and card in one folder")
+            raise WeightsError(needed, "file", "no such file", "weights and card in one folder")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

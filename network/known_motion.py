@@ -1,4 +1,4 @@
-"""Known motion: the distance of a window from those that weights were trained on.
+"""Known motion: a summary of the training windows, and the distance of other windows to it.
 
 Five features that do not depend on its yaw describe a window; those of the training windows are
 summarised by their k-means centres (Lloyd 1982), which are stored on the card. A window further
@@ -53,7 +53,7 @@ class KnownMotion:
     """Summary of the training windows.
 
     Attributes:
-        centres: k-means centres of the windows, each five numbers on the scales of `described`.
+        centres: k-means centres of the windows, each five numbers as of `scaled_features`.
         limit: distance to the nearest centre that 95 % of the training windows do not exceed.
         ranges: 1st and 99th percentile of each of `FEATURES`, of "step_rate" [Hz] and of "speed"
             [m/s], for reports.
@@ -162,7 +162,7 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
 def known_motion(
     streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
 ) -> KnownMotion | None:
-    """Summarise the motion in training streams; return None for less than a minute of them.
+    """Summarise the motion in training streams; return None if they are shorter than a minute.
 
     Args:
         streams: streams with full ground truth.

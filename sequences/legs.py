@@ -27,8 +27,8 @@ _FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
 """A faster step between two samples [m/s] is a jump of the track; a longer step [s] is a gap."""
 
 _SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
-"""In a low-rate track, such as from GNSS, a gap is longer than this many median steps or than this
-many seconds, whichever is less: a pedestrian has turned by then."""
+"""In a low-rate track, for example from GNSS, a gap is longer than this many median steps or than
+this many seconds, whichever is less: a pedestrian has turned by then."""
 
 _TRACK_SIGMA = 0.15
 """Sigma of a track's positions [m]: the reference device is not rigidly fixed to the IMU."""

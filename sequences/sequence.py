@@ -31,7 +31,7 @@ MAX_TRUTH_GAP = 0.1
 """Longest step [s] between two valid ground-truth samples that is interpolated across."""
 
 MAX_SENSOR_VALUE = 1e5
-"""Larger than any sensor's values in any unit used here; also catches infinities."""
+"""Bound above any sensor's values in any unit used here; also catches infinities."""
 
 MAX_IMU_GAP = 0.1
 """Longest step [s] between IMU samples that is bridged by interpolation."""
@@ -269,7 +269,7 @@ class ImuSequence:
         return replace(self, truth=None, positions=None)
 
     def slice(self, start: float, stop: float) -> ImuSequence:
-        """Return the samples with start <= time <= stop [s], and all other data likewise."""
+        """Return the samples with start <= time <= stop [s], and all other data within them."""
         keep = (self.time >= start) & (self.time <= stop)
         field, positions, own = self.magnetometer, self.positions, self.device_attitude
         return replace(
@@ -298,7 +298,7 @@ def low_rate_message(truth: Trajectory) -> str:
 
 
 def whole_seconds(time: FloatArray) -> FloatArray:
-    """Return each second (M,) [s] from the first of increasing times (N,) until before the last.
+    """Return each second (M,) [s] from the first of increasing times (N,) to before the last.
 
     Seconds within a gap are skipped: the path there is straight, and a clock that jumps by decades
     must not cost memory.

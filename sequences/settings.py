@@ -16,7 +16,7 @@ def check_number(settings: object, name: str, low: float = 0.0, high: float = ma
     """Check that a field is a finite number within bounds.
 
     Raises:
-        ConfigError: it is not; the error names the field and the bounds.
+        ConfigError: the field is anything else; the error names it and the bounds.
     """
     value: Any = getattr(settings, name)  # NumPy scalars are Real, too
     if not (isinstance(value, Real) and math.isfinite(value) and low <= float(value) <= high):
@@ -28,12 +28,12 @@ def with_settings(default: Group, values: object, name: str = "") -> Group:
     """Return a frozen dataclass with some of its values replaced, also within nested groups.
 
     Args:
-        default: provides every value not given; its own checks validate the result.
+        default: dataclass with the values not given; its own checks validate the result.
         values: a parsed TOML table or JSON object.
         name: name of the group, for messages.
 
     Raises:
-        ConfigError: `values` is no table, a key is unknown, or a value is invalid.
+        ConfigError: `values` is not a table, a key is unknown, or a value is invalid.
     """
     if not isinstance(values, dict):
         raise ConfigError(name, repr(values), "a table of values")
@@ -55,7 +55,7 @@ def _fitting(name: str, value: Any, default: Any) -> Any:
     if isinstance(default, tuple) and isinstance(value, list):
         return tuple(value)
     wanted = (float, int) if isinstance(default, float) else (type(default),)
-    # A field that defaults to None may have any type: the group's own checks decide.
+    # A field that defaults to None may have any type; the group's own checks validate it.
     if default is not None and type(value) not in wanted:
         raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
     return value

@@ -23,7 +23,7 @@ def increasing_mask(time: FloatArray) -> BoolArray:
     """Return which of the finite times (N,) [s] to keep, so that kept times strictly increase.
 
     A time that is not later than all kept ones before it is dropped. So are a few that jump ahead
-    of those after them: otherwise a single wild time would make all that follow look late.
+    of those after them: otherwise all times after a single wrong one would be dropped.
     """
     steps = np.diff(time)
     breaks = np.flatnonzero((steps < 0.0) | (steps > MAX_IMU_GAP)) + 1
@@ -44,7 +44,7 @@ def increasing_mask(time: FloatArray) -> BoolArray:
 
 
 def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], behind: FloatArray) -> int:
-    """Return the first part that later, non-decreasing times `behind` show to be too far ahead."""
+    """Return the first part shown to be too far ahead by later, non-decreasing times `behind`."""
     first, samples = len(parts), 0
     for k in reversed(range(len(parts))):
         start, stop = parts[k]

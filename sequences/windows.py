@@ -9,7 +9,7 @@ in the papers.
 The networks receive windows in frame H, in which the device's heading is zero: a given motion of a
 device then gives the same window whatever its heading. The heading is that of the twist about the
 vertical, averaged over the window (`mean_heading`); it is singular only for a device that is upside
-down throughout, where any heading will do.
+down throughout, for which any heading is acceptable.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ with reversed weights, is the change of mean velocity from one second to the nex
 
 
 def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
-    """Return headings (B,) [rad] of windows from facing directions at ten instants (B, 10, 2)."""
+    """Return headings (B,) [rad] of windows from facing directions (B, 10, 2) at ten instants."""
     total = np.asarray(facing_N, dtype=np.float64).sum(axis=-2)
     return np.asarray(np.arctan2(total[..., 1], total[..., 0]))
 
@@ -164,9 +164,9 @@ def world_streams(
 
     Args:
         sequence: the recording.
-        attitude: "levelled" (by the IMU, with the true heading) or "true". If the device or the
-            truth is misaligned, the mean specific force under the true attitude reveals it: a
-            network learns the facing direction from that, and lacks the cue at inference.
+        attitude: "levelled" (by the IMU, with the true heading) or "true". Under a true attitude,
+            a misalignment of device or truth tilts the mean specific force: a network learns the
+            facing direction from that cue, which is missing at inference.
 
     Raises:
         InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.

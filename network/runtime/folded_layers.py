@@ -103,7 +103,7 @@ class Star:
     """DWSB with its residual connection.
 
     Attributes:
-        left_out: (C,) bias omitted from the result.
+        omitted_bias: (C,) bias omitted from the result.
     """
 
     def __init__(self, block: DualWingStarBlock, length: int, offset: Tensor) -> None:
@@ -200,7 +200,7 @@ class Gate:
     """MSGCU with its residual connection.
 
     Attributes:
-        left_out: (C,) bias omitted from the result.
+        omitted_bias: (C,) bias omitted from the result.
     """
 
     def __init__(self, unit: GatedUnit, length: int, offset: Tensor) -> None:

@@ -24,7 +24,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 
 class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Counter that adds the storage of every new tensor and subtracts it when it is freed."""
+    """Counter of the bytes of all new tensors' storages that have not been freed."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]

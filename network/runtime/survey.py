@@ -67,7 +67,7 @@ def measured() -> dict[str, str]:
     return {
         "parameters": "those of modules covered by the rules of the paper's table, two outputs per "
         "head (stario.network.runtime.cost); here in millions, the paper's figure in parentheses",
-        "flops": "by the same rules, for one window; likewise",
+        "flops": "by the same rules, for one window; in millions, likewise",
         "numel": "number of elements of all parameters of the same network; in millions",
         "milliseconds": "per window with six outputs, in the inference form, with random weights: "
         "median over calls in turn with all other networks, "

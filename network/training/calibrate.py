@@ -20,7 +20,10 @@ _STEEPEST = 4.0
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
-    """Fit to errors (M, 3) [m] and log sigmas (M, 3); x and y share scale and exponent."""
+    """Fit a calibration to errors (M, 3) [m] and log sigmas (M, 3).
+
+    x and y share scale and exponent.
+    """
     scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
     scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
     return Calibration(

@@ -29,7 +29,7 @@ _SIMULATED_SHARE = 0.4
 _WALK_SECONDS = 60.0
 
 _SHORTEST = 400
-"""Minimum samples of a stretch, 2 s; shorter ones are dropped."""
+"""Minimum number of samples of a stretch, 2 s; shorter ones are dropped."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ def mix_sources(
         shares: share of each source among the recordings' windows, by a part of their path;
             other recordings make up the rest of 1. The share of a source that is absent goes to
             the others. `SIMULATED` is the share of simulated walks among all windows.
-        reach: minimum samples of a stream to draw from (`TrainingConfig.reach`).
+        reach: minimum number of samples of a stream to draw from (`TrainingConfig.reach`).
 
     Raises:
-        ConfigError: nothing is left for recordings of no named source, or all shares are 0.
+        ConfigError: the named shares leave nothing for other recordings, or all shares are 0.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []

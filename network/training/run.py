@@ -42,9 +42,9 @@ class EpochReport:
     """Result of one epoch; errors are mean squared displacement errors [m^2].
 
     Attributes:
-        epoch: its number, from 1.
+        epoch: number of the epoch, from 1.
         training_error: error on its augmented windows.
-        validation_error: the error that selects weights (`ValidationSet.deciding`).
+        validation_error: the error that selects weights (`ValidationSet.selection_error`).
         validation_by_recording: error of each recording, and of each kind of weak truth [m^2/s].
         windows_per_second: training windows of this process, with full or weak truth.
         drawing_share: share of the time spent drawing them while the network waits.
@@ -189,7 +189,7 @@ class TrainingRun:
                 value.copy_(current[name])
 
     def epochs_since_best(self) -> int:
-        """Return the epochs since the smallest validation error; nan and inf are never smallest.
+        """Return the epochs since the smallest validation error; NaN and inf are never smallest.
 
         Sigma is meaningless until the likelihood is part of the loss: from then on, only epochs
         trained with it count.
@@ -201,7 +201,7 @@ class TrainingRun:
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
 
     def should_stop(self) -> bool:
-        """Whether validation stopped improving; False until sigma is learned: models need it."""
+        """Return whether validation has stopped improving; False until sigma is learned."""
         learned = len(self.history) >= self._first_with_sigma
         return learned and self.epochs_since_best() >= self.config.patience
 
@@ -249,8 +249,9 @@ class TrainingRun:
         """Continue from the folder's checkpoint, if there is one.
 
         Raises:
-            ConfigError: it belongs to another recipe, or to other recordings or initial weights.
-            ReadError: it cannot be read.
+            ConfigError: the checkpoint belongs to another recipe, or to other recordings or initial
+                weights.
+            ReadError: the checkpoint cannot be read.
         """
         if self.workers.is_leader:
             for left in self.folder.glob(".*.tmp"):  # from an interrupted write
@@ -309,7 +310,7 @@ class TrainingRun:
 
 
 def _or_infinite(error: float) -> float:
-    """Replace a non-finite error by inf: `np.argmin` takes nan for the smallest."""
+    """Replace a non-finite error by inf: `np.argmin` treats NaN as the smallest."""
     return error if math.isfinite(error) else math.inf
 
 

@@ -52,11 +52,12 @@ def train(
         on_epoch: called after each validation.
         trained_on: description of the training data, for the card.
         start_from: model that provides the initial weights.
-        calibration: calibration of other weights, used where the errors on `validation` mean
-            nothing: a last stage also trains on it, and weak truth alone has no such windows.
+        calibration: calibration of other weights, used if the errors on `validation` are
+            meaningless: a last stage also trains on it, and weak truth alone has no such windows.
         legs: additional stretches of weak truth, positions or waypoints.
         validation_legs: additional stretches of weak truth that select the weights.
-        chosen_by_legs: whether these alone do, for example if `validation` is only simulated.
+        chosen_by_legs: whether `validation_legs` alone select the weights, for example if
+            `validation` is only simulated.
 
     Returns:
         Path of the model's weights.

@@ -34,7 +34,7 @@ VALIDATION_STRIDE = 20
 """Samples between the starts of successive windows."""
 
 _STRIDES = (20, 40, 50, 100, 200)
-"""Strides for recurrent networks: each window follows one from a second before, as in use."""
+"""Strides for recurrent networks: each window follows one from a second before, as at inference."""
 
 _DENSE_SAMPLES = 200 * 60 * 15
 """For N times this many samples in total, windows are cut at N times that stride."""
@@ -55,7 +55,7 @@ class ValidationSet:
         legs: held-out streams with weak truth.
         config: recipe that determines how their stretches are drawn.
         chosen_by_legs: whether legs alone select the weights, if there are any.
-        remembers: whether the evaluated networks are recurrent.
+        is_recurrent: whether the evaluated networks are recurrent.
 
     Raises:
         InputError: no stream is longer than a second.
@@ -72,7 +72,7 @@ class ValidationSet:
     ) -> None:
         self.device, self._chosen_by_legs = device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
-        # Hours of data are cut sparsely: what matters is the variety of motion.
+        # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
         length = sum(len(stream) for stream in streams)
         self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
         if is_recurrent:
@@ -173,7 +173,7 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
             continue
         try:
             sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
-        except InputError as error:  # the error 0 of no legs would be the smallest
+        except InputError as error:  # an error of 0 without legs would be the smallest
             log.warning("validation skips %s", error)
             continue
         found[kind] = sampler.batch(_STRETCHES)
@@ -185,7 +185,7 @@ class _Answers:
 
     def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
-        # Windows that begin within the same second belong to separate series, as in use.
+        # Windows that begin within the same second belong to separate series, as at inference.
         self.batch = max(1, WINDOW_SAMPLES // stride) if network.is_recurrent else _AT_ONCE
         self._state = network.first_state(self.batch) if network.is_recurrent else None
 

@@ -14,16 +14,17 @@ variance that a second of displacement adds. A robust loss of the whitened resid
 then on the scale of the windows' squared error.
 
 psi leaves the direction of the displacements undetermined: a network trained on legs alone may
-walk backwards, and no track that is fitted in yaw shows it. The accelerometer determines it. The
+predict backward walking, which no track fitted in yaw reveals. The accelerometer determines it. The
 mean velocities of two successive seconds differ by
 
     d_k+1 - d_k = integral of w(t) a(t) dt,   w rising from 0 to 1 and falling to 0 again,
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
-the levelling error hardly change within a stretch and are removed with the mean. Two successive
-integrals give a_k = d_k+2 - d_k. (From one second to the next, a walk sways with its steps: a
-network trained from scratch on those changes predicted the sway correctly and still walked
-backwards.) The angle of c = mean_k conj(d_k+2 - d_k) a_k is a stretch's direction error. Its loss
+the levelling error hardly change within a stretch and are removed with the mean. The sum of two
+successive integrals is a_k = d_k+2 - d_k. (From one second to the next, a walk sways with its
+steps: a network trained from scratch on those changes predicted the sway correctly and still
+predicted backward walking.) The angle of c = mean_k conj(d_k+2 - d_k) a_k is a stretch's direction
+error. Its loss
 
     2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+2 - d_k| rms |a_k| / 4,
 

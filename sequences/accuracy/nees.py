@@ -82,8 +82,8 @@ def position_nees(
     """Return the NEES of a track's 3-D position under its own covariance.
 
     Poses with a covariance of exactly zero, such as a start that is the origin by definition,
-    are skipped. Alignment removes the share of the initial yaw from the error but not from the
-    covariance: to check that share, give the estimate in the truth's frame and "none".
+    are skipped. Alignment removes the contribution of the initial yaw from the error but not from
+    the covariance: to check that too, pass the estimate in the truth's frame and "none".
 
     Raises:
         InputError: no overlap, no covariance, or one that is not positive definite.

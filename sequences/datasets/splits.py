@@ -50,7 +50,10 @@ def read_list(file: Path, data: Path) -> list[ListEntry]:
         path = data / name
         if not split_name(path)[0].exists():
             raise InputError(
-                str(path), "nothing", f"a recording of {file.name}", "set the data folder: --data"
+                str(path),
+                "no such file",
+                f"a recording of {file.name}",
+                "set the data folder: --data",
             )
         listed.append(ListEntry(path, group))
     return listed

@@ -7,8 +7,8 @@ same content. The folder may be deleted at any time.
 
 A recording's key consists of its path, the names, sizes and modification times of its files, the
 options it is read with, and the code that reads it. Hashing the files' bytes instead would read
-100 hours of recordings, and the images next to some of them, at every start; it would only detect
-one case more, a file replaced by one of the same size and modification time.
+100 hours of recordings, and the images next to some of them, at every start; it would detect only
+one more case: a file replaced by one of the same size and modification time.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _digest(key: Mapping[str, object]) -> str:
 
 @cache
 def _code() -> str:
-    """Return a digest of this package, so that streams made by other code are not reused."""
+    """Return a digest of this package's code, so that streams of other versions are not reused."""
     digest = hashlib.blake2b(digest_size=20)
     for file in code_files():
         digest.update(file.read_bytes())
@@ -205,7 +205,7 @@ def code_files() -> list[Path]:
 
 
 def _written(file: Path, streams: Sequence[Stream]) -> bool:
-    """Write streams to the cache and return whether it worked; a run continues if it did not."""
+    """Write streams to the cache; return False, with a warning, if they cannot be written."""
     if not streams:
         return False
     tables = [_tables(stream) for stream in streams]
@@ -249,7 +249,7 @@ def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
 
 
 def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
-    """Return the stream that `_tables` took apart."""
+    """Rebuild a stream from the arrays of `_tables`."""
     if kind == "poses":
         return WorldStream(name, **tables)
     legs = tables["legs"]

@@ -86,9 +86,9 @@ def split_at_gaps(
     valid: BoolArray | None = None,
     max_gap: float = MAX_TRUTH_GAP,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the valid rows of time (N,) and values (N, k), with a row of nan in each gap.
+    """Return the valid rows of time (N,) and values (N, k), with a row of NaN in each gap.
 
-    Gaps are those of `behind_gaps`.
+    Gaps are those of `indices_after_gaps`.
     """
     if valid is not None:
         time, values = time[valid], values[valid]

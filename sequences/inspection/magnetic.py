@@ -40,11 +40,11 @@ _VERDICTS = (
     ("good", math.radians(12.0), 0.75),
     ("coarse", math.radians(25.0), 0.5),
 )
-"""Largest unsteadiness [rad] and least correlation of each verdict."""
+"""Maximum RMS of the bearing [rad] and minimum correlation of each verdict."""
 
 HELD_CHANGE = 2e-3
-"""Least relative change in magnitude of a measured field within half a second. Some phones report a
-calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
+"""Minimum relative change in magnitude of a measured field within half a second. Some phones report
+a calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
 1e-4 for seconds, while that of a measured field changes by 1e-2."""
 
 _NO_FIELD_UT = 1e-9
@@ -72,10 +72,10 @@ class MagneticFindings:
         spread_uT: 10th and 90th percentile of the magnitude [uT].
         dip_rad: median angle below the horizontal [rad].
         correlation: correlation of dm/dt and -w x (m - b); None if the device hardly turns.
-        lag_s: time by which the samples are stamped late [s]; None likewise, and if it is outside
-            the range searched.
+        lag_s: time by which the samples are stamped late [s]; None in that case, and if it is
+            outside the range searched.
         hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
-        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None likewise.
+        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None if the lag is.
         bearing_rms_rad: median RMS of the levelled bearing about a line over a minute [rad].
         drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
         held: share of the half seconds with rotation in which the device extrapolated the field
@@ -143,8 +143,8 @@ class MagneticFindings:
         )
         if self.held > _OFTEN:
             lines.append(
-                f"  constant in size: extrapolated by the device's own gyroscope {self.held:.0%} "
-                "of the time that it turns, and given little weight then"
+                f"  constant in magnitude: extrapolated by the device's own gyroscope "
+                f"{self.held:.0%} of the time that it turns, and given little weight then"
             )
         return lines
 
@@ -256,7 +256,7 @@ def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
 
 
 def _held(time: FloatArray, field: FloatArray) -> float:
-    """Return the share of half seconds with rotation in which a field (n, 3) keeps its size."""
+    """Return the share of half seconds with rotation in which a field's (n, 3) size is constant."""
     later = np.searchsorted(time, time + _HALF_SECOND)
     first = np.flatnonzero(later < len(time))
     size = np.maximum(np.linalg.norm(field, axis=1), _NO_FIELD_UT)

@@ -2,8 +2,8 @@
 
 One chi-square test serves all callers, each with its own factor: the scatter of both sensors about
 their means against the white noise of a phone's IMU (`PHONE_NOISE`). The filter's own densities are
-unsuitable here: they include errors of scale and alignment, which arise only in motion. (Whether
-the mean force at the start gives the vertical is another question: a hand may tremble, but a
+unsuitable here: they include errors of scale and alignment, which arise only in motion. (The test
+of whether the mean force at the start gives the vertical is another one: a hand may tremble, but a
 trolley must not accelerate; see `levelling`.)
 
 Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
@@ -28,7 +28,7 @@ _LYING = 6.0
 """Factor for a device at rest, used by inspection: its sensors may be noisier than a phone's."""
 
 _SLOW = 0.06
-"""Largest mean rate [rad/s] that may be a bias: 3.4 degrees per second."""
+"""Largest mean rate [rad/s] that can be a bias: 3.4 degrees per second."""
 
 _PROBABILITY = 0.999
 """Probability that a sensor at rest passes the test."""

@@ -128,7 +128,7 @@ _CONTAINERS = (
     (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
     (b"MATLAB", "a MATLAB file"),
 )
-"""First bytes of files that may hold a recording but that are not unpacked."""
+"""First bytes of files that may hold a recording but are not unpacked, and their description."""
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -174,7 +174,7 @@ def find_recordings(
 
     Args:
         path: a recording, a list file or a folder.
-        on_error: called for each list entry that is empty or leads nowhere; the others are still
+        on_error: called for each list entry that is empty or does not exist; the others are still
             returned. Without it, such an entry raises its error.
         where: attributes that recordings must have (only those in archives have any): patterns for
             each attribute, one of which must match, `{"person": ["dan", "ha*"]}`.
@@ -249,7 +249,7 @@ def _below(path: Path) -> list[Path]:
 def _listed(
     path: Path, on_error: Callable[[ReadError], None] | None, where: AttributeFilter | None
 ) -> list[Path]:
-    """Return what a list names, each once; a list in a list is an error: it could be a cycle."""
+    """Return a list's recordings, each once; a nested list is an error: it could be a cycle."""
     found: list[Path] = []
     for entry in list_entries(path):
         try:
@@ -285,7 +285,7 @@ def _poses_alone(path: Path, pose: Path) -> ReadError:
 
 
 def _unknown(path: Path) -> ReadError:
-    """Return an error that states in one line what was found instead of a recording."""
+    """Return an error that describes what was found instead of a recording."""
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"

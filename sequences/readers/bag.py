@@ -6,7 +6,7 @@ whatever precedes them, and has the stamp at byte 4, both in ROS 1's serialisati
 is fast and needs no type definitions, which older `.db3` files lack.
 
 Time is the header's stamp, or the bag's time if a driver left all stamps zero. Poses are assumed to
-be those of the IMU in a world with z up; `stario inspect` shows if they are not.
+be those of the IMU in a world with z up; `stario inspect` reports if they are not.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
+    """Return whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
     if path.is_dir():
         return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 200)
     head = first_bytes(path)
@@ -171,7 +171,7 @@ def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:
 def _decoded(
     path: Path, topic: str, kind: str, received: list[tuple[int, bytes]], little: bool
 ) -> _Messages:
-    """Return the stamps and doubles of messages; CDR gives its byte order in the second byte."""
+    """Return the stamps and doubles of messages; CDR states its byte order in the second byte."""
     raws = [raw for _, raw in received]
     size = 8 * _DOUBLES[kind]
     shortest = min(map(len, raws), default=0)

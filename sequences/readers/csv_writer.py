@@ -12,7 +12,7 @@ from stario.sequences.sequence import FloatArray, ImuSequence
 
 
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
-    """Write a recording so that `read_own_csv` returns the same numbers; never a partial file.
+    """Write a recording so that `read_generic_csv` returns the same numbers; never a partial file.
 
     Magnetometer samples and the truth's valid poses or positions go into the IMU's rows where
     their times are equal and into separate rows elsewhere; the truth's velocity and covariance

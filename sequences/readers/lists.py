@@ -24,7 +24,7 @@ _CHOICE = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file may be a list: a text suffix and no row of numbers in its first lines.
+    """Return whether a file may be a list: a text suffix and no row of numbers in its first lines.
 
     A line with a single number may be a name, as in TLIO's lists.
     """

@@ -2,10 +2,10 @@
 
 Rows are time, position xyz [m] and a quaternion, or the upper three rows of a pose matrix (ARKit).
 Files differ in the body they describe (camera, display, sensor), in the quaternion's order, which
-some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). The gyroscope
-decides: each file and order is compared with it (`stario.sequences.truth.alignment`), and the best
-is used. Its constant rotation relative to the IMU's axes is removed, and its world is levelled with
-the mean specific force. If several agree, the one with the smallest rotation is the sensor's own.
+some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). Each file and order
+is compared with the gyroscope (`stario.sequences.truth.alignment`), and the best is used. Its
+constant rotation relative to the IMU's axes is removed, and its world is levelled with the mean
+specific force. If several agree, the one with the smallest rotation is the sensor's own.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseCandidate)
 
 
 def _squared(mount: Rotation) -> Rotation:
-    """Return the nearest mount by right angles if it is close, else the mount itself."""
+    """Round a mount to the nearest one by right angles if it is close to that."""
     square = Rotation.create_group("O")
     away = (square.inv() * mount).magnitude()
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount

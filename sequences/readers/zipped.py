@@ -18,7 +18,7 @@ _LARGEST = 4 * 2**30
 
 
 def is_zip(path: Path) -> bool:
-    """Whether a file is a zip with text files in it; never raises."""
+    """Return whether a file is a zip with text files in it; never raises."""
     if path.suffix.lower() != ".zip" or first_bytes(path, 4) != b"PK\x03\x04":
         return False
     try:

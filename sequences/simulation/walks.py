@@ -45,7 +45,7 @@ class WalkStyle:
         step_constant: k in speed = k height step_rate^2 [s]; large for long steps.
         preferred_speed: preferred speed [m/s].
         vigor: strength of arm swing and heel strike, 1 is typical.
-        mount_rotvec: any rotation vector of the device from its neutral attitude [rad].
+        mount_rotvec: rotation vector of the device from its neutral attitude [rad], of any size.
 
     Raises:
         InputError: a carrying mode is unknown or a value is out of range.

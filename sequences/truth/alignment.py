@@ -69,7 +69,7 @@ def align_tracked_body(
     position_WV: FloatArray | None = None,
     max_lag: float = 0.15,
 ) -> BodyAlignment:
-    """Estimate lag, mount (again after every flip) and the tilt of the world.
+    """Estimate the lag, the mount (separately after every flip) and the tilt of the world.
 
     Args:
         imu_time: (N,) [s].
@@ -174,7 +174,7 @@ class _GyroIntegral:
         )
 
     def silent(self, start: float, stop: float) -> bool:
-        """Return whether a gap between two times is too long to carry an attitude across."""
+        """Return whether the samples between two times have a gap too long to integrate across."""
         first, last = np.searchsorted(self.time, [start, stop])
         inside = self.time[max(first - 1, 0) : last + 1]
         return bool(np.diff(inside).max(initial=0.0) > _SILENT_S)
@@ -220,7 +220,8 @@ def _lag_by_axes(
 ) -> float:
     """Return the remaining lag from the rates as vectors, once the mount is known.
 
-    From magnitudes alone, noise of the capture costs up to 12 ms where little is turned: a trolley.
+    From magnitudes alone, the capture's noise costs up to 12 ms if there is little rotation, as on
+    a trolley.
     """
     stride = max(1, round(0.06 / float(np.median(np.diff(time)))))
     rates, good = _rates(time, attitude_WB, valid, stride)

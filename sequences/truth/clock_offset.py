@@ -25,7 +25,7 @@ def clock_offset(
     """Return the offset [s] to add to the truth's clock, from the rotation that both measured.
 
     If both stretches overlap in time, offsets of up to 5 s are searched, otherwise all of them. The
-    result is good to a few hundredths of a second; `align_tracked_body` refines it.
+    result is accurate to a few hundredths of a second; `align_tracked_body` refines it.
 
     Args:
         imu_time: (N,) [s].

@@ -37,7 +37,7 @@ the same rotations; published recordings have at least 0.97 and 0.999. An even g
 itself a few steps later by up to 0.94, but with a lower share."""
 
 _EDGE_S = 0.05
-"""An offset this close [s] to the largest one searched is the end of the search, not the best."""
+"""An offset this close [s] to the largest one searched is the end of the search, not a maximum."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,8 +109,8 @@ def _rows(
 ) -> FloatArray:
     """Return rows (M, 10), two for each instant, whose columns are means in W.
 
-    Lever arm (3), bias (3), the force along `up_B`, the force across it, the latter rotated by 90
-    degrees, and the second difference of the position.
+    Lever arm (3), bias (3), the force along `up_B`, the force perpendicular to it, the latter
+    rotated by 90 degrees, and the second difference of the position.
     """
     dt = float(np.median(np.diff(time)))
     k = max(1, round(_H_S / dt))

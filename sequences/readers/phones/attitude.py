@@ -1,4 +1,4 @@
-"""The attitude that a phone's own fusion logged alongside its sensors.
+"""Attitude logged by a phone's own sensor fusion.
 
 Apps differ in the order of a quaternion and in whether it takes the body to the world or back, so
 all variants are compared with the gyroscope: over a step the attitude rotates by R_k^T R_k+1 in the

@@ -82,7 +82,7 @@ def read_event_lines(path: Path) -> ImuSequence:
 
 
 def is_event_lines(path: Path) -> bool:
-    """Whether a text file's first lines hold a sensor event."""
+    """Return whether a text file's first lines hold a sensor event."""
     if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
         return False
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))

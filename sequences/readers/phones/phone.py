@@ -8,8 +8,8 @@ values without a unit are in rad/s, m/s^2 and uT.
 A wide file (AndroSensor, Physics Toolbox, phyphox, `*_IMU.txt`) has a clock and columns for each
 sensor; cells of sensors that were not sampled are empty.
 
-Both sensors are brought to the gyroscope's times in their common time span. If the accelerometer's
-file lacks gravity and there is a file of gravity, it is added. Apple's accelerometers report the
+The accelerometer is interpolated to the gyroscope's times in their common time span. If its file
+lacks gravity and there is a file of gravity, that is added. Apple's accelerometers report the
 opposite of specific force, in g: this is determined from the app and system that the folder
 indicates (Sensor Logger's `Metadata.csv`), or from the phone's own attitude. A pose that an ARCore
 or ARKit logger wrote alongside is the ground truth, see `poses`; reference points (`*_ref.csv`:
@@ -92,7 +92,7 @@ def read_wide(path: Path) -> ImuSequence:
 
 
 def is_wide(path: Path) -> bool:
-    """Whether a file's header names a clock and the axes of both sensors.
+    """Return whether a file's header names a clock and the axes of both sensors.
 
     A generic CSV does not count unless poses lie next to it or it holds two kinds of force.
     """
@@ -170,7 +170,7 @@ def assemble_recording(
 
 
 def is_phone(path: Path) -> bool:
-    """Whether a folder holds one recording, or a file is the gyroscope file of one of several.
+    """Return whether a folder holds one recording, or a file is the gyroscope file of one of many.
 
     Never raises.
     """
@@ -244,7 +244,7 @@ def gyro_folder(files: PhoneFiles) -> Path:
 
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
-    """Return the first that holds gravity in m/s^2, else the steadiest that may hold it in g."""
+    """Return the first candidate with gravity in m/s^2, else the steadiest that may be in g."""
     sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
     for one, size in zip(candidates, sizes, strict=True):
         if float(np.median(size)) >= _GRAVITY_REMOVED:

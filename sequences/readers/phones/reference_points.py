@@ -17,7 +17,7 @@ from stario.sequences.units import TIME_UNITS
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
 
 _BESIDE_S = 60.0
-"""Maximum time of reference points before or after their recording."""
+"""Maximum time [s] by which reference points may precede or follow their recording."""
 
 
 def reference_points(

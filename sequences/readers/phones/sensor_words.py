@@ -1,8 +1,8 @@
 """Sensor, axis and unit of a file or a column, determined by its name.
 
 Apps spell the same things in many ways (`TotalAcceleration.csv`, `gyr_walk1.txt`, `magneticFieldX`,
-`ACCELEROMETER X (m/s²)`, `gFx`). A name is split into words at case changes and at non-letters, and
-the words decide, so that order, case and surrounding characters do not matter.
+`ACCELEROMETER X (m/s²)`, `gFx`). A name is split into words at case changes and at non-letters,
+which are then looked up, so that order, case and surrounding characters do not matter.
 """
 
 from __future__ import annotations
@@ -99,19 +99,19 @@ def _sensor(word: str) -> Sensor | None:
 
 
 def is_sensor_word(word: str) -> bool:
-    """Whether a word names a sensor or one of its variants, rather than a recording."""
+    """Return whether a word names a sensor or one of its variants, rather than a recording."""
     variants = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
     return _sensor(word) is not None or word.startswith(variants)
 
 
 def without_sensor(stem: str) -> str:
-    """Remove the sensor from a file's name, otherwise unchanged: `Eight_gyr` becomes `Eight`."""
+    """Remove the words of sensors from a file's name: `Eight_gyr` becomes `Eight`."""
     kept = _WORD.sub(lambda match: "" if is_sensor_word(match[0].lower()) else match[0], stem)
     return re.sub(r"[_\W]*$|^[_\W]*", "", re.sub(r"([_\W])[_\W]+", r"\1", kept))
 
 
 def is_uncalibrated(words: Iterable[str]) -> bool:
-    """Whether words name a sensor's raw variant."""
+    """Return whether words name a sensor's raw variant."""
     return any(word.startswith(("uncal", "raw")) for word in words)
 
 
@@ -145,7 +145,7 @@ def quaternion_of(name: str) -> str | None:
 
 
 def is_time(name: str) -> bool:
-    """Whether a column is a clock."""
+    """Return whether a column is a clock."""
     words = set(words_of(name))
     return bool(words & _TIME) and not words & _NO_TIME
 

@@ -1,4 +1,4 @@
-"""Whether a phone's accelerometer reports specific force or, as Apple's do, its opposite.
+"""Sign of a phone's accelerometer: specific force or, as on Apple's phones, its opposite.
 
 The accelerometer and the gyroscope do not reveal the sign: a world upside down moves the same way.
 It is determined from the phone's own attitude if that was logged, since specific force points up,
@@ -30,11 +30,11 @@ _CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
 """Beginnings of names of files that only loggers on iOS write."""
 
 _SURE = 0.7
-"""Minimum mean cosine between an attitude's vertical and the force for it to decide."""
+"""Minimum mean cosine between an attitude's vertical and the force that determines the sign."""
 
 
 def is_in_g(values: FloatArray) -> bool:
-    """Whether an accelerometer's samples (N, 3) have norms of about one: gravity in g."""
+    """Return whether an accelerometer's samples (N, 3) have norms of about one: gravity in g."""
     size = np.linalg.norm(values, axis=1)
     low, median = np.percentile(size, [10, 50])
     return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
@@ -107,7 +107,7 @@ def _by_metadata(file: Path) -> float | None:
 
 
 def _has_core_motion(files: PhoneFiles) -> bool:
-    """Whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
+    """Return whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
     titles = [
         place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
     ]
