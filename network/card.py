@@ -28,7 +28,7 @@ FRAMES = (FRAME, "gravity-aligned, z up, yaw arbitrary")
 MAX_SIGMA = 5.0
 """Upper limit of sigma [m]: nobody walks further in a second."""
 
-_STEEPEST = 10.0
+_MAX_EXPONENT = 10.0
 """Largest accepted exponent, larger than any calibration yields."""
 
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
@@ -174,8 +174,8 @@ def _calibration(content: dict[str, list[float]]) -> Calibration:
             raise ValueError(f"calibration.{name} {values!r}")
     if min(content["floor"]) <= 0.0:
         raise ValueError(f"calibration.floor {content['floor']!r}, allowing a covariance of 0")
-    if max(content["exponent"]) > _STEEPEST:
-        raise ValueError(f"calibration.exponent {content['exponent']!r}, above {_STEEPEST:g}")
+    if max(content["exponent"]) > _MAX_EXPONENT:
+        raise ValueError(f"calibration.exponent {content['exponent']!r}, above {_MAX_EXPONENT:g}")
     return Calibration(**{name: (x, y, z) for name, (x, y, z) in content.items()})
 
 

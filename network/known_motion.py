@@ -36,11 +36,11 @@ _WINDOWS_OF_CENTRE = 20
 """Minimum number of windows without overlap per centre: with fewer, the centres become the windows
 themselves, and no other window is near them."""
 
-_LEAST_WINDOWS = 60
+_MIN_WINDOWS = 60
 """Minimum number of windows without overlap, a minute, to summarise known motion."""
 
-_MOST_WINDOWS = 20_000
-_AT_ONCE = 256
+_MAX_WINDOWS = 20_000
+_BATCH = 256
 _WALKING = 0.3
 _PERCENTILE = 95.0
 
@@ -171,25 +171,25 @@ def known_motion(
     """
     imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
     count = sum(len(imu) // WINDOW_SAMPLES for imu in imus)
-    if count < _LEAST_WINDOWS:
+    if count < _MIN_WINDOWS:
         return None
-    stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
+    stride = max(20, sum(map(len, imus)) // _MAX_WINDOWS)
     values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
-    told = {
+    extra = {
         "step_rate": np.concatenate([step_rates(imu) for imu in imus]),
         "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
-    most = min(_CENTRES, count // _WINDOWS_OF_CENTRE)
-    centres, limit = _centres(scaled_features(values), most, seed)
-    columns = dict(zip(FEATURES, values.T, strict=True)) | told
+    centre_count = min(_CENTRES, count // _WINDOWS_OF_CENTRE)
+    centres, limit = _centres(scaled_features(values), centre_count, seed)
+    columns = dict(zip(FEATURES, values.T, strict=True)) | extra
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
 
 
 def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
     """Yield windows (B, 6, 200) every `stride` samples, a few at a time."""
     starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
-    for first in range(0, len(starts), _AT_ONCE):
-        rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
+    for first in range(0, len(starts), _BATCH):
+        rows = starts[first : first + _BATCH, None] + np.arange(WINDOW_SAMPLES)
         yield imu[rows].transpose(0, 2, 1)
 
 

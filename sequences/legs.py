@@ -149,15 +149,15 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         position = np.column_stack([position, np.zeros(len(position))])
     if known.kind == "waypoints":
         ends = np.arange(len(time))
-        whole = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
+        unbroken = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
     else:
         ends = _ticks(time)
         breaks = np.concatenate([[0], np.cumsum(gaps_and_jumps(time, position))])
-        whole = np.diff(breaks[ends]) == 0
+        unbroken = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]
     displacement = np.diff(position[ends], axis=0)
     speed = np.linalg.norm(displacement, axis=1) / (stop - start)
-    keep = whole & (stop - start >= _SHORTEST_LEG) & (speed <= _FASTEST_LEG)
+    keep = unbroken & (stop - start >= _SHORTEST_LEG) & (speed <= _FASTEST_LEG)
     if known.kind == "waypoints":
         sigma = np.hypot(_TAP_SIGMA, _TAP_TIME * speed)
     else:

@@ -241,11 +241,11 @@ class ImuSequence:
     def summary(self) -> str:
         """Return a description of the recording in one line."""
         field, own = self.magnetometer, self.device_attitude
-        told = [self.source] if self.source else []
-        told.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
-        told.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
-        told += [] if own is None else ["the device's own attitude"]
-        return f"{self.name}: {', '.join(told)}, truth: {self.truth_summary()}"
+        parts = [self.source] if self.source else []
+        parts.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
+        parts.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
+        parts += [] if own is None else ["the device's own attitude"]
+        return f"{self.name}: {', '.join(parts)}, truth: {self.truth_summary()}"
 
     def truth_summary(self) -> str:
         """Return a description of the ground truth in a few words."""

@@ -42,14 +42,14 @@ def with_settings(default: Group, values: object, name: str = "") -> Group:
     for key, value in values.items():
         if key not in known:
             raise ConfigError(f"{prefix}{key}", "an unknown key", f"one of {', '.join(known)}")
-        given[key] = _fitting(f"{prefix}{key}", value, known[key])
+        given[key] = _checked_value(f"{prefix}{key}", value, known[key])
     try:
         return replace(default, **given)  # type: ignore[type-var]
     except InputError as error:
         raise ConfigError(f"{prefix}{error.field}", error.found, error.expected) from error
 
 
-def _fitting(name: str, value: Any, default: Any) -> Any:
+def _checked_value(name: str, value: Any, default: Any) -> Any:
     if is_dataclass(default):
         return with_settings(default, value, name)
     if isinstance(default, tuple) and isinstance(value, list):

@@ -109,7 +109,7 @@ def survey(
             graphs.append(_graph_engine(model, cache))
             progress(0.6 * done / len(models))
         engines["onnxruntime"] = graphs
-    times = {name: _times(some) if some else None for name, some in engines.items()}
+    times = {name: _times(group) if group else None for name, group in engines.items()}
     progress(0.9)
     rows = []
     for column, (name, entry, model) in enumerate(zip(names, entries, models, strict=True)):

@@ -168,10 +168,10 @@ class WindowSampler:
         imu, displacement = apply_swing(imu, displacement, swings)
         heading = heading_of(facing.view(size, seconds, -1, 2), swings)
         imu = imu.reshape(size * seconds, WINDOW_SAMPLES, 6)
-        seen = augmented(imu, heading.flatten(), a, self.generator, seconds)
-        displacement = displacement.reshape(-1, 1, 3) @ seen.R_HW.mT
-        displacement = displacement * seen.mirror[:, None, 3:]
-        return seen.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
+        varied = augmented(imu, heading.flatten(), a, self.generator, seconds)
+        displacement = displacement.reshape(-1, 1, 3) @ varied.R_HW.mT
+        displacement = displacement * varied.mirror[:, None, 3:]
+        return varied.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)

@@ -137,7 +137,7 @@ class TrainingRun:
         legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
         with_sigma = self.step >= self.config.likelihood_from * self.config.steps
-        loss, error = step_loss(self._answers, windows, target, legs, with_sigma)
+        loss, error = step_loss(self._predict, windows, target, legs, with_sigma)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -151,7 +151,7 @@ class TrainingRun:
         self._windows += sum(part[..., 0, 0].numel() for part in parts)
         return error
 
-    def _answers(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+    def _predict(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Return displacements and log sigmas (B, 3) of windows (B, 6, 200).
 
         A recurrent network receives them as rows of `config.successive` windows.
@@ -254,8 +254,8 @@ class TrainingRun:
             ReadError: the checkpoint cannot be read.
         """
         if self.workers.is_leader:
-            for left in self.folder.glob(".*.tmp"):  # from an interrupted write
-                left.unlink(missing_ok=True)
+            for leftover in self.folder.glob(".*.tmp"):  # from an interrupted write
+                leftover.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)

@@ -71,11 +71,11 @@ def train(
     if not streams or not validation:
         fix = "positions and waypoints can only be learned alongside them" if legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
-    with workers(config.device, config.batch // config.successive) as these:
+    with workers(config.device, config.batch // config.successive) as processes:
         sampler = _sampler(config, streams, weights)
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = TrainingRun(
-            config, sampler, leg_samplers(config, legs, sampler), material, folder, these
+            config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
         )
         if start_from is not None:
             run.start_from(start_from)
@@ -93,7 +93,7 @@ def train(
         while run.step < config.steps and not run.should_stop():
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)
-            if these.is_leader:
+            if processes.is_leader:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
@@ -121,9 +121,9 @@ def _material(
     start_from: DisplacementModel | None,
 ) -> str:
     """Return the digest of training data, validation data and initial weights."""
-    told = [
+    content = [
         [[(stream.name, len(stream)) for stream in part] for part in streams],
         [f"{weight:.6g}" for weight in weights],
         start_from.card.sha256 if start_from else "",
     ]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()

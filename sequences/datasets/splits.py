@@ -68,10 +68,10 @@ def hold_out_group(
         InputError: the group contains no recording, or all of them.
     """
     known = list(recordings)
-    outside = [one for one in known if not one.within(group)]
-    inside = [one for one in known if one.within(group)]
+    outside = [entry for entry in known if not entry.within(group)]
+    inside = [entry for entry in known if entry.within(group)]
     if not inside or not outside:
-        groups = ", ".join(sorted({one.group for one in known}))
+        groups = ", ".join(sorted({entry.group for entry in known}))
         raise InputError("group", repr(group), f"a prefix of some, but not all, of {groups}")
     return outside, inside
 

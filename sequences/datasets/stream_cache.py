@@ -138,8 +138,8 @@ def recording_files(path: Path) -> list[Path]:
         return [path]
     number = "".join(filter(str.isdigit, path.stem))
     siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
-    alike = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
-    return sorted(alike | set(filter(None, [capture_file(path)])))
+    same_number = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
+    return sorted(same_number | set(filter(None, [capture_file(path)])))
 
 
 @cache
@@ -230,10 +230,10 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
 
 def _sweep(file: Path) -> None:
     """Remove temporary files that killed writers of this file have left."""
-    for left in file.parent.glob(f".{file.name}.*.tmp"):
+    for abandoned in file.parent.glob(f".{file.name}.*.tmp"):
         with suppress(FileNotFoundError):  # its writer has just finished
-            if time.time() - left.stat().st_mtime > _ABANDONED_S:
-                left.unlink()
+            if time.time() - abandoned.stat().st_mtime > _ABANDONED_S:
+                abandoned.unlink()
 
 
 def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
@@ -278,11 +278,11 @@ def _opened(file: Path) -> list[Stream] | None:
     names = list(_TABLES["poses" if metadata[0]["kind"] == "poses" else "legs"])
     first = dict.fromkeys(names, 0)
     streams = []
-    for one in metadata:
-        rows = dict(zip(names, one["rows"], strict=True))
+    for entry in metadata:
+        rows = dict(zip(names, entry["rows"], strict=True))
         tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
         first = {name: first[name] + rows[name] for name in names}
-        streams.append(_stream(one["name"], one["kind"], tables))
+        streams.append(_stream(entry["name"], entry["kind"], tables))
     return streams
 
 

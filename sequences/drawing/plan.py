@@ -107,8 +107,8 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
     for name, track in tracks.items():
         if name == "pdr":  # it has no poses while the person stands
             continue
-        behind = indices_after_gaps(track.time, _MARKED_GAP)
-        if len(behind):
-            x, y = track.position_W[behind, :2].T
+        after = indices_after_gaps(track.time, _MARKED_GAP)
+        if len(after):
+            x, y = track.position_W[after, :2].T
             axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
             label = ""

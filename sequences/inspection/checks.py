@@ -45,7 +45,7 @@ _OFF_GRAVITY = 0.1
 _SHAKEN_OFF_GRAVITY = 0.25
 """The same for a shaken device, whose sensors saturate; without gravity it is near 1."""
 
-_APART_RATIO = 6.0
+_MIN_LOSS_RATIO = 6.0
 """Factor by which a wrong gyroscope unit reduces the average more than the right one."""
 
 _COHERENT = 0.7
@@ -161,9 +161,9 @@ def check_gyro(
     # gravity. So an average that equals gravity, in m/s^2 or g, clears the gyroscope.
     off = min(abs(average / STANDARD_GRAVITY - 1.0), abs(average - 1.0))
     lost, lost_in_degrees = force - average, max(force - in_degrees, 0.0)
-    seen = f"rotations of {speed:.3g} rad/s"
-    if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _APART_RATIO * lost_in_degrees):
-        seen += " that contradict the accelerometer"
+    found = f"rotations of {speed:.3g} rad/s"
+    if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _MIN_LOSS_RATIO * lost_in_degrees):
+        found += " that contradict the accelerometer"
     elif speed <= _FAST_RAD_S:
         return
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
@@ -171,7 +171,7 @@ def check_gyro(
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif unit_known:
         fix = _UNIT_NAMED
-    raise InputError(f"{name}: gyroscope", seen, "rad/s", fix)
+    raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
 
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:

@@ -31,7 +31,7 @@ _STUCK_S = 1.0
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
 """Smallest maxima taken for a limit: below them, repeated values are coarsely rounded ones."""
 
-_OFTEN_AT_LIMIT, _NO_CHANCE = 0.005, 3
+_MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
 """Minimum share and number of samples at the limit for a report."""
 
 _SHAKEN_M_S2 = 0.5
@@ -49,9 +49,9 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
             f"{sequence.name}: time: the clock jumps back by {-steps[k]:.3g} s at "
             f"{time[k] - time[0]:.1f} s; split the recording there"
         )
-    wild = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
-    if wild:
-        problems.append(f"{sequence.name}: values that no sensor can measure, in {wild} samples")
+    invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
+    if invalid:
+        problems.append(f"{sequence.name}: values that no sensor can measure, in {invalid} samples")
     return problems + _stuck_problems(sequence) + _limit_problems(sequence)
 
 
@@ -98,7 +98,7 @@ def _limit_problems(sequence: ImuSequence) -> list[str]:
         at_limit = (values[1:] == values[:-1]) & (size[1:] >= largest) & (largest > large)
         count = int(at_limit.any(axis=1).sum())
         share = count / max(len(at_limit), 1)
-        if share >= _OFTEN_AT_LIMIT and count >= _NO_CHANCE:
+        if share >= _MIN_LIMIT_SHARE and count >= _MIN_LIMIT_COUNT:
             limit = float(largest[at_limit.any(axis=0)].max())
             problems.append(
                 f"{sequence.name}: {sensor}: {share:.1%} of its samples are at its limit of "

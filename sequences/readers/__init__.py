@@ -69,7 +69,7 @@ def _read_zip(path: Path) -> ImuSequence:
     with unpacked(path) as folder:
         found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
         if len(found) > 1:
-            names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
+            names = ", ".join(str(path_inside.relative_to(folder)) for path_inside in found[:4])
             raise ReadError(
                 path, "content", f"{len(found)} recordings ({names})", "one", "unpack the zip"
             )
@@ -214,16 +214,16 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     errors: list[ReadError] = []
     for file, paths in members.items():
         try:
-            fitting = set(archive_members(file, where))
-            chosen += [path for path in paths if path in fitting]
+            matching = set(archive_members(file, where))
+            chosen += [path for path in paths if path in matching]
         except ReadError as error:
             errors.append(error)
     if errors and not chosen:
         raise errors[0]
     if not chosen:
-        asked = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+        filters = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
         fix = "only recordings in archives have attributes"
-        raise ReadError(found[0], f"recordings with {asked}", "none", "at least one", fix)
+        raise ReadError(found[0], f"recordings with {filters}", "none", "at least one", fix)
     return chosen
 
 
@@ -232,10 +232,10 @@ def _below(path: Path) -> list[Path]:
     for folder, subfolders, files in os.walk(path):
         here = Path(folder)
         subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-        whole = [name for name in subfolders if _is_recording(here / name)]
-        found += [here / name for name in whole]
-        doubles = {"raw"} if "syn" in subfolders else set()
-        subfolders[:] = [name for name in subfolders if name not in {*whole, *doubles}]
+        recordings = [name for name in subfolders if _is_recording(here / name)]
+        found += [here / name for name in recordings]
+        duplicates = {"raw"} if "syn" in subfolders else set()
+        subfolders[:] = [name for name in subfolders if name not in {*recordings, *duplicates}]
         for name in files:
             if not name.lower().endswith(_SUFFIXES):
                 continue
@@ -289,14 +289,16 @@ def _unknown(path: Path) -> ReadError:
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif lone := incomplete_sensors(path):
+    elif sensors := incomplete_sensors(path):
         expected = "a gyroscope and an accelerometer"
-        return ReadError(path, "sensors", f"only {' and '.join(lone)}", expected, "log both")
+        return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
         return _poses_alone(path, poses[0])
     elif path.is_dir():
-        there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
+        entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        names = ", ".join(entries[:5]) + (
+            f" and {len(entries) - 5} more" if len(entries) > 5 else ""
+        )
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
     elif kind := next(
         (words for start, words in _CONTAINERS if first_bytes(path).startswith(start)), ""

@@ -116,9 +116,9 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
 
 def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
     """Return whether a recording's attributes, including its `name`, match the filter."""
-    told = {"name": name, **attributes}
+    values = {"name": name, **attributes}
     return all(
-        any(fnmatchcase(_text(told.get(key, "")), pattern) for pattern in patterns)
+        any(fnmatchcase(_text(values.get(key, "")), pattern) for pattern in patterns)
         for key, patterns in where.items()
     )
 
@@ -126,14 +126,16 @@ def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFi
 def _none_chosen(
     path: Path, known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    asked = ", ".join(f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns)
+    wanted = ", ".join(
+        f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns
+    )
     key = next(
         (k for k, patterns in where.items() if not _any(known, {k: patterns})), next(iter(where))
     )
     values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
-    seen = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
-    expected = f"{key} to be one of {seen}" if seen else f"another attribute: none has {key}"
-    return ReadError(path, f"recordings with {asked}", "none", expected)
+    listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
+    expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
+    return ReadError(path, f"recordings with {wanted}", "none", expected)
 
 
 def _any(known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter) -> bool:

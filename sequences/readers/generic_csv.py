@@ -60,7 +60,7 @@ from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME
 
 _log = logging.getLogger(__name__)
 
-_WAYPOINTS_APART = 2.0
+_MIN_WAYPOINT_INTERVAL = 2.0
 """Minimum median interval between waypoints [s]; positions at a shorter one are a track."""
 
 _HEAD_LINES = 200
@@ -204,8 +204,8 @@ def _row(path: Path, number: int, line: str, separator: str, columns: list[Colum
     cells = line.split(separator)
     needed = 1 + max(column.index for column in columns)
     if len(cells) < needed:
-        alone = f"separate the values by {separator!r} as in the header"
-        fix = alone if len(cells) == 1 else "is the file cut short?"
+        separator_fix = f"separate the values by {separator!r} as in the header"
+        fix = separator_fix if len(cells) == 1 else "is the file cut short?"
         raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
     row = []
     for column in columns:
@@ -272,8 +272,8 @@ def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
         _log.warning("%s: %d rows hold a position, too few for a track", path, len(kept))
         return None
     time = rows.time[kept]
-    apart = float(np.median(np.diff(time))) >= _WAYPOINTS_APART
-    return PositionTrack(time, known[kept], "waypoints" if apart else "positions")
+    sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
+    return PositionTrack(time, known[kept], "waypoints" if sparse else "positions")
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:

@@ -219,5 +219,5 @@ def _measured(
     steps[0] = turn_on * rng.standard_normal(3)
     bias = np.cumsum(steps, axis=0)
     noise = white * math.sqrt(rate) * rng.standard_normal(true.shape)
-    shown: FloatArray = np.clip(true @ axes.T * scales + bias + noise, -limit, limit)
-    return shown
+    measured: FloatArray = np.clip(true @ axes.T * scales + bias + noise, -limit, limit)
+    return measured

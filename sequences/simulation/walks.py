@@ -75,7 +75,7 @@ class WalkStyle:
         """Draw a person, a carrying mode (about a third of walks change it) and a mount."""
         carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
         # A device is not put onto a trolley, or taken off it, within a step or two.
-        others = [way for way in CARRYING_MODES if way not in (carry, "trolley")]
+        others = [mode for mode in CARRYING_MODES if mode not in (carry, "trolley")]
         changes = carry != "trolley" and rng.random() < 1.0 / 3.0
         x, y, z = Rotation.random(rng=rng).as_rotvec()
         return WalkStyle(

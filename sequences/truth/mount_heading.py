@@ -84,8 +84,8 @@ def _gyro_information(
     use &= np.arange(len(use)) % stride == 0
     phi_B = (angle[stride:] - angle[:-stride])[use]
     starts = np.flatnonzero(use)
-    seen = (attitude_WB[starts].inv() * attitude_WB[starts + stride]).as_rotvec()
-    deviation = _deviation(seen - phi_B)
+    phi_attitude = (attitude_WB[starts].inv() * attitude_WB[starts + stride]).as_rotvec()
+    deviation = _deviation(phi_attitude - phi_B)
     return float(np.square(np.cross(phi_B, up_B)).sum() / deviation**2)
 
 

@@ -102,8 +102,9 @@ def is_wide(path: Path) -> bool:
     if files is None:
         return False
     axes = files.tables["gyro"][0].axes
-    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx and ax
-    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or more
+    # Two kinds of force: gFx and ax.
+    has_both = "linear" in axes or axes["accel"][0].title.lower().startswith("g")
+    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or has_both
 
 
 def _wide(path: Path) -> PhoneFiles | None:
@@ -215,13 +216,13 @@ def _force(
     """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity = _gravity(files)
-    whole = _with_gravity(candidates, or_g=gravity is None)
+    total = _with_gravity(candidates, or_g=gravity is None)
     linear = files.first("linear")
-    if whole is None and not candidates and linear is not None:
+    if total is None and not candidates and linear is not None:
         candidates = [_read(linear, "linear")]
-    accel = whole or candidates[0]
-    apart = whole is None and gravity is not None
-    if apart and gravity is not None:
+    accel = total or candidates[0]
+    separate_gravity = total is None and gravity is not None
+    if separate_gravity and gravity is not None:
         folder = gyro_folder(files)
         stamps, force, gravity_B = resample_to_gyro(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
@@ -230,7 +231,7 @@ def _force(
         _log.info("%s: added gravity from its separate file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
-    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, apart)
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, separate_gravity)
     in_g &= sign < 0
     if sign < 0:
         converted |= {"accel"}
@@ -245,12 +246,12 @@ def gyro_folder(files: PhoneFiles) -> Path:
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
     """Return the first candidate with gravity in m/s^2, else the steadiest that may be in g."""
-    sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
-    for one, size in zip(candidates, sizes, strict=True):
+    sizes = [np.linalg.norm(candidate.values, axis=1) for candidate in candidates]
+    for candidate, size in zip(candidates, sizes, strict=True):
         if float(np.median(size)) >= _GRAVITY_REMOVED:
-            return one
+            return candidate
     shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
-    maybe = [k for k, one in enumerate(candidates) if or_g and is_in_g(one.values)]
+    maybe = [k for k, candidate in enumerate(candidates) if or_g and is_in_g(candidate.values)]
     return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
 
 

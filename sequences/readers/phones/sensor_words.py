@@ -84,12 +84,12 @@ def sensor_of(words: Iterable[str]) -> Sensor | None:
     words = list(words)
     if set(words) & _NOT_SAMPLES:
         return None
-    told = {sensor for word in words if (sensor := _sensor(word)) is not None}
-    if "linear" in told:  # linear acceleration, user acceleration
-        return "linear" if told <= {"linear", "accel"} else None
-    if told == {"gyro", "attitude"} or (told == {"attitude"} and "rate" in words):
+    sensors = {sensor for word in words if (sensor := _sensor(word)) is not None}
+    if "linear" in sensors:  # linear acceleration, user acceleration
+        return "linear" if sensors <= {"linear", "accel"} else None
+    if sensors == {"gyro", "attitude"} or (sensors == {"attitude"} and "rate" in words):
         return "gyro"  # gyro rotation, rotation rate
-    return next(iter(told)) if len(told) == 1 else None
+    return next(iter(sensors)) if len(sensors) == 1 else None
 
 
 def _sensor(word: str) -> Sensor | None:
@@ -120,10 +120,10 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
     words = words_of(name)
     if set(words) & _NOT_SAMPLES:
         return None
-    alone = [word for word in words if word in ("x", "y", "z")]
-    if len(alone) == 1:
-        return alone[0], tuple(word for word in words if word != alone[0])
-    match = _GLUED.fullmatch(words[-1]) if words and not alone else None
+    axes = [word for word in words if word in ("x", "y", "z")]
+    if len(axes) == 1:
+        return axes[0], tuple(word for word in words if word != axes[0])
+    match = _GLUED.fullmatch(words[-1]) if words and not axes else None
     if match is None or (match["stem"] and _sensor(match["stem"]) is None):
         return None
     return match["axis"], (*words[:-1], match["stem"])
@@ -132,8 +132,8 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
 def bias_axis_of(name: str) -> str | None:
     """Return the axis of a column with a raw sensor's bias; None for other columns."""
     words = words_of(name)
-    alone = [word for word in words if word in ("x", "y", "z")]
-    return alone[0] if len(alone) == 1 and {"bias", "drift", "offset"} & set(words) else None
+    axes = [word for word in words if word in ("x", "y", "z")]
+    return axes[0] if len(axes) == 1 and {"bias", "drift", "offset"} & set(words) else None
 
 
 def quaternion_of(name: str) -> str | None:

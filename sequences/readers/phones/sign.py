@@ -90,8 +90,8 @@ def _by_system(folder: Path, in_g: bool) -> float | None:
         return 1.0
     if "BootTime" in "".join(head_lines(names.get("description.txt", folder))):
         return -1.0
-    apples = any(name.startswith(_CORE_MOTION) for name in names)
-    return -1.0 if apples and in_g else None
+    from_apple = any(name.startswith(_CORE_MOTION) for name in names)
+    return -1.0 if from_apple and in_g else None
 
 
 def _by_metadata(file: Path) -> float | None:
@@ -99,11 +99,11 @@ def _by_metadata(file: Path) -> float | None:
     if len(lines) < 2:
         return None
     titles, cells = ([c.strip().lower() for c in row] for row in csv.reader(lines))
-    told = dict(zip(titles, cells, strict=False))
-    system = told.get("platform", "") or told.get("device name", "")
+    fields = dict(zip(titles, cells, strict=False))
+    system = fields.get("platform", "") or fields.get("device name", "")
     if not any(word in system for word in ("ios", "iphone", "ipad")):
         return 1.0 if system else None
-    return 1.0 if told.get("standardisation", told.get("standardization")) == "true" else -1.0
+    return 1.0 if fields.get("standardisation", fields.get("standardization")) == "true" else -1.0
 
 
 def _has_core_motion(files: PhoneFiles) -> bool:
@@ -124,8 +124,8 @@ def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> 
         return None
     up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     time, clock = (seconds(ns, stamps_ns[0]) for ns in (accel.stamps_ns[inside], stamps_ns))
-    seen = interpolated(time, clock, up_B)
+    vertical = interpolated(time, clock, up_B)
     force = accel.values[inside]
-    sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
-    cosine = float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))
+    sizes = np.linalg.norm(vertical, axis=1) * np.linalg.norm(force, axis=1)
+    cosine = float(np.mean(np.sum(vertical * force, axis=1) / np.maximum(sizes, 1e-9)))
     return float(np.sign(cosine)) if abs(cosine) > _SURE else None
