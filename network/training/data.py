@@ -150,12 +150,12 @@ def split_off(
     """Split the last fifth off each recording; drop parts that are too short to learn from."""
     first, last = [], []
     for recording in recordings:
-        left = round(0.8 * sum(len(stream) for stream in recording.streams))
+        remaining = round(0.8 * sum(len(stream) for stream in recording.streams))
         before, after = [], []
         for stream in recording.streams:
-            before.append(stream.part(0, left))
-            after.append(stream.part(max(left, 0), len(stream)))
-            left -= len(stream)
+            before.append(stream.part(0, remaining))
+            after.append(stream.part(max(remaining, 0), len(stream)))
+            remaining -= len(stream)
         first.append(replace(recording, streams=[s for s in before if _is_long(s)]))
         last.append(replace(recording, streams=[s for s in after if _is_long(s)]))
     return first, last

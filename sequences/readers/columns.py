@@ -128,11 +128,11 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
         _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-        alike = [title for title in ignored if _LIKE_TRUTH.match(title)]
-        if alike and not truth:
+        truth_like = [title for title in ignored if _LIKE_TRUTH.match(title)]
+        if truth_like and not truth:
             _log.warning(
                 "%s: no ground truth is read from %s: it must have %s",
-                path, ", ".join(alike), TRUTH_HEADER,
+                path, ", ".join(truth_like), TRUTH_HEADER,
             )  # fmt: skip
     for name in truth:
         unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
