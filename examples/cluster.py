@@ -1,4 +1,4 @@
-"""Evaluate many recordings on a cluster: here two local workers; give an address for a real one.
+"""Evaluate many recordings on a cluster: here two local workers; pass an address for a real one.
 
 joblib distributes the recordings to the backend that `joblib.parallel_config` names: with Ray,
 `backend="ray"` after `ray.util.joblib.register_ray()` does the same. The workers must be able to

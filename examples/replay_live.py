@@ -29,7 +29,7 @@ def replay(
     recording: ImuSequence, url: str, speed: float, seconds: float, device: str = "replay"
 ) -> int:
     """Push a recording in batches; return the number of samples that the server accepted."""
-    first_ns, began, taken = time.time_ns(), time.monotonic(), 0
+    first_ns, began, accepted = time.time_ns(), time.monotonic(), 0
     stop = min(recording.duration, seconds)
     sensors = [
         ("gyroscope", recording.time, recording.gyro),
@@ -57,8 +57,8 @@ def replay(
         body = json.dumps(message | {"payload": payload}).encode()
         request = urllib.request.Request(url, body, {"content-type": "application/json"})
         with urllib.request.urlopen(request) as answer:
-            taken += json.load(answer)["samples"]
-    return taken
+            accepted += json.load(answer)["samples"]
+    return accepted
 
 
 def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], Path]:
@@ -76,9 +76,9 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
     listening.wait()
     try:
         url = f"http://127.0.0.1:{server.port}/data"
-        taken = replay(demonstration(), url, speed, seconds)
+        accepted = replay(demonstration(), url, speed, seconds)
         session = server.hub.sessions["replay"]
-        return taken, session.drawn.points[-1][1:4], session.path
+        return accepted, session.drawn.points[-1][1:4], session.path
     finally:
         server.stop()
         thread.join()

@@ -1,4 +1,4 @@
-"""A ROS 2 node around StarIO, a skeleton to start from: ROS is needed only to run as a node.
+"""Skeleton of a ROS 2 node around StarIO; ROS is needed only to run it as a node.
 
     subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
                            mounting works, as the device is levelled by gravity)
@@ -109,8 +109,8 @@ class OdometryBridge:
 
     def fix(self, message: Any) -> None:
         """Apply the position of a geometry_msgs/PoseWithCovarianceStamped in map."""
-        before, steady = self._navigator.state, self._navigator.continuous
-        if before is None or steady is None or self._first_ns is None:
+        before, continuous = self._navigator.state, self._navigator.continuous
+        if before is None or continuous is None or self._first_ns is None:
             return
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         at = message.pose.pose.position
@@ -120,7 +120,7 @@ class OdometryBridge:
         after = self._navigator.state
         if after.map_frame == before.map_frame:
             return  # an ordinary correction, which is applied gradually
-        self._follow(Transform(_attitude(before), steady.p_W), after)
+        self._follow(Transform(_attitude(before), continuous.p_W), after)
         self._last = self._navigator.continuous
 
     def _follow(self, before: Transform, after: NavState) -> None:
@@ -131,8 +131,8 @@ class OdometryBridge:
         self._frame = Transform(R, after.p_W - R.apply(stays))
 
     def _odometry(self, state: NavState, gyro: np.ndarray) -> Odometry:
-        steady, P = self._navigator.continuous, state.covariance
-        correction = Transform(Rotation.identity(), steady.correction_W)
+        continuous, P = self._navigator.continuous, state.covariance
+        correction = Transform(Rotation.identity(), continuous.correction_W)
         to_odom = self._frame.R.inv().as_matrix()
         pose = np.zeros((6, 6))
         pose[:3, :3], pose[3:, 3:] = P[6:9, 6:9], P[:3, :3]
@@ -143,7 +143,7 @@ class OdometryBridge:
         turn = np.kron(np.eye(2), to_odom)
         return Odometry(
             stamp_ns=(self._first_ns or 0) + round(state.time * 1e9),
-            odom_base=self._frame.inverse() @ Transform(_attitude(steady), steady.p_W),
+            odom_base=self._frame.inverse() @ Transform(_attitude(continuous), continuous.p_W),
             map_odom=correction @ self._frame,
             pose_covariance=turn @ pose @ turn.T,
             linear=_attitude(state).inv().apply(state.v_W),
@@ -214,28 +214,28 @@ def spin() -> None:
             found = self.bridge.imu(message)
             if found is None:
                 return
-            told = OdometryMessage()
+            output = OdometryMessage()
             stamp = rclpy.time.Time(nanoseconds=found.stamp_ns).to_msg()
-            told.header.stamp, told.header.frame_id = stamp, "odom"
-            told.child_frame_id = "base_link"
-            place(found.odom_base, told.pose.pose.position, told.pose.pose.orientation)
-            told.pose.covariance = found.pose_covariance.ravel().tolist()
-            told.twist.covariance = found.twist_covariance.ravel().tolist()
+            output.header.stamp, output.header.frame_id = stamp, "odom"
+            output.child_frame_id = "base_link"
+            place(found.odom_base, output.pose.pose.position, output.pose.pose.orientation)
+            output.pose.covariance = found.pose_covariance.ravel().tolist()
+            output.twist.covariance = found.twist_covariance.ravel().tolist()
             for vector, values in (
-                (told.twist.twist.linear, found.linear),
-                (told.twist.twist.angular, found.angular),
+                (output.twist.twist.linear, found.linear),
+                (output.twist.twist.angular, found.angular),
             ):
                 vector.x, vector.y, vector.z = values.tolist()
-            self.odometry.publish(told)
+            self.odometry.publish(output)
             for parent, child, where in (
                 ("map", "odom", found.map_odom),
                 ("odom", "base_link", found.odom_base),
             ):
-                sent = TransformStamped()
-                sent.header.stamp, sent.header.frame_id = stamp, parent
-                sent.child_frame_id = child
-                place(where, sent.transform.translation, sent.transform.rotation)
-                self.transforms.sendTransform(sent)
+                transform = TransformStamped()
+                transform.header.stamp, transform.header.frame_id = stamp, parent
+                transform.child_frame_id = child
+                place(where, transform.transform.translation, transform.transform.rotation)
+                self.transforms.sendTransform(transform)
 
     def place(where: Transform, position: Any, orientation: Any) -> None:
         position.x, position.y, position.z = where.p.tolist()

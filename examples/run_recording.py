@@ -1,4 +1,4 @@
-"""Compute a fused track of a recording: your own CSV needs nothing but IMU columns.
+"""Compute a fused track of a recording: a CSV of your own needs only IMU columns.
 
 python examples/run_recording.py [RECORDING]
 """

@@ -45,7 +45,7 @@ def exported(folder: Path) -> Path:
 
 
 def main(path: Path | None = None, seconds: float = 20.0) -> dict[str, Any]:
-    """Stream on an exported model; return the last position, and the time and memory needed."""
+    """Stream with an exported model; return the last position, and the time and memory needed."""
     with tempfile.TemporaryDirectory() as folder:
         states, loading = stream(path or exported(Path(folder)), seconds)
     return {

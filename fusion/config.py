@@ -176,7 +176,7 @@ def read_config(path: Path | str) -> NavigatorConfig:
         text = path.read_text(encoding="utf-8")
         values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except FileNotFoundError:
-        raise ConfigError(str(path), "nothing there", "a TOML or JSON file") from None
+        raise ConfigError(str(path), "no such file", "a TOML or JSON file") from None
     except OSError as error:
         found = error.strerror or "an error"
         raise ConfigError(str(path), found, "a TOML or JSON file") from error

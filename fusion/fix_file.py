@@ -47,7 +47,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
         separator = max(",;\t", key=lines[0].count) if lines else ","
         rows = list(csv.reader(lines, delimiter=separator))
     except FileNotFoundError:
-        raise ReadError(path, "file", "nothing there", "a CSV of fixes") from None
+        raise ReadError(path, "file", "no such file", "a CSV of fixes") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
     header = [_without_unit(word).lower() for word in rows[0]] if rows else []

@@ -35,7 +35,7 @@ class DisplacementNetwork(nn.Module):
 
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Map windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
-        return _parted(self.network(windows - self.gravity))
+        return _split_output(self.network(windows - self.gravity))
 
     def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run a recurrent network as in `forward`, starting from its state (2, B, H).
@@ -45,7 +45,7 @@ class DisplacementNetwork(nn.Module):
         """
         network: Any = self.network
         output, after = network.step(windows - self.gravity, state)
-        return *_parted(output), after
+        return *_split_output(output), after
 
     def first_state(self, batch: int) -> Tensor:
         """Return the state (2, B, H) of a recurrent network before the first window."""
@@ -54,6 +54,6 @@ class DisplacementNetwork(nn.Module):
         return state
 
 
-def _parted(output: Tensor) -> tuple[Tensor, Tensor]:
+def _split_output(output: Tensor) -> tuple[Tensor, Tensor]:
     output = output.float()
     return output[..., :3], output[..., 3:].clamp(*_LOG_SIGMA_RANGE)

@@ -195,7 +195,7 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     if path.parent == Path() and not path.suffix and packaged.is_file():
         path = packaged
     if path.parent == Path() and not path.suffix and not path.exists():
-        raise WeightsError(path, "weights", "nothing there", f"a file, or {packaged_names()}")
+        raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}")
     card = read_card(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"
@@ -225,7 +225,7 @@ def weights_named(name: str, runs: Path) -> str | Path:
         runs: folder of training runs.
 
     Raises:
-        WeightsError: the architecture has no weights there.
+        WeightsError: the architecture has no weights in `runs`.
     """
     if name not in ARCHITECTURES:
         return name
@@ -235,7 +235,7 @@ def weights_named(name: str, runs: Path) -> str | Path:
     if name == "StarIO":
         return "default"
     fix = f"train it: stario train --model '{name}' --out '{runs / name}'"
-    raise WeightsError(path, "file", "nothing there", f"weights of {name}", fix)
+    raise WeightsError(path, "file", "no such file", f"weights of {name}", fix)
 
 
 def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:

@@ -27,7 +27,7 @@ def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s], checked to be finite and strictly increasing.
 
     Raises:
-        InputError: they are not.
+        InputError: a time is not finite, or the times do not strictly increase.
     """
     time = np.asarray(value, dtype=np.float64)
     if time.ndim != 1 or time.size == 0:
@@ -49,7 +49,7 @@ def checked_array(
     """Return `value` as an array, checked for its shape and for finite rows at `where`.
 
     Raises:
-        InputError: it is not.
+        InputError: the shape differs, or a row at `where` has a value that is not finite.
     """
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:

@@ -66,7 +66,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             raise InputError("path", str(path), "a file in an existing folder", "create the folder")
         if path.is_dir():
             raise InputError("path", f"the folder {path}", "a file")
-        temporary = _beside(path)
+        temporary = _temporary_path(path)
         try:
             yield temporary
             temporary.replace(path)
@@ -96,7 +96,7 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
             raise InputError("path", str(path), expected, "create the folder")
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
             raise InputError("path", f"{path}, which exists", "a new folder")
-        temporary = _beside(path)
+        temporary = _temporary_path(path)
         try:
             temporary.mkdir()
             yield temporary
@@ -108,7 +108,7 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
             raise
 
 
-def _beside(path: Path) -> Path:
+def _temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
 
 
@@ -232,9 +232,9 @@ def _is_finite(word: str) -> bool:
 
 
 def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:
-    stuck = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
-    if len(stuck):
-        k = int(stuck[0])
+    not_increasing = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    if len(not_increasing):
+        k = int(not_increasing[0])
         found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
         raise ReadError(path, f"line {numbers[k + 1]}, t", found, "strictly increasing seconds")
     norm = np.linalg.norm(rows[:, 4:], axis=1)

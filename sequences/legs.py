@@ -27,8 +27,8 @@ _FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
 """A faster step between two samples [m/s] is a jump of the track; a longer step [s] is a gap."""
 
 _SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
-"""In a low-rate track, such as from GNSS, a gap is longer than this many median steps or than this
-many seconds, whichever is less: a pedestrian has turned by then."""
+"""In a low-rate track, for example from GNSS, a gap is longer than this many median steps or than
+this many seconds, whichever is less: a pedestrian has turned by then."""
 
 _TRACK_SIGMA = 0.15
 """Sigma of a track's positions [m]: the reference device is not rigidly fixed to the IMU."""
@@ -149,15 +149,15 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         position = np.column_stack([position, np.zeros(len(position))])
     if known.kind == "waypoints":
         ends = np.arange(len(time))
-        whole = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
+        unbroken = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
     else:
         ends = _ticks(time)
         breaks = np.concatenate([[0], np.cumsum(gaps_and_jumps(time, position))])
-        whole = np.diff(breaks[ends]) == 0
+        unbroken = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]
     displacement = np.diff(position[ends], axis=0)
     speed = np.linalg.norm(displacement, axis=1) / (stop - start)
-    keep = whole & (stop - start >= _SHORTEST_LEG) & (speed <= _FASTEST_LEG)
+    keep = unbroken & (stop - start >= _SHORTEST_LEG) & (speed <= _FASTEST_LEG)
     if known.kind == "waypoints":
         sigma = np.hypot(_TAP_SIGMA, _TAP_TIME * speed)
     else:

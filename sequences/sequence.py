@@ -31,7 +31,7 @@ MAX_TRUTH_GAP = 0.1
 """Longest step [s] between two valid ground-truth samples that is interpolated across."""
 
 MAX_SENSOR_VALUE = 1e5
-"""Larger than any sensor's values in any unit used here; also catches infinities."""
+"""Bound above any sensor's values in any unit used here; also catches infinities."""
 
 MAX_IMU_GAP = 0.1
 """Longest step [s] between IMU samples that is bridged by interpolation."""
@@ -241,11 +241,11 @@ class ImuSequence:
     def summary(self) -> str:
         """Return a description of the recording in one line."""
         field, own = self.magnetometer, self.device_attitude
-        told = [self.source] if self.source else []
-        told.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
-        told.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
-        told += [] if own is None else ["the device's own attitude"]
-        return f"{self.name}: {', '.join(told)}, truth: {self.truth_summary()}"
+        parts = [self.source] if self.source else []
+        parts.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
+        parts.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
+        parts += [] if own is None else ["the device's own attitude"]
+        return f"{self.name}: {', '.join(parts)}, truth: {self.truth_summary()}"
 
     def truth_summary(self) -> str:
         """Return a description of the ground truth in a few words."""
@@ -269,7 +269,7 @@ class ImuSequence:
         return replace(self, truth=None, positions=None)
 
     def slice(self, start: float, stop: float) -> ImuSequence:
-        """Return the samples with start <= time <= stop [s], and all other data likewise."""
+        """Return the samples with start <= time <= stop [s], and all other data within them."""
         keep = (self.time >= start) & (self.time <= stop)
         field, positions, own = self.magnetometer, self.positions, self.device_attitude
         return replace(
@@ -298,7 +298,7 @@ def low_rate_message(truth: Trajectory) -> str:
 
 
 def whole_seconds(time: FloatArray) -> FloatArray:
-    """Return each second (M,) [s] from the first of increasing times (N,) until before the last.
+    """Return each second (M,) [s] from the first of increasing times (N,) to before the last.
 
     Seconds within a gap are skipped: the path there is straight, and a clock that jumps by decades
     must not cost memory.

@@ -16,7 +16,7 @@ def check_number(settings: object, name: str, low: float = 0.0, high: float = ma
     """Check that a field is a finite number within bounds.
 
     Raises:
-        ConfigError: it is not; the error names the field and the bounds.
+        ConfigError: the field is anything else; the error names it and the bounds.
     """
     value: Any = getattr(settings, name)  # NumPy scalars are Real, too
     if not (isinstance(value, Real) and math.isfinite(value) and low <= float(value) <= high):
@@ -28,12 +28,12 @@ def with_settings(default: Group, values: object, name: str = "") -> Group:
     """Return a frozen dataclass with some of its values replaced, also within nested groups.
 
     Args:
-        default: provides every value not given; its own checks validate the result.
+        default: dataclass with the values not given; its own checks validate the result.
         values: a parsed TOML table or JSON object.
         name: name of the group, for messages.
 
     Raises:
-        ConfigError: `values` is no table, a key is unknown, or a value is invalid.
+        ConfigError: `values` is not a table, a key is unknown, or a value is invalid.
     """
     if not isinstance(values, dict):
         raise ConfigError(name, repr(values), "a table of values")
@@ -42,20 +42,20 @@ def with_settings(default: Group, values: object, name: str = "") -> Group:
     for key, value in values.items():
         if key not in known:
             raise ConfigError(f"{prefix}{key}", "an unknown key", f"one of {', '.join(known)}")
-        given[key] = _fitting(f"{prefix}{key}", value, known[key])
+        given[key] = _checked_value(f"{prefix}{key}", value, known[key])
     try:
         return replace(default, **given)  # type: ignore[type-var]
     except InputError as error:
         raise ConfigError(f"{prefix}{error.field}", error.found, error.expected) from error
 
 
-def _fitting(name: str, value: Any, default: Any) -> Any:
+def _checked_value(name: str, value: Any, default: Any) -> Any:
     if is_dataclass(default):
         return with_settings(default, value, name)
     if isinstance(default, tuple) and isinstance(value, list):
         return tuple(value)
     wanted = (float, int) if isinstance(default, float) else (type(default),)
-    # A field that defaults to None may have any type: the group's own checks decide.
+    # A field that defaults to None may have any type; the group's own checks validate it.
     if default is not None and type(value) not in wanted:
         raise ConfigError(name, repr(value), f"a value of type {type(default).__name__}")
     return value

@@ -23,7 +23,7 @@ def increasing_mask(time: FloatArray) -> BoolArray:
     """Return which of the finite times (N,) [s] to keep, so that kept times strictly increase.
 
     A time that is not later than all kept ones before it is dropped. So are a few that jump ahead
-    of those after them: otherwise a single wild time would make all that follow look late.
+    of those after them: otherwise all times after a single wrong one would be dropped.
     """
     steps = np.diff(time)
     breaks = np.flatnonzero((steps < 0.0) | (steps > MAX_IMU_GAP)) + 1
@@ -37,14 +37,14 @@ def increasing_mask(time: FloatArray) -> BoolArray:
             start += int(np.searchsorted(time[start:stop], newest, side="right"))
         if start < stop:
             parts.append((start, stop))
-    counts = np.zeros(len(time), dtype=np.bool_)
+    kept = np.zeros(len(time), dtype=np.bool_)
     for start, stop in parts:
-        counts[start:stop] = np.diff(time[start:stop], prepend=-np.inf) > 0.0
-    return counts
+        kept[start:stop] = np.diff(time[start:stop], prepend=-np.inf) > 0.0
+    return kept
 
 
-def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], behind: FloatArray) -> int:
-    """Return the first part that later, non-decreasing times `behind` show to be too far ahead."""
+def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], following: FloatArray) -> int:
+    """Return the first part that later, ordered times `following` show to be too far ahead."""
     first, samples = len(parts), 0
     for k in reversed(range(len(parts))):
         start, stop = parts[k]
@@ -55,7 +55,7 @@ def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], behind: Float
         jump = time[start] - before
         few = samples < (CONFIRMED_FAR if jump > LONG_GAP else CONFIRMED)
         if few and jump > MAX_IMU_GAP:
-            later = behind[np.searchsorted(behind, before, side="right") :]
+            later = following[np.searchsorted(following, before, side="right") :]
             if len(later) and later[0] < time[start]:
                 first = k
     return first

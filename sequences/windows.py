@@ -9,7 +9,7 @@ in the papers.
 The networks receive windows in frame H, in which the device's heading is zero: a given motion of a
 device then gives the same window whatever its heading. The heading is that of the twist about the
 vertical, averaged over the window (`mean_heading`); it is singular only for a device that is upside
-down throughout, where any heading will do.
+down throughout, for which any heading is acceptable.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ with reversed weights, is the change of mean velocity from one second to the nex
 
 
 def mean_heading(facing_N: FloatArray | NDArray[np.float32]) -> FloatArray:
-    """Return headings (B,) [rad] of windows from facing directions at ten instants (B, 10, 2)."""
+    """Return headings (B,) [rad] of windows from facing directions (B, 10, 2) at ten instants."""
     total = np.asarray(facing_N, dtype=np.float64).sum(axis=-2)
     return np.asarray(np.arctan2(total[..., 1], total[..., 0]))
 
@@ -164,9 +164,9 @@ def world_streams(
 
     Args:
         sequence: the recording.
-        attitude: "levelled" (by the IMU, with the true heading) or "true". If the device or the
-            truth is misaligned, the mean specific force under the true attitude reveals it: a
-            network learns the facing direction from that, and lacks the cue at inference.
+        attitude: "levelled" (by the IMU, with the true heading) or "true". Under a true attitude,
+            a misalignment of device or truth tilts the mean specific force: a network learns the
+            facing direction from that cue, which is missing at inference.
 
     Raises:
         InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.
@@ -207,10 +207,10 @@ def _even(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
 ) -> LevelledImu:
     """Rotate samples by their attitudes and resample them to an even 200 Hz."""
-    left_out = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
-    even_time = time - left_out
+    omitted = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
+    even_time = time - omitted
     even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
-    grid = even + left_out[np.searchsorted(even_time, even, side="right") - 1]
+    grid = even + omitted[np.searchsorted(even_time, even, side="right") - 1]
     columns = [attitude_WB.apply(gyro), attitude_WB.apply(accel), facing(attitude_WB.as_matrix())]
     values = resample(even_time, np.concatenate(columns, axis=1), even).astype(np.float32)
     return LevelledImu(grid, values[:, :6], values[:, 6:], ~_spans_gap(even_time, even))
@@ -256,11 +256,11 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < MAX_SENSOR_VALUE).all(axis=1)
     finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
     index = np.flatnonzero(finite)
-    counts = increasing_mask(sequence.time[index])
-    ahead = _ahead(sequence.time[index], counts)
+    kept = increasing_mask(sequence.time[index])
+    ahead = _ahead(sequence.time[index], kept)
     if ahead:
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
-    index = index[counts]
+    index = index[kept]
     if len(index) < 2:
         raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
     time = sequence.time[index]
@@ -275,9 +275,9 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     return time, sequence.gyro[index], sequence.accel[index]
 
 
-def _ahead(time: FloatArray, counts: BoolArray) -> int:
+def _ahead(time: FloatArray, kept: BoolArray) -> int:
     """Return the number of dropped samples that are later than all kept ones before them."""
-    newest = np.maximum.accumulate(np.where(counts, time, -np.inf))
+    newest = np.maximum.accumulate(np.where(kept, time, -np.inf))
     return int((time > newest).sum())
 
 

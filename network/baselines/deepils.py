@@ -31,8 +31,8 @@ class Attention(nn.Module):
         """Map (B, C, L) to (B, C, L)."""
         average, largest = self.average(x), x.amax(2, keepdim=True)
         x = x * torch.sigmoid(self.shared(average) + self.shared(largest))
-        seen = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
-        return x * torch.sigmoid(self.spatial(seen))
+        pooled = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
+        return x * torch.sigmoid(self.spatial(pooled))
 
 
 class SeparableBlock(nn.Module):

@@ -25,8 +25,8 @@ class NetworkSpeed:
         batch: number of windows per call.
         training_form: median for the training form, in evaluation mode [ms].
         inference_form: median for the inference form [ms].
-        training_form_least: fastest call [ms]; other jobs on the machine disturb it least.
-        inference_form_least: fastest call [ms].
+        training_form_least: the same for its fastest call [ms], which other jobs disturb least.
+        inference_form_least: fastest call of the inference form [ms].
         threads: number of threads that PyTorch used.
     """
 

@@ -110,7 +110,7 @@ class OnnxEngine:
 
     @property
     def training_form(self) -> DisplacementNetwork:
-        """Not available in an exported graph.
+        """Network with trainable weights, which an exported graph does not contain.
 
         Raises:
             InputError: always.

@@ -90,7 +90,7 @@ def _shapes(network: DisplacementNetwork) -> tuple[dict[int, Any], ...]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporter's warnings about its own parts and packages not needed here."""
+    """Silence the exporter's warnings about its own code and about packages not needed here."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

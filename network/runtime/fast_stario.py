@@ -75,15 +75,15 @@ class FastStarIO(nn.Module):
     def weights(self) -> list[Tensor]:
         """Return all folded weights."""
         found: list[Tensor] = []
-        held: list[object] = [*self.stages, *self.head]
-        while held:
-            item = held.pop()
+        pending: list[object] = [*self.stages, *self.head]
+        while pending:
+            item = pending.pop()
             if isinstance(item, Tensor):
                 found.append(item)
             elif isinstance(item, list | tuple):
-                held += item
+                pending += item
             elif isinstance(item, Stage | Product | Star | Gate | Depthwise | Wings):
-                held += vars(item).values()
+                pending += vars(item).values()
         return found
 
     def _recording(self, batch: int) -> _Batch:

@@ -25,16 +25,16 @@ def folded(network: nn.Module) -> nn.Module:
     for parent in list(network.modules()):
         for name, child in parent.named_children():
             if isinstance(child, ConvNorm):
-                setattr(parent, name, _one_convolution(child))
+                setattr(parent, name, _merged(child))
     return network
 
 
-def _one_convolution(pair: ConvNorm) -> nn.Conv1d:
+def _merged(pair: ConvNorm) -> nn.Conv1d:
     convolution, norm = pair
     assert isinstance(convolution, nn.Conv1d)
     assert isinstance(norm, nn.BatchNorm1d)
     scale, offset = affine(norm)
-    one = nn.Conv1d(
+    merged = nn.Conv1d(
         convolution.in_channels,
         convolution.out_channels,
         convolution.kernel_size[0],
@@ -43,7 +43,7 @@ def _one_convolution(pair: ConvNorm) -> nn.Conv1d:
         groups=convolution.groups,
     )
     with torch.no_grad():
-        one.weight.copy_(convolution.weight.double() * scale[:, None, None])
-        assert one.bias is not None
-        one.bias.copy_(offset)
-    return one.requires_grad_(False)
+        merged.weight.copy_(convolution.weight.double() * scale[:, None, None])
+        assert merged.bias is not None
+        merged.bias.copy_(offset)
+    return merged.requires_grad_(False)

@@ -17,19 +17,19 @@ def peak_bytes(work: Callable[[], object]) -> int:
     Memory that an operation takes and frees internally, such as a packed copy of its weights, is
     not counted.
     """
-    watch = _Watch()
-    with torch.no_grad(), watch:
+    counter = _Counter()
+    with torch.no_grad(), counter:
         work()
-    return watch.most
+    return counter.peak
 
 
-class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Counter that adds the storage of every new tensor and subtracts it when it is freed."""
+class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Counter of the bytes of all new tensors' storages that have not been freed."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.held: int = 0
-        self.most: int = 0
+        self.current: int = 0
+        self.peak: int = 0
         self._alive: set[int] = set()
 
     def __torch_dispatch__(
@@ -38,17 +38,17 @@ class _Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
         result = function(*args, **(kwargs or {}))
         for value in tree_leaves(result):
             if isinstance(value, torch.Tensor):
-                self._see(value.untyped_storage())
+                self._add(value.untyped_storage())
         return result
 
-    def _see(self, storage: torch.UntypedStorage) -> None:
+    def _add(self, storage: torch.UntypedStorage) -> None:
         key, size = storage._cdata, storage.nbytes()
         if key not in self._alive:
             self._alive.add(key)
-            self.held += size
-            self.most = max(self.most, self.held)
-            weakref.finalize(storage, self._forget, key, size)
+            self.current += size
+            self.peak = max(self.peak, self.current)
+            weakref.finalize(storage, self._remove, key, size)
 
-    def _forget(self, key: int, size: int) -> None:
+    def _remove(self, key: int, size: int) -> None:
         self._alive.discard(key)
-        self.held -= size
+        self.current -= size

@@ -27,9 +27,9 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
     """
     runtime = onnx_packages("onnxruntime")
     if not path.is_file():
-        raise WeightsError(path, "file", "nothing there", "an exported model")
+        raise WeightsError(path, "file", "no such file", "an exported model")
     options = runtime.SessionOptions()
-    # As many threads as PyTorch uses: those that the environment grants, else all (0).
+    # As many threads as PyTorch uses: the number set in the environment, else all (0).
     granted = os.environ.get("OMP_NUM_THREADS", "")
     options.intra_op_num_threads = int(granted) if granted.isdecimal() else 0
     options.log_severity_level = 3

@@ -67,7 +67,7 @@ def measured() -> dict[str, str]:
     return {
         "parameters": "those of modules covered by the rules of the paper's table, two outputs per "
         "head (stario.network.runtime.cost); here in millions, the paper's figure in parentheses",
-        "flops": "by the same rules, for one window; likewise",
+        "flops": "by the same rules, for one window; in millions, likewise",
         "numel": "number of elements of all parameters of the same network; in millions",
         "milliseconds": "per window with six outputs, in the inference form, with random weights: "
         "median over calls in turn with all other networks, "
@@ -109,7 +109,7 @@ def survey(
             graphs.append(_graph_engine(model, cache))
             progress(0.6 * done / len(models))
         engines["onnxruntime"] = graphs
-    times = {name: _times(some) if some else None for name, some in engines.items()}
+    times = {name: _times(group) if group else None for name, group in engines.items()}
     progress(0.9)
     rows = []
     for column, (name, entry, model) in enumerate(zip(names, entries, models, strict=True)):

@@ -35,7 +35,7 @@ class Augmentation:
         lever: maximum distance of the device from the pivot of the swing [m].
         mirrored: share of windows mirrored left to right.
         yaw: standard deviation of the error of the device's heading [rad].
-        any_yaw: share of windows turned by a uniformly random yaw instead.
+        any_yaw: share of windows rotated by a uniformly random yaw instead.
         tilt: maximum error of the gravity direction [rad], about a random horizontal axis.
         gyro_bias: half-width of the uniform bias [rad/s].
         accel_bias: half-width of the uniform bias [m/s^2].
@@ -74,7 +74,7 @@ def _is_range(speeds: object) -> bool:
 
 
 def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
-    """Return the minimum samples of a stream for successive windows at the fastest replay."""
+    """Return the minimum number of samples for successive windows at the fastest replay."""
     # Windows that are not replayed keep speed 1.
     return math.ceil(successive * WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
 
@@ -124,7 +124,7 @@ class WindowSampler:
         """
         uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
         stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._streams) - 1)
-        # Whole samples: at speed 1, interpolation would smooth data that is not smoothed in use.
+        # Whole samples: at speed 1, interpolation would smooth data that is not smoothed otherwise.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
         speed = self._speeds(size)
         steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
@@ -156,7 +156,7 @@ class WindowSampler:
         return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
 
     def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
-        """Add swings in W, then rotate each second into its frame H and apply `augmented`.
+        """Add swings in W, then apply `augmented`, which rotates each second into its frame H.
 
         Args:
             imu: (B, 200 K, 6) gyroscope and specific force in W.
@@ -168,10 +168,10 @@ class WindowSampler:
         imu, displacement = apply_swing(imu, displacement, swings)
         heading = heading_of(facing.view(size, seconds, -1, 2), swings)
         imu = imu.reshape(size * seconds, WINDOW_SAMPLES, 6)
-        seen = augmented(imu, heading.flatten(), a, self.generator, seconds)
-        displacement = displacement.reshape(-1, 1, 3) @ seen.R_HW.mT
-        displacement = displacement * seen.mirror[:, None, 3:]
-        return seen.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
+        varied = augmented(imu, heading.flatten(), a, self.generator, seconds)
+        displacement = displacement.reshape(-1, 1, 3) @ varied.R_HW.mT
+        displacement = displacement * varied.mirror[:, None, 3:]
+        return varied.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)
@@ -191,7 +191,7 @@ class AugmentedWindows:
 
     Attributes:
         imu: (B, 200, 6).
-        R_HW: (B, 3, 3) rotation from W to the frame of presentation, before mirroring.
+        R_HW: (B, 3, 3) rotation from W to the frame of `imu`, before mirroring.
         mirror: (B, 6) signs of the mirror image for axial vectors, then for polar ones.
     """
 
@@ -207,9 +207,9 @@ def augmented(
     generator: torch.Generator,
     together: int = 1,
 ) -> AugmentedWindows:
-    """Turn windows (B, 200, 6) from W into the frame H, as an imperfect device would measure them.
+    """Rotate windows (B, 200, 6) from W into frame H, as an imperfect device would measure them.
 
-    They are turned by minus the heading (B,) plus an error; mirrored left to right, which in H is
+    They are rotated by minus the heading (B,) plus an error; mirrored left to right, which in H is
     the same person with the device in the other hand; tilted, biased and made noisy.
 
     Args:

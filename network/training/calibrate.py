@@ -16,11 +16,14 @@ from stario.sequences.sequence import FloatArray
 
 _FLOOR_M = 0.01
 _CLIP = 25.0
-_STEEPEST = 4.0
+_MAX_EXPONENT = 4.0
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
-    """Fit to errors (M, 3) [m] and log sigmas (M, 3); x and y share scale and exponent."""
+    """Fit a calibration to errors (M, 3) [m] and log sigmas (M, 3).
+
+    x and y share scale and exponent.
+    """
     scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
     scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
     return Calibration(
@@ -40,6 +43,6 @@ def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
         return float(np.mean(normalised + np.log(variance)))
 
     # An uninformative sigma is ignored (exponent 0), never used with its sign reversed.
-    bounds = [(-10.0, 10.0), (0.0, _STEEPEST)]
+    bounds = [(-10.0, 10.0), (0.0, _MAX_EXPONENT)]
     log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead", bounds=bounds).x
     return float(np.exp(log_scale)), float(exponent)

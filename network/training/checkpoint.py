@@ -53,7 +53,7 @@ def read_checkpoint(
 
     Raises:
         ConfigError: the file belongs to another recipe or to other material.
-        ReadError: it cannot be read.
+        ReadError: the file cannot be read.
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:

@@ -64,7 +64,7 @@ _RANGES = (
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """The recipe.
+    """Training recipe.
 
     Attributes:
         architecture: name of the network.
@@ -81,16 +81,17 @@ class TrainingConfig:
         patience: epochs without a better validation error after which training stops.
         precision: "float32" or "bfloat16" (mixed; nearly twice as fast where supported).
         device: "auto", "cpu" or "cuda".
-        attitude: attitude that turns windows into the world frame: "levelled" by the IMU, as in
-            use, or "true", the papers' protocol.
-        successive: consecutive windows, one second apart, that a step draws from one place; more
-            than one only for a recurrent network.
+        attitude: attitude that rotates windows into the world frame: "levelled" by the IMU, as at
+            inference, or "true", the papers' protocol.
+        successive: number of consecutive windows, one second apart, that a step draws from one
+            place; above 1 only for a recurrent network.
         seed: seed of initial weights, draws and dropout.
         waypoint_stretches: stretches between waypoints per step, where recordings have them
             (`stario.network.training.weak_truth`).
-        waypoint_seconds: windows in each of them.
+        waypoint_seconds: number of windows in each of them.
         track_stretches: stretches along a track of positions without attitude, per step.
-        track_seconds: windows in each; few, because heads and phones drift apart in yaw.
+        track_seconds: number of windows in each; few, because heads and phones drift
+            apart in yaw.
         shares: share of the windows for each source, given by a part of its recordings' path;
             recordings of no named source are drawn by their length and liveliness. The share of
             a source that is absent goes to the other recordings. "simulated" is the share of
@@ -162,17 +163,17 @@ class TrainingConfig:
 
     @property
     def reach(self) -> int:
-        """Minimum samples of a stream to draw from."""
+        """Minimum number of samples of a stream to draw from."""
         return reach_of(self.augmentation, self.successive)
 
     @property
     def steps_per_epoch(self) -> int:
-        """Steps between two validations."""
+        """Number of steps between two validations."""
         return max(1, self.epoch_windows // self.batch)
 
     @property
     def steps(self) -> int:
-        """Maximum steps of the whole run."""
+        """Maximum number of steps of the run."""
         return self.epochs * self.steps_per_epoch
 
 

@@ -29,7 +29,7 @@ _SIMULATED_SHARE = 0.4
 _WALK_SECONDS = 60.0
 
 _SHORTEST = 400
-"""Minimum samples of a stretch, 2 s; shorter ones are dropped."""
+"""Minimum number of samples of a stretch, 2 s; shorter ones are dropped."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,17 @@ def mix_sources(
         shares: share of each source among the recordings' windows, by a part of their path;
             other recordings make up the rest of 1. The share of a source that is absent goes to
             the others. `SIMULATED` is the share of simulated walks among all windows.
-        reach: minimum samples of a stream to draw from (`TrainingConfig.reach`).
+        reach: minimum number of samples of a stream to draw from (`TrainingConfig.reach`).
 
     Raises:
-        ConfigError: nothing is left for recordings of no named source, or all shares are 0.
+        ConfigError: the named shares leave nothing for other recordings, or all shares are 0.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []
     simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
     named = _sources(recorded, shares)
-    there = sum(share for _, share, members in named if any(len(s) >= reach for s in members))
-    sources = [(f"recorded, {name}", (1.0 - simulated) * share / (there or 1.0), members)
+    present = sum(share for _, share, members in named if any(len(s) >= reach for s in members))
+    sources = [(f"recorded, {name}", (1.0 - simulated) * share / (present or 1.0), members)
                for name, share, members in named]  # fmt: skip
     sources.append(("simulated walks", simulated, list(generated)))
     words = []
@@ -97,7 +97,7 @@ def mix_sources(
         words.append(f"{name}: {_minutes(members):.0f} min")
     if any(len(s) >= reach for s in streams) and not any(weights):
         raise ConfigError("shares", "0 for every source present", "at least one above 0")
-    legs = [s for one in recorded for s in one.streams if isinstance(s, LegStream)]
+    legs = [s for recording in recorded for s in recording.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
     return TrainingData(streams, weights, legs, words + _licences(recorded))
@@ -106,13 +106,13 @@ def mix_sources(
 def _licences(recorded: Sequence[RecordingStreams]) -> list[str]:
     """Describe each archive's licences and how much training data is under each."""
     known: dict[str, list[RecordingStreams]] = {}
-    for one in recorded:
-        if one.licence:
-            file = split_name(one.path)[0].name
-            known.setdefault(f"{file}, licence {one.licence}", []).append(one)
+    for recording in recorded:
+        if recording.licence:
+            file = split_name(recording.path)[0].name
+            known.setdefault(f"{file}, licence {recording.licence}", []).append(recording)
     return [
         f"{words}: {len(members)} recordings, "
-        f"{sum(_minutes(one.streams) for one in members):.0f} min"
+        f"{sum(_minutes(recording.streams) for recording in members):.0f} min"
         for words, members in known.items()
     ]
 
@@ -123,9 +123,9 @@ def _sources(
     """Return name, share and streams of each source of recordings with full truth."""
     shares = {name: share for name, share in shares.items() if name != SIMULATED}
     members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
-    for one in recorded:
-        source = next((name for name in shares if name in str(one.path)), "")
-        members[source] += [s for s in one.streams if isinstance(s, WorldStream)]
+    for recording in recorded:
+        source = next((name for name in shares if name in str(recording.path)), "")
+        members[source] += [s for s in recording.streams if isinstance(s, WorldStream)]
     left = 1.0 - sum(shares.values())
     if members[""] and left < 1e-9:
         raise ConfigError(
@@ -149,15 +149,15 @@ def split_off(
 ) -> tuple[list[RecordingStreams], list[RecordingStreams]]:
     """Split the last fifth off each recording; drop parts that are too short to learn from."""
     first, last = [], []
-    for one in recordings:
-        left = round(0.8 * sum(len(stream) for stream in one.streams))
+    for recording in recordings:
+        remaining = round(0.8 * sum(len(stream) for stream in recording.streams))
         before, after = [], []
-        for stream in one.streams:
-            before.append(stream.part(0, left))
-            after.append(stream.part(max(left, 0), len(stream)))
-            left -= len(stream)
-        first.append(replace(one, streams=[s for s in before if _is_long(s)]))
-        last.append(replace(one, streams=[s for s in after if _is_long(s)]))
+        for stream in recording.streams:
+            before.append(stream.part(0, remaining))
+            after.append(stream.part(max(remaining, 0), len(stream)))
+            remaining -= len(stream)
+        first.append(replace(recording, streams=[s for s in before if _is_long(s)]))
+        last.append(replace(recording, streams=[s for s in after if _is_long(s)]))
     return first, last
 
 

@@ -1,7 +1,7 @@
 """Swings of a device about a nearby point, added to windows that were recorded without them.
 
 Hands turn a device while its owner walks on. The device then moves with the walk plus
-r_W(t) = exp(alpha(t) [n]x) r_0, a lever arm turned about a fixed axis n; rotating the device about
+r_W(t) = exp(alpha(t) [n]x) r_0, a lever arm rotated about a fixed axis n; rotating the device about
 its own centre leaves its specific force in the world unchanged and adds its rate. All of this is
 exact: rate, acceleration and displacement follow from the same angle alpha(t), a sum of sines.
 The network learns that rotation carries no information about the path walked.

@@ -1,4 +1,4 @@
-"""The loss of a step: windows with full truth and stretches of weak truth, in one batch."""
+"""Loss of a step: windows with full truth and stretches of weak truth, in one batch."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Workers:
         return self.rank == 0
 
     def share(self, batch: Tensor) -> Tensor:
-        """Return this process's rows of a batch that all have drawn."""
+        """Return this process's rows of a batch that all processes have drawn."""
         return batch[self.rank :: self.count]
 
     def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
@@ -81,7 +81,7 @@ def is_leader() -> bool:
 
 @contextmanager
 def workers(device: str, batch: int) -> Iterator[Workers]:
-    """Connect the processes that the launcher started; one process without it.
+    """Connect the processes that the launcher started; without a launcher, use this one alone.
 
     Args:
         device: "auto", "cpu" or "cuda"; each process uses its own GPU.
@@ -111,6 +111,6 @@ def _device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda":
         if not torch.cuda.is_available():
-            raise ConfigError("device", "cuda, but torch finds no GPU", "cpu or auto")
+            raise ConfigError("device", "cuda, but no GPU is available", "cpu or auto")
         return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
     return torch.device(name)

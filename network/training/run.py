@@ -42,7 +42,7 @@ class EpochReport:
     """Result of one epoch; errors are mean squared displacement errors [m^2].
 
     Attributes:
-        epoch: its number, from 1.
+        epoch: number of the epoch, from 1.
         training_error: error on its augmented windows.
         validation_error: the error that selects weights (`ValidationSet.selection_error`).
         validation_by_recording: error of each recording, and of each kind of weak truth [m^2/s].
@@ -137,7 +137,7 @@ class TrainingRun:
         legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
         with_sigma = self.step >= self.config.likelihood_from * self.config.steps
-        loss, error = step_loss(self._answers, windows, target, legs, with_sigma)
+        loss, error = step_loss(self._predict, windows, target, legs, with_sigma)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -151,7 +151,7 @@ class TrainingRun:
         self._windows += sum(part[..., 0, 0].numel() for part in parts)
         return error
 
-    def _answers(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+    def _predict(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Return displacements and log sigmas (B, 3) of windows (B, 6, 200).
 
         A recurrent network receives them as rows of `config.successive` windows.
@@ -189,7 +189,7 @@ class TrainingRun:
                 value.copy_(current[name])
 
     def epochs_since_best(self) -> int:
-        """Return the epochs since the smallest validation error; nan and inf are never smallest.
+        """Return the epochs since the smallest validation error; NaN and inf are never smallest.
 
         Sigma is meaningless until the likelihood is part of the loss: from then on, only epochs
         trained with it count.
@@ -201,7 +201,7 @@ class TrainingRun:
         return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
 
     def should_stop(self) -> bool:
-        """Whether validation stopped improving; False until sigma is learned: models need it."""
+        """Return whether validation has stopped improving; False until sigma is learned."""
         learned = len(self.history) >= self._first_with_sigma
         return learned and self.epochs_since_best() >= self.config.patience
 
@@ -249,12 +249,13 @@ class TrainingRun:
         """Continue from the folder's checkpoint, if there is one.
 
         Raises:
-            ConfigError: it belongs to another recipe, or to other recordings or initial weights.
-            ReadError: it cannot be read.
+            ConfigError: the checkpoint belongs to another recipe, or to other recordings or initial
+                weights.
+            ReadError: the checkpoint cannot be read.
         """
         if self.workers.is_leader:
-            for left in self.folder.glob(".*.tmp"):  # from an interrupted write
-                left.unlink(missing_ok=True)
+            for leftover in self.folder.glob(".*.tmp"):  # from an interrupted write
+                leftover.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
@@ -309,7 +310,7 @@ class TrainingRun:
 
 
 def _or_infinite(error: float) -> float:
-    """Replace a non-finite error by inf: `np.argmin` takes nan for the smallest."""
+    """Replace a non-finite error by inf: `np.argmin` treats NaN as the smallest."""
     return error if math.isfinite(error) else math.inf
 
 

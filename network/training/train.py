@@ -52,11 +52,12 @@ def train(
         on_epoch: called after each validation.
         trained_on: description of the training data, for the card.
         start_from: model that provides the initial weights.
-        calibration: calibration of other weights, used where the errors on `validation` mean
-            nothing: a last stage also trains on it, and weak truth alone has no such windows.
+        calibration: calibration of other weights, used if the errors on `validation` are
+            meaningless: a last stage also trains on it, and weak truth alone has no such windows.
         legs: additional stretches of weak truth, positions or waypoints.
         validation_legs: additional stretches of weak truth that select the weights.
-        chosen_by_legs: whether these alone do, for example if `validation` is only simulated.
+        chosen_by_legs: whether `validation_legs` alone select the weights, for example if
+            `validation` is only simulated.
 
     Returns:
         Path of the model's weights.
@@ -70,11 +71,11 @@ def train(
     if not streams or not validation:
         fix = "positions and waypoints can only be learned alongside them" if legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
-    with workers(config.device, config.batch // config.successive) as these:
+    with workers(config.device, config.batch // config.successive) as processes:
         sampler = _sampler(config, streams, weights)
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = TrainingRun(
-            config, sampler, leg_samplers(config, legs, sampler), material, folder, these
+            config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
         )
         if start_from is not None:
             run.start_from(start_from)
@@ -92,7 +93,7 @@ def train(
         while run.step < config.steps and not run.should_stop():
             report = run.report(run.epoch(on_step), held_out)
             run.record(report)
-            if these.is_leader:
+            if processes.is_leader:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
@@ -120,9 +121,9 @@ def _material(
     start_from: DisplacementModel | None,
 ) -> str:
     """Return the digest of training data, validation data and initial weights."""
-    told = [
+    content = [
         [[(stream.name, len(stream)) for stream in part] for part in streams],
         [f"{weight:.6g}" for weight in weights],
         start_from.card.sha256 if start_from else "",
     ]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()

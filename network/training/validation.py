@@ -34,12 +34,12 @@ VALIDATION_STRIDE = 20
 """Samples between the starts of successive windows."""
 
 _STRIDES = (20, 40, 50, 100, 200)
-"""Strides for recurrent networks: each window follows one from a second before, as in use."""
+"""Strides for recurrent networks: each window follows one from a second before, as at inference."""
 
 _DENSE_SAMPLES = 200 * 60 * 15
 """For N times this many samples in total, windows are cut at N times that stride."""
 
-_AT_ONCE = 256
+_BATCH = 256
 """Windows per batch."""
 
 _STRETCHES = 48
@@ -72,7 +72,7 @@ class ValidationSet:
     ) -> None:
         self.device, self._chosen_by_legs = device, chosen_by_legs
         self.legs = _drawn_once(legs, config or TrainingConfig())
-        # Hours of data are cut sparsely: what matters is the variety of motion.
+        # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
         length = sum(len(stream) for stream in streams)
         self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
         if is_recurrent:
@@ -91,9 +91,9 @@ class ValidationSet:
         network.eval()
         errors, log_sigmas = [], []
         for stream in self.streams:
-            answer = _Answers(network, self.stride)
-            for windows, target in self._cut(stream, answer.batch):
-                mean, log_sigma = answer(torch.from_numpy(windows).to(self.device))
+            predict = _StreamPredictor(network, self.stride)
+            for windows, target in self._cut(stream, predict.batch):
+                mean, log_sigma = predict(torch.from_numpy(windows).to(self.device))
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
@@ -104,7 +104,7 @@ class ValidationSet:
             [
                 known.variance_factor(windows)
                 for stream in self.streams
-                for windows, _ in self._cut(stream, _AT_ONCE)
+                for windows, _ in self._cut(stream, _BATCH)
             ]
         )
 
@@ -173,20 +173,20 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
             continue
         try:
             sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
-        except InputError as error:  # the error 0 of no legs would be the smallest
+        except InputError as error:  # an error of 0 without legs would be the smallest
             log.warning("validation skips %s", error)
             continue
         found[kind] = sampler.batch(_STRETCHES)
     return found
 
 
-class _Answers:
+class _StreamPredictor:
     """Predictions of a network for the windows of one stream, in order of time."""
 
     def __init__(self, network: DisplacementNetwork, stride: int) -> None:
         self._network = network
-        # Windows that begin within the same second belong to separate series, as in use.
-        self.batch = max(1, WINDOW_SAMPLES // stride) if network.is_recurrent else _AT_ONCE
+        # Windows that begin within the same second belong to separate series, as at inference.
+        self.batch = max(1, WINDOW_SAMPLES // stride) if network.is_recurrent else _BATCH
         self._state = network.first_state(self.batch) if network.is_recurrent else None
 
     def __call__(self, windows: Tensor) -> tuple[Tensor, Tensor]:

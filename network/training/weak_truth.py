@@ -14,16 +14,17 @@ variance that a second of displacement adds. A robust loss of the whitened resid
 then on the scale of the windows' squared error.
 
 psi leaves the direction of the displacements undetermined: a network trained on legs alone may
-walk backwards, and no track that is fitted in yaw shows it. The accelerometer determines it. The
+predict backward walking, which no track fitted in yaw reveals. The accelerometer determines it. The
 mean velocities of two successive seconds differ by
 
     d_k+1 - d_k = integral of w(t) a(t) dt,   w rising from 0 to 1 and falling to 0 again,
 
 and a, the specific force without gravity, is known in the frame of the displacements; its bias and
-the levelling error hardly change within a stretch and are removed with the mean. Two successive
-integrals give a_k = d_k+2 - d_k. (From one second to the next, a walk sways with its steps: a
-network trained from scratch on those changes predicted the sway correctly and still walked
-backwards.) The angle of c = mean_k conj(d_k+2 - d_k) a_k is a stretch's direction error. Its loss
+the levelling error hardly change within a stretch and are removed with the mean. The sum of two
+successive integrals is a_k = d_k+2 - d_k. (From one second to the next, a walk sways with its
+steps: a network trained from scratch on those changes predicted the sway correctly and still
+predicted backward walking.) The angle of c = mean_k conj(d_k+2 - d_k) a_k is a stretch's direction
+error. Its loss
 
     2 q / s_a^2 max(0, |c| / 2 - Re c - m),   m = rms |d_k+2 - d_k| rms |a_k| / 4,
 
@@ -164,11 +165,11 @@ class LegSampler:
         heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
-        shown = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
-        R_NH = shown.R_HW.mT * shown.mirror[:, None, 3:]
-        windows = shown.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        predicted = [*_padded(drawn, self._seconds), change]
-        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *predicted)
+        varied = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
+        R_NH = varied.R_HW.mT * varied.mirror[:, None, 3:]
+        windows = varied.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
+        leg_tensors = [*_padded(drawn, self._seconds), change]
+        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *leg_tensors)
 
     def _draw(self) -> tuple[LegStream, int]:
         uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
@@ -189,13 +190,13 @@ def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
 
 def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     kind = streams[0].kind
-    apart = float(np.median(np.concatenate([s.stop - s.start for s in streams])))
+    interval = float(np.median(np.concatenate([s.stop - s.start for s in streams])))
     longest = max(len(stream) for stream in streams) / WINDOW_RATE
     return InputError(
         kind,
-        f"one every {apart:.1f} s in stretches of up to {longest:.0f} s",
+        f"one every {interval:.1f} s in stretches of up to {longest:.0f} s",
         f"two legs within {seconds} s",
-        f"set `{_SECONDS[kind]}` in the recipe to about {math.ceil(2.0 * apart) + 1}",
+        f"set `{_SECONDS[kind]}` in the recipe to about {math.ceil(2.0 * interval) + 1}",
     )
 
 
@@ -208,10 +209,10 @@ def _inside(stream: LegStream, offset: int, seconds: int) -> NDArray[np.int64]:
 def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:
     """Return the tensors of a `LegBatch` that describe the legs."""
     rows = [_inside(stream, offset, seconds) for stream, offset in drawn]
-    size, most = len(drawn), max(1, *(len(row) for row in rows))
-    share = np.zeros((size, most, seconds))
-    displacement, whitening = np.zeros((size, most, 3)), np.zeros((size, most, most))
-    variance, duration = np.zeros((size, most)), np.ones((size, most))
+    size, width = len(drawn), max(1, *(len(row) for row in rows))
+    share = np.zeros((size, width, seconds))
+    displacement, whitening = np.zeros((size, width, 3)), np.zeros((size, width, width))
+    variance, duration = np.zeros((size, width)), np.ones((size, width))
     edges = np.arange(seconds)
     for s, ((stream, offset), legs) in enumerate(zip(drawn, rows, strict=True)):
         count = len(legs)
@@ -225,7 +226,7 @@ def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor
         variance[s, :count] = np.diag(C)
         C += VARIANCE_RATE * np.diag(duration[s, :count])
         whitening[s, :count, :count] = np.linalg.inv(np.linalg.cholesky(C)) if count else 0.0
-    known = np.arange(most) < np.array([[len(row)] for row in rows])
+    known = np.arange(width) < np.array([[len(row)] for row in rows])
     arrays = [share, displacement, whitening, variance, duration]
     return [torch.from_numpy(a).float() for a in arrays] + [torch.from_numpy(known)]
 
@@ -345,8 +346,8 @@ def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
     size = (real**2 + imaginary**2 + 1e-12).sqrt()  # keeps the gradient finite where nothing moves
     chance = _CHANCE * d.detach().norm(dim=(1, 2)) * a.norm(dim=(1, 2))
-    away = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
-    loss: Tensor = VARIANCE_RATE * away.mean() / VELOCITY_SIGMA**2
+    excess = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
+    loss: Tensor = VARIANCE_RATE * excess.mean() / VELOCITY_SIGMA**2
     return loss
 
 

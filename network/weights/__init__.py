@@ -1,1 +1,1 @@
-"""The default weights and their card."""
+"""Packaged weights with their cards, and the recipes that they were trained with."""

@@ -104,12 +104,12 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
             "a pose at a time when the truth is known",
             low_rate_message(truth),
         )
-    ours, theirs = _select(estimate, common), _select(at_estimate, common)
+    estimated, true = _select(estimate, common), _select(at_estimate, common)
     return PoseErrors(
-        estimate=ours,
-        truth=theirs,
-        position_W=ours.position_W - theirs.position_W,
-        yaw=yaw_of(ours.attitude_WB * theirs.attitude_WB.inv()),
+        estimate=estimated,
+        truth=true,
+        position_W=estimated.position_W - true.position_W,
+        yaw=yaw_of(estimated.attitude_WB * true.attitude_WB.inv()),
         coverage=float(common.sum() / estimate.valid.sum()),
     )
 
@@ -133,12 +133,12 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     if mode == "none":
         return estimate
     errors = pose_errors(estimate, truth)
-    ours, theirs = errors.estimate.position_W, errors.truth.position_W
+    estimated, true = errors.estimate.position_W, errors.truth.position_W
     if mode == "first":
-        return _moved(estimate, -float(errors.yaw[0]), ours[0], theirs[0])
-    center, target = ours.mean(axis=0), theirs.mean(axis=0)
-    x, y = (ours - center)[:, :2].T
-    u, v = (theirs - target)[:, :2].T
+        return _moved(estimate, -float(errors.yaw[0]), estimated[0], true[0])
+    center, target = estimated.mean(axis=0), true.mean(axis=0)
+    x, y = (estimated - center)[:, :2].T
+    u, v = (true - target)[:, :2].T
     if min(np.hypot(x, y).max(), np.hypot(u, v).max()) < _PLACE_M:
         yaw = -np.angle(np.exp(1j * errors.yaw).mean())
     else:

@@ -82,8 +82,8 @@ def position_nees(
     """Return the NEES of a track's 3-D position under its own covariance.
 
     Poses with a covariance of exactly zero, such as a start that is the origin by definition,
-    are skipped. Alignment removes the share of the initial yaw from the error but not from the
-    covariance: to check that share, give the estimate in the truth's frame and "none".
+    are skipped. Alignment removes the contribution of the initial yaw from the error but not from
+    the covariance: to check that too, pass the estimate in the truth's frame and "none".
 
     Raises:
         InputError: no overlap, no covariance, or one that is not positive definite.
@@ -93,9 +93,9 @@ def position_nees(
     errors = pose_errors(align(estimate, truth, alignment), truth)
     covariance = errors.estimate.position_covariance_W
     assert covariance is not None  # alignment and selection keep it
-    stated = covariance.any(axis=(1, 2))
-    if not stated.any():
+    known = covariance.any(axis=(1, 2))
+    if not known.any():
         raise InputError("estimate.position_covariance_W", "only zeros", "covariances [m^2]")
-    values = nees(errors.position_W[stated], covariance[stated])
-    time = errors.estimate.time[stated]
+    values = nees(errors.position_W[known], covariance[known])
+    time = errors.estimate.time[known]
     return PositionNees(time, values, float(values.mean()), float(np.median(values)))

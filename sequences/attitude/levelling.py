@@ -33,10 +33,10 @@ STILL_ACCEL = 0.3
 """Deviation of the specific force [m/s^2] up to which its mean gives the vertical to 0.01 rad."""
 
 STILL_GYRO = 0.1
-"""Root mean square rate [rad/s], likewise; not a test of rest, since a hand may tremble."""
+"""Root mean square rate [rad/s], likewise; not a stillness test, since a hand may tremble."""
 
 MIN_GRAVITY_FORCE = 1.0
-"""Mean specific force [m/s^2] below which it gives no vertical: free fall, a dead sensor."""
+"""Mean specific force [m/s^2] below which it has no direction: free fall, a dead sensor."""
 
 _TILT_SIGMA = 0.05
 """Sigma of the tilt at the start, and added after a gap [rad]."""
@@ -91,7 +91,7 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
-    """Integrate attitudes (n + 1, 3, 3) at the samples from the one at the first sample.
+    """Integrate the gyroscope from the attitude at the first sample: (n + 1, 3, 3).
 
     Uses the mean rate and a coning correction (Savage 1998), as in the filter's preintegration.
     """

@@ -1,4 +1,4 @@
-"""Small rotation helpers shared by readers, windows, metrics and the estimators."""
+"""Rotation helpers shared by readers, windows, metrics and estimators."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.sequence import FloatArray
 
 NORM_TOLERANCE = 1e-2
-"""Largest deviation of a quaternion's norm from 1: files round, but not more coarsely."""
+"""Largest deviation of a quaternion's norm from 1 that rounding in a file explains."""
 
 
 def yaw_of(attitude_WB: Rotation) -> FloatArray:
@@ -37,7 +37,7 @@ def tilt_aligning(up_B: FloatArray) -> Rotation:
 
 
 def cumulative_rotations(steps: Rotation) -> FloatArray:
-    """Return products q_0 q_1 ... q_k (N + 1, 4), xyzw, in about 2 sqrt(N) vectorised products."""
+    """Return the products 1, q_0, q_0 q_1, ... (N + 1, 4), xyzw, in about 2 sqrt(N) array steps."""
     count = len(steps) + 1
     width = int(np.ceil(np.sqrt(count)))
     padded = np.tile([0.0, 0.0, 0.0, 1.0], (width * width, 1))

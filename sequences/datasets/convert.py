@@ -54,7 +54,7 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     """
     layout = layout_of(path, layout)
     check_content(sequence)
-    _warn_of_loss(sequence, layout)
+    _warn_about_losses(sequence, layout)
     if layout == "euroc":
         return write_euroc(path, sequence)
     if layout == "archive":
@@ -162,7 +162,7 @@ def _write_table(path: Path, header: str, stamps: NDArray[np.int64], values: Flo
         file.write("\n".join([header, *rows]) + "\n")
 
 
-def _warn_of_loss(sequence: ImuSequence, layout: str) -> None:
+def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
     if layout == "archive":
         return
     truth, lost = sequence.truth, []

@@ -50,7 +50,10 @@ def read_list(file: Path, data: Path) -> list[ListEntry]:
         path = data / name
         if not split_name(path)[0].exists():
             raise InputError(
-                str(path), "nothing", f"a recording of {file.name}", "set the data folder: --data"
+                str(path),
+                "no such file",
+                f"a recording of {file.name}",
+                "set the data folder: --data",
             )
         listed.append(ListEntry(path, group))
     return listed
@@ -65,10 +68,10 @@ def hold_out_group(
         InputError: the group contains no recording, or all of them.
     """
     known = list(recordings)
-    outside = [one for one in known if not one.within(group)]
-    inside = [one for one in known if one.within(group)]
+    outside = [entry for entry in known if not entry.within(group)]
+    inside = [entry for entry in known if entry.within(group)]
     if not inside or not outside:
-        groups = ", ".join(sorted({one.group for one in known}))
+        groups = ", ".join(sorted({entry.group for entry in known}))
         raise InputError("group", repr(group), f"a prefix of some, but not all, of {groups}")
     return outside, inside
 

@@ -7,8 +7,8 @@ same content. The folder may be deleted at any time.
 
 A recording's key consists of its path, the names, sizes and modification times of its files, the
 options it is read with, and the code that reads it. Hashing the files' bytes instead would read
-100 hours of recordings, and the images next to some of them, at every start; it would only detect
-one case more, a file replaced by one of the same size and modification time.
+100 hours of recordings, and the images next to some of them, at every start; it would detect only
+one more case: a file replaced by one of the same size and modification time.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ def recording_files(path: Path) -> list[Path]:
         return [path]
     number = "".join(filter(str.isdigit, path.stem))
     siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
-    alike = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
-    return sorted(alike | set(filter(None, [capture_file(path)])))
+    same_number = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
+    return sorted(same_number | set(filter(None, [capture_file(path)])))
 
 
 @cache
@@ -192,7 +192,7 @@ def _digest(key: Mapping[str, object]) -> str:
 
 @cache
 def _code() -> str:
-    """Return a digest of this package, so that streams made by other code are not reused."""
+    """Return a digest of this package's code, so that streams of other versions are not reused."""
     digest = hashlib.blake2b(digest_size=20)
     for file in code_files():
         digest.update(file.read_bytes())
@@ -205,7 +205,7 @@ def code_files() -> list[Path]:
 
 
 def _written(file: Path, streams: Sequence[Stream]) -> bool:
-    """Write streams to the cache and return whether it worked; a run continues if it did not."""
+    """Write streams to the cache; return False, with a warning, if they cannot be written."""
     if not streams:
         return False
     tables = [_tables(stream) for stream in streams]
@@ -230,10 +230,10 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
 
 def _sweep(file: Path) -> None:
     """Remove temporary files that killed writers of this file have left."""
-    for left in file.parent.glob(f".{file.name}.*.tmp"):
+    for abandoned in file.parent.glob(f".{file.name}.*.tmp"):
         with suppress(FileNotFoundError):  # its writer has just finished
-            if time.time() - left.stat().st_mtime > _ABANDONED_S:
-                left.unlink()
+            if time.time() - abandoned.stat().st_mtime > _ABANDONED_S:
+                abandoned.unlink()
 
 
 def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
@@ -249,7 +249,7 @@ def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
 
 
 def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
-    """Return the stream that `_tables` took apart."""
+    """Rebuild a stream from the arrays of `_tables`."""
     if kind == "poses":
         return WorldStream(name, **tables)
     legs = tables["legs"]
@@ -278,11 +278,11 @@ def _opened(file: Path) -> list[Stream] | None:
     names = list(_TABLES["poses" if metadata[0]["kind"] == "poses" else "legs"])
     first = dict.fromkeys(names, 0)
     streams = []
-    for one in metadata:
-        rows = dict(zip(names, one["rows"], strict=True))
+    for entry in metadata:
+        rows = dict(zip(names, entry["rows"], strict=True))
         tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
         first = {name: first[name] + rows[name] for name in names}
-        streams.append(_stream(one["name"], one["kind"], tables))
+        streams.append(_stream(entry["name"], entry["kind"], tables))
     return streams
 
 

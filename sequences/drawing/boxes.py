@@ -1,4 +1,4 @@
-"""Bounding boxes of paths [m], which determine the tracks and the size of a plan view."""
+"""Bounding boxes of paths [m], which determine the frame of a plan view and the tracks in it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def box_of(path: FloatArray) -> FloatArray:
 
 
 def size_of(box: FloatArray) -> float:
-    """Return the longer side of a box [m], minimum one metre."""
+    """Return the longer side of a box, at least 1 [m]."""
     return max(float(np.ptp(box, axis=0).max()), 1.0)
 
 

@@ -86,7 +86,7 @@ def split_at_gaps(
     valid: BoolArray | None = None,
     max_gap: float = MAX_TRUTH_GAP,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the valid rows of time (N,) and values (N, k), with a row of nan in each gap.
+    """Return the valid rows of time (N,) and values (N, k), with a row of NaN in each gap.
 
     Gaps are those of `indices_after_gaps`.
     """

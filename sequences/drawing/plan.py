@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CROWDED = 12.0
-"""Number of rounds above which lines are drawn thinner."""
+"""Revisit count above which lines are drawn thinner."""
 
 _MARKED_GAP = 1.0
 """Length of a gap [s] above which the track's next pose is marked."""
@@ -102,13 +102,13 @@ def plan_view(
 
 
 def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
-    """Mark where each track continues after a gap: its direction there is a guess at best."""
+    """Mark where each track continues after a gap, during which its direction is unknown."""
     label = "after a gap"
     for name, track in tracks.items():
         if name == "pdr":  # it has no poses while the person stands
             continue
-        behind = indices_after_gaps(track.time, _MARKED_GAP)
-        if len(behind):
-            x, y = track.position_W[behind, :2].T
+        after = indices_after_gaps(track.time, _MARKED_GAP)
+        if len(after):
+            x, y = track.position_W[after, :2].T
             axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
             label = ""

@@ -81,14 +81,14 @@ def error_over_time(
         panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
     panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
     panels[0].set_ylabel("horizontal error [m]")
-    stated = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
+    with_covariance = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
     for k, name in enumerate(tracks):
-        if name in (stated or good):
+        if name in (with_covariance or good):
             _draw_axis_errors(panels[1:], errors[name], *style_of(name, k))
     panels[-1].set_xlabel("time [s]")
     fig.align_ylabels()
     panels[0].legend(**ABOVE_LEFT)
-    if stated:
+    if with_covariance:
         panels[1].legend(**ABOVE_LEFT)
     return fig
 

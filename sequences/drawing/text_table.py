@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-_APART = 3
+_GAP = 3
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -13,7 +13,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [
         f"{name:<{first}}"
-        + "".join(f"{cell:>{_APART + width}}" for cell, width in zip(cells, others, strict=True))
+        + "".join(f"{cell:>{_GAP + width}}" for cell, width in zip(cells, others, strict=True))
         for name, *cells in rows
     ]
 

@@ -1,6 +1,6 @@
 """Detection of wrong units, missing gravity and the like, before a recording is processed.
 
-Every recording must obey one rule, however the device was moved: specific force, rotated into one
+One rule holds for every recording, however the device was moved: specific force, rotated into one
 frame by the integrated gyroscope, averages to gravity, because a person's velocity stays bounded.
 A gyroscope in deg/s rotates it 57 times too far, and the average collapses. A sign that is wrong
 for all three axes of the accelerometer cannot be detected that way (both the force and the average
@@ -40,19 +40,19 @@ _FAST_RAD_S = 15.0
 least 41 if deg/s are taken for rad/s."""
 
 _OFF_GRAVITY = 0.1
-"""Relative error of the average force beyond any calibration's; recordings have at most 0.008."""
+"""Relative error of the average force above any calibration error; recordings reach 0.008."""
 
 _SHAKEN_OFF_GRAVITY = 0.25
 """The same for a shaken device, whose sensors saturate; without gravity it is near 1."""
 
-_APART_RATIO = 6.0
+_MIN_LOSS_RATIO = 6.0
 """Factor by which a wrong gyroscope unit reduces the average more than the right one."""
 
 _COHERENT = 0.7
 """Ratio of average to median force below which gravity does not dominate."""
 
 _NO_GRAVITY = 0.3
-"""A smaller average force has no gravity in any unit: a device at rest with gravity removed."""
+"""An average force below this has no gravity in any unit: a device at rest, gravity removed."""
 
 _G_RANGE = (0.8, 1.25)
 _FORCE_RANGE = (7.5, 12.5)
@@ -161,9 +161,9 @@ def check_gyro(
     # gravity. So an average that equals gravity, in m/s^2 or g, clears the gyroscope.
     off = min(abs(average / STANDARD_GRAVITY - 1.0), abs(average - 1.0))
     lost, lost_in_degrees = force - average, max(force - in_degrees, 0.0)
-    seen = f"rotations of {speed:.3g} rad/s"
-    if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _APART_RATIO * lost_in_degrees):
-        seen += " that contradict the accelerometer"
+    found = f"rotations of {speed:.3g} rad/s"
+    if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _MIN_LOSS_RATIO * lost_in_degrees):
+        found += " that contradict the accelerometer"
     elif speed <= _FAST_RAD_S:
         return
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
@@ -171,7 +171,7 @@ def check_gyro(
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif unit_known:
         fix = _UNIT_NAMED
-    raise InputError(f"{name}: gyroscope", seen, "rad/s", fix)
+    raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
 
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
@@ -211,7 +211,7 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
 
 
 def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray) -> None:
-    """Check that the true attitude turns the average force (N, 3) at `time` (N,) upright."""
+    """Check that the true attitude rotates the mean force (N, 3) at `time` (N,) upwards."""
     truth = sequence.truth
     if truth is None or truth.valid.sum() < 2:
         return
@@ -245,7 +245,7 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
 
 
 def _axes(sequence: ImuSequence) -> str | None:
-    """Return the `--axes` that gyroscope and true attitude imply, None if none."""
+    """Return the `--axes` that gyroscope and true attitude imply, or None."""
     try:
         return fit_truth(sequence).axes()
     except InputError:
@@ -271,7 +271,10 @@ def _pieces(time: FloatArray) -> list[slice]:
 def average_force(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice]
 ) -> float:
-    """Return the median over pieces of the mean force's magnitude [m/s^2], in each first frame."""
+    """Return the median over pieces of the magnitude of the mean force [m/s^2].
+
+    The force is averaged in the axes of the first sample of its piece.
+    """
     sizes = []
     for piece in pieces:
         dt = np.diff(time[piece])[:, None]

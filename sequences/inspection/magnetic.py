@@ -40,17 +40,17 @@ _VERDICTS = (
     ("good", math.radians(12.0), 0.75),
     ("coarse", math.radians(25.0), 0.5),
 )
-"""Largest unsteadiness [rad] and least correlation of each verdict."""
+"""Maximum RMS of the bearing [rad] and minimum correlation of each verdict."""
 
 HELD_CHANGE = 2e-3
-"""Least relative change in magnitude of a measured field within half a second. Some phones report a
-calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
+"""Minimum relative change in magnitude of a measured field within half a second. Some phones report
+a calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
 1e-4 for seconds, while that of a measured field changes by 1e-2."""
 
 _NO_FIELD_UT = 1e-9
 """Smallest magnitude to divide by [uT], for a sensor that reports zeros."""
 
-_HALF_SECOND, _TURNED_RAD, _OFTEN = 0.5, 0.05, 0.5
+_HALF_SECOND, _TURNED_RAD, _REPORTED_SHARE = 0.5, 0.05, 0.5
 """Half seconds in which the field turns by more than this in the sensor's axes are examined; share
 of them above which an extrapolated field is reported."""
 
@@ -72,10 +72,10 @@ class MagneticFindings:
         spread_uT: 10th and 90th percentile of the magnitude [uT].
         dip_rad: median angle below the horizontal [rad].
         correlation: correlation of dm/dt and -w x (m - b); None if the device hardly turns.
-        lag_s: time by which the samples are stamped late [s]; None likewise, and if it is outside
-            the range searched.
+        lag_s: time by which the samples are stamped late [s]; None in that case, and if it is
+            outside the range searched.
         hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
-        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None likewise.
+        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None if the lag is.
         bearing_rms_rad: median RMS of the levelled bearing about a line over a minute [rad].
         drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
         held: share of the half seconds with rotation in which the device extrapolated the field
@@ -141,10 +141,10 @@ class MagneticFindings:
             f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
             f"gyroscope; as a yaw reference: {self.verdict}"
         )
-        if self.held > _OFTEN:
+        if self.held > _REPORTED_SHARE:
             lines.append(
-                f"  constant in size: extrapolated by the device's own gyroscope {self.held:.0%} "
-                "of the time that it turns, and given little weight then"
+                f"  constant in magnitude: extrapolated by the device's own gyroscope "
+                f"{self.held:.0%} of the time that it turns, and given little weight then"
             )
         return lines
 
@@ -179,12 +179,12 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     if len(stamps) < 20 or stamps[-1] - stamps[0] < _SHORTEST_S:
         return None
     turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
-    seen = _against_gyro(time, gyro, stamps, values) if turning > _TURNING_RAD_S else None
-    agreement, lag, iron, sigma = seen or (None, None, None, None)
-    taken = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
+    comparison = _against_gyro(time, gyro, stamps, values) if turning > _TURNING_RAD_S else None
+    agreement, lag, iron, sigma = comparison or (None, None, None, None)
+    removed = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
     nearest = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[nearest]
-    field_N = np.einsum("nij,nj->ni", R_NB, values - taken)
+    field_N = np.einsum("nij,nj->ni", R_NB, values - removed)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
     spread, drift = _steadiness(stamps, field_N[:, :2])
     sizes = np.linalg.norm(values, axis=1)
@@ -232,11 +232,11 @@ def _against_gyro(
         target = (change + np.cross(rate, mean)).ravel()
         normal = cross.T @ cross + 1e-9 * np.eye(3)
         iron = np.asarray(np.linalg.solve(normal, cross.T @ target), dtype=np.float64)
-        left = target - cross @ iron
+        residual = target - cross @ iron
         # Neighbours share half their span and disturbances last: a tenth of the rows counts.
-        spread = np.sqrt(10.0 * float(left.var()) * np.diag(np.linalg.inv(normal)))
-        seen = -np.cross(rate, mean - iron).ravel()
-        return correlation(change.ravel(), seen), iron, np.asarray(spread, dtype=np.float64)
+        spread = np.sqrt(10.0 * float(residual.var()) * np.diag(np.linalg.inv(normal)))
+        expected = -np.cross(rate, mean - iron).ravel()
+        return correlation(change.ravel(), expected), iron, np.asarray(spread, dtype=np.float64)
 
     scores = np.array([fit(lag)[0] for lag in _LAGS_S])
     best = int(np.argmax(scores))
@@ -256,7 +256,7 @@ def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
 
 
 def _held(time: FloatArray, field: FloatArray) -> float:
-    """Return the share of half seconds with rotation in which a field (n, 3) keeps its size."""
+    """Return the share of half seconds with rotation in which a field's (n, 3) size is constant."""
     later = np.searchsorted(time, time + _HALF_SECOND)
     first = np.flatnonzero(later < len(time))
     size = np.maximum(np.linalg.norm(field, axis=1), _NO_FIELD_UT)
@@ -286,8 +286,8 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
         if part.sum() > count:
             clock = time[part] - edge
             line = np.polyfit(clock, np.unwrap(np.angle(smooth[part])), 1)
-            left = np.angle(field[part] * np.exp(-1j * np.polyval(line, clock)))
-            spreads.append(float(np.sqrt(np.square(left).mean())))
+            residual = np.angle(field[part] * np.exp(-1j * np.polyval(line, clock)))
+            spreads.append(float(np.sqrt(np.square(residual).mean())))
             slopes.append(float(line[0]))
     if not slopes:
         return math.inf, 0.0

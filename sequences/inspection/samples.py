@@ -1,4 +1,4 @@
-"""Samples that are wrong in themselves: by their times, or by values that no sensor gives."""
+"""Samples that are invalid by themselves: by their times, or by values that no sensor measures."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ _SET_BACK = 5.0
 """A step back by more than this [s] means that the clock was set."""
 
 _STUCK_S = 1.0
-"""A sensor whose values repeat exactly for this time [s] is stuck; recorded ones do for 0.1 s."""
+"""Time [s] for which a stuck sensor's values repeat exactly; those of others repeat for 0.1 s."""
 
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
-"""Sensors with smaller maxima are not at their limit: coarsely rounded values repeat as well."""
+"""Smallest maxima taken for a limit: below them, repeated values are coarsely rounded ones."""
 
-_OFTEN_AT_LIMIT, _NO_CHANCE = 0.005, 3
-"""Least share and number of samples at the limit that are reported."""
+_MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
+"""Minimum share and number of samples at the limit for a report."""
 
 _SHAKEN_M_S2 = 0.5
 _TILTING_RAD_S = 0.1
-"""Scatter of the force, and of the rate across it, above which a device moves."""
+"""Scatter of the force, and of the rate perpendicular to it, above which a device moves."""
 
 
 def sample_problems(sequence: ImuSequence) -> list[str]:
-    """Return the samples' problems, one line each; rows out of order are left to `disorder`."""
+    """Return problems of the samples, one line each; `disorder` reports rows out of order."""
     time, problems = sequence.time[np.isfinite(sequence.time)], []
     steps = np.diff(time)
     if len(steps) and steps.min() < -_SET_BACK and not disorder(time):
@@ -49,9 +49,9 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
             f"{sequence.name}: time: the clock jumps back by {-steps[k]:.3g} s at "
             f"{time[k] - time[0]:.1f} s; split the recording there"
         )
-    wild = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
-    if wild:
-        problems.append(f"{sequence.name}: values that no sensor can measure, in {wild} samples")
+    invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
+    if invalid:
+        problems.append(f"{sequence.name}: values that no sensor can measure, in {invalid} samples")
     return problems + _stuck_problems(sequence) + _limit_problems(sequence)
 
 
@@ -98,7 +98,7 @@ def _limit_problems(sequence: ImuSequence) -> list[str]:
         at_limit = (values[1:] == values[:-1]) & (size[1:] >= largest) & (largest > large)
         count = int(at_limit.any(axis=1).sum())
         share = count / max(len(at_limit), 1)
-        if share >= _OFTEN_AT_LIMIT and count >= _NO_CHANCE:
+        if share >= _MIN_LIMIT_SHARE and count >= _MIN_LIMIT_COUNT:
             limit = float(largest[at_limit.any(axis=0)].max())
             problems.append(
                 f"{sequence.name}: {sensor}: {share:.1%} of its samples are at its limit of "
@@ -115,7 +115,8 @@ def dead_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
 def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     """Return whether a force (n, 3) contradicts both rest and steady rotation at the first rate.
 
-    In steady rotation it is constant in the device's axes (in a circle) or the world's (in place).
+    In steady rotation the force is constant, in the device's axes (moving in a circle) or in the
+    world's (turning in place).
     """
     turned = Rotation.from_rotvec(np.outer(time - time[0], gyro[0])).apply(accel)
     scatter = min(float(np.linalg.norm(force.std(axis=0))) for force in (accel, turned))
@@ -123,13 +124,16 @@ def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
 
 
 def _tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether the rate (n, 3) across the force varies, which a constant force rules out."""
+    """Return whether the rate (n, 3) perpendicular to the force varies.
+
+    A constant force rules that out.
+    """
     up = accel[0] / max(float(np.linalg.norm(accel[0])), 1e-9)
     return float(np.linalg.norm(np.cross(gyro, up).std(axis=0))) > _TILTING_RAD_S
 
 
 def disorder(time: FloatArray) -> str:
-    """Describe how many of the times (n,) [s] go back; empty if few do."""
+    """Return how many of the times (n,) [s] go back, in words; empty if few do."""
     back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
     many = back > _OUT_OF_ORDER * len(time)
     return f"{back} of {len(time)} times earlier than the one above" if many else ""
@@ -139,7 +143,7 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
     """Sort a recording by time if many rows are out of order, each by little.
 
     Some loggers write samples of a few milliseconds in any order. Dropping them, as is done with a
-    few, would lose a twentieth of the samples. If rows are far off, their order is not guessed.
+    few, would lose a twentieth of the samples. Rows that are far out of order are not sorted.
     """
     time = sequence.time
     if not disorder(time):

@@ -2,8 +2,8 @@
 
 One chi-square test serves all callers, each with its own factor: the scatter of both sensors about
 their means against the white noise of a phone's IMU (`PHONE_NOISE`). The filter's own densities are
-unsuitable here: they include errors of scale and alignment, which arise only in motion. (Whether
-the mean force at the start gives the vertical is another question: a hand may tremble, but a
+unsuitable here: they include errors of scale and alignment, which arise only in motion. (The test
+of whether the mean force at the start gives the vertical is another one: a hand may tremble, but a
 trolley must not accelerate; see `levelling`.)
 
 Noise is the Allan deviation at 0.1 s times sqrt(0.1 s): the density of white noise, whatever the
@@ -24,11 +24,11 @@ from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
 
-_LYING = 6.0
+_INSPECTION_FACTOR = 6.0
 """Factor for a device at rest, used by inspection: its sensors may be noisier than a phone's."""
 
-_SLOW = 0.06
-"""Largest mean rate [rad/s] that may be a bias: 3.4 degrees per second."""
+_MAX_BIAS_RATE = 0.06
+"""Largest mean rate [rad/s] that can be a bias: 3.4 degrees per second."""
 
 _PROBABILITY = 0.999
 """Probability that a sensor at rest passes the test."""
@@ -60,7 +60,7 @@ def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float)
 
     A steady turn has no scatter: the mean rate must also be small enough to be a bias.
     """
-    if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _SLOW:
+    if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _MAX_BIAS_RATE:
         return False
     rates, forces = (float(np.square(x - x.mean(axis=0)).sum()) for x in (gyro, accel))
     return looks_still(rates, forces, scatter_bound(len(gyro), seconds, factor))
@@ -111,7 +111,7 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
         x[:used].reshape(blocks, _BLOCK_BINS, per_bin, 3).mean(2) for x in (gyro, accel)
     )
     pairs = zip(rates, forces, strict=True)
-    quiet = np.array([is_still(w, f, _BLOCK_BINS * _BIN_S, _LYING) for w, f in pairs])
+    quiet = np.array([is_still(w, f, _BLOCK_BINS * _BIN_S, _INSPECTION_FACTOR) for w, f in pairs])
     joined = unbroken & quiet
     spans = [(a, b) for a, b in runs(joined) if stop[b - 1] - start[a] >= _SHORTEST_S]
     if not spans:

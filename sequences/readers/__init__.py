@@ -69,7 +69,7 @@ def _read_zip(path: Path) -> ImuSequence:
     with unpacked(path) as folder:
         found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
         if len(found) > 1:
-            names = ", ".join(str(one.relative_to(folder)) for one in found[:4])
+            names = ", ".join(str(path_inside.relative_to(folder)) for path_inside in found[:4])
             raise ReadError(
                 path, "content", f"{len(found)} recordings ({names})", "one", "unpack the zip"
             )
@@ -128,7 +128,7 @@ _CONTAINERS = (
     (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
     (b"MATLAB", "a MATLAB file"),
 )
-"""First bytes of files that may hold a recording but that are not unpacked."""
+"""First bytes of files that may hold a recording but are not unpacked, and their description."""
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -174,7 +174,7 @@ def find_recordings(
 
     Args:
         path: a recording, a list file or a folder.
-        on_error: called for each list entry that is empty or leads nowhere; the others are still
+        on_error: called for each list entry that is empty or does not exist; the others are still
             returned. Without it, such an entry raises its error.
         where: attributes that recordings must have (only those in archives have any): patterns for
             each attribute, one of which must match, `{"person": ["dan", "ha*"]}`.
@@ -214,16 +214,16 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     errors: list[ReadError] = []
     for file, paths in members.items():
         try:
-            fitting = set(archive_members(file, where))
-            chosen += [path for path in paths if path in fitting]
+            matching = set(archive_members(file, where))
+            chosen += [path for path in paths if path in matching]
         except ReadError as error:
             errors.append(error)
     if errors and not chosen:
         raise errors[0]
     if not chosen:
-        asked = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+        filters = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
         fix = "only recordings in archives have attributes"
-        raise ReadError(found[0], f"recordings with {asked}", "none", "at least one", fix)
+        raise ReadError(found[0], f"recordings with {filters}", "none", "at least one", fix)
     return chosen
 
 
@@ -232,10 +232,10 @@ def _below(path: Path) -> list[Path]:
     for folder, subfolders, files in os.walk(path):
         here = Path(folder)
         subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-        whole = [name for name in subfolders if _is_recording(here / name)]
-        found += [here / name for name in whole]
-        doubles = {"raw"} if "syn" in subfolders else set()
-        subfolders[:] = [name for name in subfolders if name not in {*whole, *doubles}]
+        recordings = [name for name in subfolders if _is_recording(here / name)]
+        found += [here / name for name in recordings]
+        duplicates = {"raw"} if "syn" in subfolders else set()
+        subfolders[:] = [name for name in subfolders if name not in {*recordings, *duplicates}]
         for name in files:
             if not name.lower().endswith(_SUFFIXES):
                 continue
@@ -249,7 +249,7 @@ def _below(path: Path) -> list[Path]:
 def _listed(
     path: Path, on_error: Callable[[ReadError], None] | None, where: AttributeFilter | None
 ) -> list[Path]:
-    """Return what a list names, each once; a list in a list is an error: it could be a cycle."""
+    """Return a list's recordings, each once; a nested list is an error: it could be a cycle."""
     found: list[Path] = []
     for entry in list_entries(path):
         try:
@@ -285,18 +285,20 @@ def _poses_alone(path: Path, pose: Path) -> ReadError:
 
 
 def _unknown(path: Path) -> ReadError:
-    """Return an error that states in one line what was found instead of a recording."""
+    """Return an error that describes what was found instead of a recording."""
     fix = ""
     if path.is_dir() and (inside := sorted(_below(path))):
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif lone := incomplete_sensors(path):
+    elif sensors := incomplete_sensors(path):
         expected = "a gyroscope and an accelerometer"
-        return ReadError(path, "sensors", f"only {' and '.join(lone)}", expected, "log both")
+        return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
         return _poses_alone(path, poses[0])
     elif path.is_dir():
-        there = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        names = ", ".join(there[:5]) + (f" and {len(there) - 5} more" if len(there) > 5 else "")
+        entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        names = ", ".join(entries[:5]) + (
+            f" and {len(entries) - 5} more" if len(entries) > 5 else ""
+        )
         found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
     elif kind := next(
         (words for start, words in _CONTAINERS if first_bytes(path).startswith(start)), ""

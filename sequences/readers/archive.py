@@ -44,7 +44,7 @@ _OPTIONAL = {
 
 
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
-"""What h5py and NumPy raise for a damaged file, or for one with other content."""
+"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -58,13 +58,13 @@ def split_name(path: Path) -> tuple[Path, str | None]:
 
 
 def is_archive_member(path: Path) -> bool:
-    """Whether a path names a recording in an archive."""
+    """Return whether a path names a recording in an archive."""
     file, name = split_name(path)
     return name is not None and is_archive(file)
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file is an archive: HDF5 whose first group holds IMU samples or a track.
+    """Return whether a file is an archive: HDF5 whose first group holds IMU samples or a track.
 
     A file that cannot be opened counts as one unless it is named like RoNIN's: reading it then
     raises an error that names the damage.
@@ -89,7 +89,8 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
             `{"person": ["dan", "ha*"]}`.
 
     Raises:
-        ReadError: the file cannot be read, or no recording matches; it lists the values present.
+        ReadError: the file cannot be read, or no recording matches; then the error lists the
+            values present.
     """
     wanted = where or {}
     with _opened(path) as file:
@@ -114,10 +115,10 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
 
 
 def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
-    """Whether a recording's attributes, its `name` among them, match the filter."""
-    told = {"name": name, **attributes}
+    """Return whether a recording's attributes, including its `name`, match the filter."""
+    values = {"name": name, **attributes}
     return all(
-        any(fnmatchcase(_text(told.get(key, "")), pattern) for pattern in patterns)
+        any(fnmatchcase(_text(values.get(key, "")), pattern) for pattern in patterns)
         for key, patterns in where.items()
     )
 
@@ -125,14 +126,16 @@ def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFi
 def _none_chosen(
     path: Path, known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    asked = ", ".join(f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns)
+    wanted = ", ".join(
+        f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns
+    )
     key = next(
         (k for k, patterns in where.items() if not _any(known, {k: patterns})), next(iter(where))
     )
     values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
-    seen = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
-    expected = f"{key} to be one of {seen}" if seen else f"another attribute: none has {key}"
-    return ReadError(path, f"recordings with {asked}", "none", expected)
+    listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
+    expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
+    return ReadError(path, f"recordings with {wanted}", "none", expected)
 
 
 def _any(known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter) -> bool:
@@ -264,7 +267,7 @@ def _plain(value: Any) -> str | float:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open the file; damage or other content raises ReadError while the block reads it."""
+    """Open the file; turn errors from damage or other content within the block into ReadError."""
     h5py = optional_package("h5py", "readers")
     try:
         with h5py.File(path) as file:

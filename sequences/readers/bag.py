@@ -6,7 +6,7 @@ whatever precedes them, and has the stamp at byte 4, both in ROS 1's serialisati
 is fast and needs no type definitions, which older `.db3` files lack.
 
 Time is the header's stamp, or the bag's time if a driver left all stamps zero. Poses are assumed to
-be those of the IMU in a world with z up; `stario inspect` shows if they are not.
+be those of the IMU in a world with z up; `stario inspect` reports if they are not.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
+    """Return whether a path is a bag, by its first bytes or its folder's `metadata.yaml`."""
     if path.is_dir():
         return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 200)
     head = first_bytes(path)
@@ -113,8 +113,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
             received: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in chosen}
             for connection, time, raw in reader.messages(connections):
                 received[connection.topic].append((time, bytes(raw)))
-        little = version == "1"
-        return {topics[t]: _decoded(path, t, topics[t], received[t], little) for t in chosen}
+        little_endian = version == "1"
+        return {topics[t]: _decoded(path, t, topics[t], received[t], little_endian) for t in chosen}
     except ReadError:
         raise
     except Exception as error:  # any error of the library means a damaged file
@@ -123,35 +123,36 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
 
 
 def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
-    fitting = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
+    candidates = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
     if wanted:
-        return _named(path, "imu topic", wanted, fitting)
-    if len(fitting) != 1:
-        seen = ", ".join(fitting or [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8])
-        fix = f"name one: --imu-topic {fitting[0]}" if fitting else ""
-        raise ReadError(path, "topics", seen or "none", "one topic with sensor_msgs/Imu", fix)
-    return fitting[0]
+        return _named(path, "imu topic", wanted, candidates)
+    if len(candidates) != 1:
+        others = [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8]
+        found = ", ".join(candidates or others)
+        fix = f"name one: --imu-topic {candidates[0]}" if candidates else ""
+        raise ReadError(path, "topics", found or "none", "one topic with sensor_msgs/Imu", fix)
+    return candidates[0]
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
     sensors = (_IMU, _MAGNETIC)
-    fitting = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
+    candidates = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
     if wanted == NO_TRUTH:
         return []
     if wanted:
-        return [_named(path, "truth topic", wanted, fitting)]
-    if len(fitting) > 1:
-        fix = f"name one: --truth-topic {fitting[0]}, or --truth-topic {NO_TRUTH}"
-        raise ReadError(path, "topics", ", ".join(fitting), "one topic with poses", fix)
-    return fitting
+        return [_named(path, "truth topic", wanted, candidates)]
+    if len(candidates) > 1:
+        fix = f"name one: --truth-topic {candidates[0]}, or --truth-topic {NO_TRUTH}"
+        raise ReadError(path, "topics", ", ".join(candidates), "one topic with poses", fix)
+    return candidates
 
 
 def _magnetic_topic(topics: dict[str, str], imu_topic: str) -> list[str]:
     """Return the magnetic field's topic; of several, the one nearest to the IMU's by name."""
-    fitting = [topic for topic, kind in sorted(topics.items()) if kind == _MAGNETIC]
-    here = set(accumulate(imu_topic.split("/"), "{}/{}".format))
-    near = [len(here & set(accumulate(t.split("/"), "{}/{}".format))) for t in fitting]
-    return [fitting[near.index(max(near))]] if fitting else []
+    candidates = [topic for topic, kind in sorted(topics.items()) if kind == _MAGNETIC]
+    prefixes = set(accumulate(imu_topic.split("/"), "{}/{}".format))
+    shared = [len(prefixes & set(accumulate(t.split("/"), "{}/{}".format))) for t in candidates]
+    return [candidates[shared.index(max(shared))]] if candidates else []
 
 
 def _magnetometer(field: _Messages, start_ns: np.int64) -> Magnetometer | None:
@@ -160,24 +161,24 @@ def _magnetometer(field: _Messages, start_ns: np.int64) -> Magnetometer | None:
     return magnetometer(time, field.values[order, :3] * MAGNETIC_UNITS["T"])
 
 
-def _named(path: Path, field: str, wanted: str, fitting: list[str]) -> str:
-    if wanted not in fitting:
+def _named(path: Path, field: str, wanted: str, candidates: list[str]) -> str:
+    if wanted not in candidates:
         raise ReadError(
-            path, field, repr(wanted), f"one of {', '.join(fitting) or '(none in this bag)'}"
+            path, field, repr(wanted), f"one of {', '.join(candidates) or '(none in this bag)'}"
         )
     return wanted
 
 
 def _decoded(
-    path: Path, topic: str, kind: str, received: list[tuple[int, bytes]], little: bool
+    path: Path, topic: str, kind: str, received: list[tuple[int, bytes]], little_endian: bool
 ) -> _Messages:
-    """Return the stamps and doubles of messages; CDR gives its byte order in the second byte."""
+    """Return the stamps and doubles of messages; CDR states its byte order in the second byte."""
     raws = [raw for _, raw in received]
     size = 8 * _DOUBLES[kind]
     shortest = min(map(len, raws), default=0)
     if shortest < _STAMP.stop + size:
         raise ReadError(path, topic, f"a message of {shortest} bytes", f"a complete {kind}")
-    order = "<" if little or raws[0][1] & 1 else ">"
+    order = "<" if little_endian or raws[0][1] & 1 else ">"
     parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{order}u4").reshape(-1, 2)
     stamps = parts.astype(np.int64) @ np.array([10**9, 1])
     if not stamps.any():

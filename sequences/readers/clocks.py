@@ -1,4 +1,4 @@
-"""Times whose unit is not named, and sensors with separate sample times."""
+"""Inference of unnamed time units, and sensors with separate sample times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The header of a generic CSV: which column holds what, in which unit."""
+"""Header of a generic CSV: the quantity and unit of each column."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def read_header(path: Path, lines: list[str]) -> Header:
 
 
 def _header_index(lines: list[str]) -> int | None:
-    """Return the index of the first line that is not a comment, or is one that names columns."""
+    """Return the index of the first line that is no comment, or is a comment that names columns."""
     for index, line in enumerate(lines):
         if line.strip() and (not line.lstrip().startswith("#") or _names_columns(line)):
             return index
@@ -93,7 +93,7 @@ def _header_index(lines: list[str]) -> int | None:
 
 
 def is_header(lines: list[str]) -> bool:
-    """Whether a file's lines begin with a header that names columns of this format."""
+    """Return whether a file's lines begin with a header that names columns of this format."""
     index = _header_index(lines)
     return index is not None and _names_columns(lines[index])
 
@@ -128,11 +128,11 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
         _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-        alike = [title for title in ignored if _LIKE_TRUTH.match(title)]
-        if alike and not truth:
+        truth_like = [title for title in ignored if _LIKE_TRUTH.match(title)]
+        if truth_like and not truth:
             _log.warning(
                 "%s: no ground truth is read from %s: it must have %s",
-                path, ", ".join(alike), TRUTH_HEADER,
+                path, ", ".join(truth_like), TRUTH_HEADER,
             )  # fmt: skip
     for name in truth:
         unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
@@ -140,7 +140,7 @@ def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
 
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
-    """Return the factor of a column's unit; the table's first if the header names none."""
+    """Return the factor of a column's unit; the first of `known` if the header names none."""
     unit = unit_named(column.unit) or next(iter(known))
     if unit not in known:
         names = ", ".join(filter(None, known)) or "no unit"
@@ -149,7 +149,7 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Fact
 
 
 def _names_columns(line: str) -> bool:
-    """Whether a line names any IMU column of this format."""
+    """Return whether a line names any IMU column of this format."""
     names = {_ALIASES.get(_cell(text)[0].lower(), "") for text in _titles(line)}
     return bool(names & set(IMU))
 

@@ -8,7 +8,7 @@ separated by commas, semicolons or tabs like the rows below it; comments (`#`) m
   (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named are rad/s,
   m/s^2 and, for time, the unit that gives a plausible sample rate.
 - `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
-  blank or nan where it was not sampled.
+  blank or `nan` where it was not sampled.
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
   leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
 - or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
@@ -60,11 +60,11 @@ from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME
 
 _log = logging.getLogger(__name__)
 
-_WAYPOINTS_APART = 2.0
-"""Median interval between positions from which they are waypoints [s]."""
+_MIN_WAYPOINT_INTERVAL = 2.0
+"""Minimum median interval between waypoints [s]; positions at a shorter one are a track."""
 
 _HEAD_LINES = 200
-"""Number of lines in which the header must be for a file to be recognised."""
+"""Number of lines within which the header must be for a file to be recognised."""
 
 
 def read_generic_csv(path: Path) -> ImuSequence:
@@ -114,7 +114,7 @@ class _Rows:
 
 
 def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
-    """Whether the last line has no line end and fewer cells than the row before it."""
+    """Return whether the last line has no line end and fewer cells than the row before it."""
     if len(lines) < header.lines + 2 or not _is_row(lines[-2]):
         return False
     if lines[-1].count(header.separator) >= lines[-2].count(header.separator):
@@ -168,7 +168,7 @@ def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
 
 
 def is_generic_csv(path: Path) -> bool:
-    """Whether a file starts with a header that names columns of this format."""
+    """Return whether a file starts with a header that names columns of this format."""
     return is_header(first_lines(path, _HEAD_LINES, comments=True))
 
 
@@ -204,8 +204,8 @@ def _row(path: Path, number: int, line: str, separator: str, columns: list[Colum
     cells = line.split(separator)
     needed = 1 + max(column.index for column in columns)
     if len(cells) < needed:
-        alone = f"separate the values by {separator!r} as in the header"
-        fix = alone if len(cells) == 1 else "is the file cut short?"
+        separator_fix = f"separate the values by {separator!r} as in the header"
+        fix = separator_fix if len(cells) == 1 else "is the file cut short?"
         raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
     row = []
     for column in columns:
@@ -272,8 +272,8 @@ def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
         _log.warning("%s: %d rows hold a position, too few for a track", path, len(kept))
         return None
     time = rows.time[kept]
-    apart = float(np.median(np.diff(time))) >= _WAYPOINTS_APART
-    return PositionTrack(time, known[kept], "waypoints" if apart else "positions")
+    sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
+    return PositionTrack(time, known[kept], "waypoints" if sparse else "positions")
 
 
 def _truth(path: Path, rows: _Rows) -> Trajectory | None:

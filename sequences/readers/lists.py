@@ -18,19 +18,19 @@ from stario.sequences.readers.archive import AttributeFilter, split_name
 from stario.sequences.readers.text import first_line, first_lines, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
-_LOOKED_AT = 20
+_HEAD_LINES = 20
 _OXIOD_FORMS = ("syn", "raw")
-_CHOICE = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s*$")
+_FILTER = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s*$")
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file may be a list: a text suffix and no row of numbers in its first lines.
+    """Return whether a file may be a list: a text suffix and no row of numbers in its first lines.
 
     A line with a single number may be a name, as in TLIO's lists.
     """
     if path.suffix.lower() not in _SUFFIXES or first_line(path, comments=True) is None:
         return False
-    lines = first_lines(path, _LOOKED_AT)
+    lines = first_lines(path, _HEAD_LINES)
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
 
 
@@ -61,7 +61,7 @@ def list_entries(path: Path) -> Iterator[Entry | ReadError]:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
     for number, text in written:
-        text, where = _chosen(text)
+        text, where = _split_filters(text)
         name = text.split(",")[0].strip()
         if not name:
             yield ReadError(
@@ -76,10 +76,10 @@ def list_entries(path: Path) -> Iterator[Entry | ReadError]:
             yield Entry(found, where)
 
 
-def _chosen(text: str) -> tuple[str, AttributeFilter]:
+def _split_filters(text: str) -> tuple[str, AttributeFilter]:
     """Split the `key=value` filters off the end of a line."""
     where: dict[str, list[str]] = {}
-    while match := _CHOICE.search(text):
+    while match := _FILTER.search(text):
         where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
         text = text[: match.start()]
     return text, where

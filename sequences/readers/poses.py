@@ -2,10 +2,10 @@
 
 Rows are time, position xyz [m] and a quaternion, or the upper three rows of a pose matrix (ARKit).
 Files differ in the body they describe (camera, display, sensor), in the quaternion's order, which
-some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). The gyroscope
-decides: each file and order is compared with it (`stario.sequences.truth.alignment`), and the best
-is used. Its constant rotation relative to the IMU's axes is removed, and its world is levelled with
-the mean specific force. If several agree, the one with the smallest rotation is the sensor's own.
+some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). Each file and order
+is compared with the gyroscope (`stario.sequences.truth.alignment`), and the best is used. Its
+constant rotation relative to the IMU's axes is removed, and its world is levelled with the mean
+specific force. If several agree, the one with the smallest rotation is the sensor's own.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ _NAMES = ("pose", "arcore", "arkit")
 _OTHER = {"point", "points", "cloud", "intrinsics", "image", "frames"}
 _SUFFIXES = (".txt", ".csv")
 
-_AGREES = 0.9
+_MIN_CORRELATION = 0.9
 """Minimum correlation of angular rates for a pose to be that of the IMU's device."""
 
-_ALIKE = 0.02
+_TIE_MARGIN = 0.02
 _DOWN = 0.985
 """Minimum cosine between a mean force and a world's -y or -z for it to point down."""
 
@@ -104,21 +104,29 @@ def with_pose(
     Raises:
         ReadError: a file's rows are malformed.
     """
-    ways = [way for file in files for way in pose_rows(file) if way.order in orders]
-    fits = [(way, fit) for way in ways if (fit := _fitted(sequence, start_ns, way)) is not None]
+    candidates = [
+        candidate for file in files for candidate in pose_rows(file) if candidate.order in orders
+    ]
+    fits = [
+        (candidate, fit)
+        for candidate in candidates
+        if (fit := _fitted(sequence, start_ns, candidate)) is not None
+    ]
     if not fits:
-        if ways:
-            names = ", ".join(dict.fromkeys(way.file.name for way in ways))
+        if candidates:
+            names = ", ".join(dict.fromkeys(candidate.file.name for candidate in candidates))
             _log.warning("%s: no poses in %s agree with the gyroscope", sequence.name, names)
         elif files:
             names = ", ".join(file.name for file in files)
             _log.warning("%s: no row in %s holds a pose", sequence.name, names)
         return sequence
     best = max(fit.aligned.correlation for _, fit in fits)
-    near = [(way, fit) for way, fit in fits if fit.aligned.correlation > best - _ALIKE]
-    way, fit = min(near, key=lambda item: item[1].turn)
-    _log_choice(sequence, fits, way, fit)
-    return _posed(sequence, way, fit)
+    near = [
+        (candidate, fit) for candidate, fit in fits if fit.aligned.correlation > best - _TIE_MARGIN
+    ]
+    candidate, fit = min(near, key=lambda item: item[1].turn)
+    _log_choice(sequence, fits, candidate, fit)
+    return _posed(sequence, candidate, fit)
 
 
 def pose_rows(file: Path) -> list[PoseCandidate]:
@@ -178,64 +186,76 @@ class _Fit:
         return float(self.mount.magnitude())
 
 
-def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, way: PoseCandidate) -> _Fit | None:
+def _fitted(
+    sequence: ImuSequence, start_ns: np.int64 | int, candidate: PoseCandidate
+) -> _Fit | None:
     time, gyro, accel = clean_samples(sequence)
-    order = np.argsort(way.stamps_ns, kind="stable")
-    pose_time = seconds(way.stamps_ns[order], start_ns)
+    order = np.argsort(candidate.stamps_ns, kind="stable")
+    pose_time = seconds(candidate.stamps_ns[order], start_ns)
     kept = increasing_mask(pose_time)
     rows, pose_time = order[kept], pose_time[kept]
-    attitude = way.attitude[rows]
+    attitude = candidate.attitude[rows]
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
         overlap = pose_time[0] < time[-1] and pose_time[-1] > time[0]
         aligned = None
         if overlap:
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
-        if aligned is None or aligned.correlation < _AGREES or abs(aligned.lag) > _SAME_CLOCK_S:
+        if (
+            aligned is None
+            or aligned.correlation < _MIN_CORRELATION
+            or abs(aligned.lag) > _SAME_CLOCK_S
+        ):
             pose_time = pose_time + clock_offset(time, gyro, pose_time, attitude, valid)
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
     except InputError:
         return None
-    if aligned.correlation < _AGREES:
+    if aligned.correlation < _MIN_CORRELATION:
         return None
     mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
     return _Fit(pose_time, rows, aligned, mount)
 
 
 def _squared(mount: Rotation) -> Rotation:
-    """Return the nearest mount by right angles if it is close, else the mount itself."""
+    """Round a mount to the nearest one by right angles if it is close to that."""
     square = Rotation.create_group("O")
     away = (square.inv() * mount).magnitude()
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
 
 
 def _log_choice(
-    sequence: ImuSequence, fits: list[tuple[PoseCandidate, _Fit]], way: PoseCandidate, fit: _Fit
+    sequence: ImuSequence,
+    fits: list[tuple[PoseCandidate, _Fit]],
+    candidate: PoseCandidate,
+    fit: _Fit,
 ) -> None:
     _log.info(
         "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
-        sequence.name, way.file.name, way.order, np.degrees(fit.turn), fit.aligned.correlation,
+        sequence.name, candidate.file.name, candidate.order, np.degrees(fit.turn),
+        fit.aligned.correlation,
     )  # fmt: skip
-    for other, its in fits:
-        if other.file != way.file and its.turn > _SAME_AXES_RAD:
+    for other, other_fit in fits:
+        if other.file != candidate.file and other_fit.turn > _SAME_AXES_RAD:
             _log.warning(
                 "%s: the ground truth is %s; %s is rotated %.0f degrees from the IMU's axes",
-                sequence.name, way.file.name, other.file.name, np.degrees(its.turn),
+                sequence.name, candidate.file.name, other.file.name, np.degrees(other_fit.turn),
             )  # fmt: skip
 
 
-def _posed(sequence: ImuSequence, way: PoseCandidate, fit: _Fit) -> ImuSequence:
+def _posed(sequence: ImuSequence, candidate: PoseCandidate, fit: _Fit) -> ImuSequence:
     aligned = fit.aligned
-    attitude_PB = way.attitude[fit.rows] * fit.mount
+    attitude_PB = candidate.attitude[fit.rows] * fit.mount
     time = fit.time + aligned.lag
-    truth = Trajectory(time, way.position[fit.rows], attitude_PB, valid=aligned.valid)
+    truth = Trajectory(time, candidate.position[fit.rows], attitude_PB, valid=aligned.valid)
     sequence = accel_axes(sequence, truth)
     inside = (sequence.time >= time[0]) & (sequence.time <= time[-1])
     pose = truth.at(np.unique(sequence.time[inside]))
     force = interpolated(pose.time, sequence.time, sequence.accel)
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
     if np.linalg.norm(up) < MIN_GRAVITY_FORCE:
-        _log.warning("%s: rejected %s: no gravity to level its poses", sequence.name, way.file.name)
+        _log.warning(
+            "%s: rejected %s: no gravity to level its poses", sequence.name, candidate.file.name
+        )
         return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
         _log.warning("%s: inverted the accelerometer, which has Apple's sign", sequence.name)
@@ -247,5 +267,5 @@ def _posed(sequence: ImuSequence, way: PoseCandidate, fit: _Fit) -> ImuSequence:
             truth, position_W=R_WP.apply(truth.position_W), attitude_WB=R_WP * truth.attitude_WB
         )
     except InputError as error:
-        raise ReadError(way.file, "poses", str(error), "finite numbers") from None
+        raise ReadError(candidate.file, "poses", str(error), "finite numbers") from None
     return replace(sequence, truth=truth)

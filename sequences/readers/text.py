@@ -1,4 +1,4 @@
-"""Numbers from text files, with errors that name file, line and column."""
+"""Reading of numbers from text files, with errors that name file, line and column."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
 
 
 def _decoded(content: bytes) -> str:
-    """Decode UTF-8 or, as old apps write their unit signs, Latin-1."""
+    """Decode UTF-8, or else Latin-1, in which old apps write the signs of units."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -206,10 +206,11 @@ def read_table(
 def read_quickly(
     path: Path, skip: int, delimiter: str | None, wanted: list[int], decimal: str = "."
 ) -> Table | None:
-    """Read a large file with pandas, five times as fast as with NumPy; else None.
+    """Read a large file with pandas, five times as fast as with NumPy; return None if it cannot.
 
-    Returns None for a small file, without pandas, and for blank or malformed cells or rows cut
-    short, which the slow way names. Arguments are those of `read_table`; `wanted` is its `used`.
+    It cannot read a small file, or any without pandas, nor blank or malformed cells or rows cut
+    short, which only the slow reader reports. Arguments are those of `read_table`; `wanted` is its
+    `used`.
     """
     try:
         if path.stat().st_size < _LARGE_BYTES:

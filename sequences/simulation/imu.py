@@ -113,8 +113,8 @@ def simulate_imu(
     """Simulate an IMU that moves along `trajectory`; samples are instantaneous.
 
     Args:
-        trajectory: at least 6 poses at any even rate that resolves the motion. The spline bridges
-            missing and invalid poses.
+        trajectory: at least 6 poses, evenly sampled at any rate that resolves the motion. The
+            spline bridges missing and invalid poses.
         rate: sampling rate of the IMU [Hz].
         errors: errors of the sensors.
         seed: seed of every random draw; the same seed gives the same recording.
@@ -219,5 +219,5 @@ def _measured(
     steps[0] = turn_on * rng.standard_normal(3)
     bias = np.cumsum(steps, axis=0)
     noise = white * math.sqrt(rate) * rng.standard_normal(true.shape)
-    shown: FloatArray = np.clip(true @ axes.T * scales + bias + noise, -limit, limit)
-    return shown
+    measured: FloatArray = np.clip(true @ axes.T * scales + bias + noise, -limit, limit)
+    return measured

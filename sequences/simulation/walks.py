@@ -45,7 +45,7 @@ class WalkStyle:
         step_constant: k in speed = k height step_rate^2 [s]; large for long steps.
         preferred_speed: preferred speed [m/s].
         vigor: strength of arm swing and heel strike, 1 is typical.
-        mount_rotvec: any rotation vector of the device from its neutral attitude [rad].
+        mount_rotvec: rotation vector of the device from its neutral attitude [rad], of any size.
 
     Raises:
         InputError: a carrying mode is unknown or a value is out of range.
@@ -75,7 +75,7 @@ class WalkStyle:
         """Draw a person, a carrying mode (about a third of walks change it) and a mount."""
         carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
         # A device is not put onto a trolley, or taken off it, within a step or two.
-        others = [way for way in CARRYING_MODES if way not in (carry, "trolley")]
+        others = [mode for mode in CARRYING_MODES if mode not in (carry, "trolley")]
         changes = carry != "trolley" and rng.random() < 1.0 / 3.0
         x, y, z = Rotation.random(rng=rng).as_rotvec()
         return WalkStyle(

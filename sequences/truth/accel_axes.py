@@ -1,4 +1,4 @@
-"""Accelerometers that were logged in other axes than their gyroscope."""
+"""Correction of accelerometers that were logged in other axes than the gyroscope."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stario.sequences.sequence import ImuSequence, Trajectory
 _log = logging.getLogger(__name__)
 
 _GRAVITY_KEPT = 0.9
-"""Least ratio of the mean force along the vertical to its mean magnitude if axes are right."""
+"""Minimum ratio of the mean force along the vertical to its mean magnitude if axes are right."""
 
 _BETTER, _SHARPER = 0.2, 0.02
 """Margins by which another axis order must exceed the logged and the next best in that ratio."""

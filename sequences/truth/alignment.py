@@ -30,11 +30,11 @@ _STRIDES_S = (0.03, 0.1, 0.25, 0.5)
 _FLIP_RAD = np.deg2rad(15.0)
 _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
-_SILENT_S = 0.5
+_MAX_GYRO_GAP_S = 0.5
 _MIN_PIECE_S = 1.0
 _MIN_FIT_S = 10.0
 _LAG_STEP_S = 0.0025
-_LEFT_LAG_S = 0.04
+_REMAINING_LAG_S = 0.04
 _CORRELATED_S = 0.1
 
 
@@ -69,7 +69,7 @@ def align_tracked_body(
     position_WV: FloatArray | None = None,
     max_lag: float = 0.15,
 ) -> BodyAlignment:
-    """Estimate lag, mount (again after every flip) and the tilt of the world.
+    """Estimate the lag, the mount (separately after every flip) and the tilt of the world.
 
     Args:
         imu_time: (N,) [s].
@@ -173,11 +173,11 @@ class _GyroIntegral:
             self._rate[left] * tau[:, None]
         )
 
-    def silent(self, start: float, stop: float) -> bool:
-        """Return whether a gap between two times is too long to carry an attitude across."""
+    def has_long_gap(self, start: float, stop: float) -> bool:
+        """Return whether the samples between two times have a gap too long to integrate across."""
         first, last = np.searchsorted(self.time, [start, stop])
         inside = self.time[max(first - 1, 0) : last + 1]
-        return bool(np.diff(inside).max(initial=0.0) > _SILENT_S)
+        return bool(np.diff(inside).max(initial=0.0) > _MAX_GYRO_GAP_S)
 
     def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
         """Return mean rates (M - stride, 3) [rad/s] from each time to the one `stride` later."""
@@ -220,7 +220,8 @@ def _lag_by_axes(
 ) -> float:
     """Return the remaining lag from the rates as vectors, once the mount is known.
 
-    From magnitudes alone, noise of the capture costs up to 12 ms where little is turned: a trolley.
+    From magnitudes alone, the capture's noise costs up to 12 ms if there is little rotation, as on
+    a trolley.
     """
     stride = max(1, round(0.06 / float(np.median(np.diff(time)))))
     rates, good = _rates(time, attitude_WB, valid, stride)
@@ -230,7 +231,7 @@ def _lag_by_axes(
         use = good & (np.linalg.norm(rates - measured, axis=1) < 3.0)
         return correlation(rates[use], measured[use])
 
-    return _best_lag(score, _LEFT_LAG_S)
+    return _best_lag(score, _REMAINING_LAG_S)
 
 
 def _best_lag(score: Callable[[float], float], reach: float) -> float:
@@ -301,16 +302,16 @@ def _mounts(
         here, there = _facing_ends(pieces[k], pieces[neighbour])
         mount, fit = mounts[neighbour], fitted[k]
         carried = fit or mount
-        if not gyro_B.silent(*sorted((time[here], time[there]))):
+        if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
             across = attitude_B[there].inv() * attitude_B[here]
             carried = attitude_WV[here].inv() * attitude_WV[there] * mount * across
-        same = _alike(mount, carried) or (fit is not None and _alike(mount, fit))
-        agrees = fit is not None and _alike(fit, carried)
+        same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
+        agrees = fit is not None and _same_mount(fit, carried)
         mounts[k] = mount if same else (fit if agrees and fit else carried)
     return [mounts[k] for k in range(len(pieces))]
 
 
-def _alike(mount: Rotation, other: Rotation) -> bool:
+def _same_mount(mount: Rotation, other: Rotation) -> bool:
     return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
 
 

@@ -25,7 +25,7 @@ def clock_offset(
     """Return the offset [s] to add to the truth's clock, from the rotation that both measured.
 
     If both stretches overlap in time, offsets of up to 5 s are searched, otherwise all of them. The
-    result is good to a few hundredths of a second; `align_tracked_body` refines it.
+    result is accurate to a few hundredths of a second; `align_tracked_body` refines it.
 
     Args:
         imu_time: (N,) [s].
@@ -44,15 +44,15 @@ def clock_offset(
     steps = np.diff(truth_time[known])
     speed_V = np.where(steps < 0.1, turned / steps, np.nan)
     start_B, start_V = float(imu_time[0]), float(truth_time[known[0]])
-    seen_B = _on_grid(imu_time - start_B, np.linalg.norm(gyro, axis=1))
-    seen_V = _on_grid(truth_time[known[1:]] - start_V, speed_V)
-    apart = start_B - start_V
-    lags, scores = _correlations(seen_B, seen_V)
+    rates_B = _on_grid(imu_time - start_B, np.linalg.norm(gyro, axis=1))
+    rates_V = _on_grid(truth_time[known[1:]] - start_V, speed_V)
+    start_offset = start_B - start_V
+    lags, scores = _correlations(rates_B, rates_V)
     overlapping = start_V < imu_time[-1] and start_B < truth_time[known[-1]]
-    near = np.abs(lags / _GRID_HZ + apart) <= _NEAR_CLOCKS_S
+    near = np.abs(lags / _GRID_HZ + start_offset) <= _NEAR_CLOCKS_S
     if overlapping and near.any():
         lags, scores = lags[near], scores[near]
-    return float(lags[int(np.argmax(scores))]) / _GRID_HZ + apart
+    return float(lags[int(np.argmax(scores))]) / _GRID_HZ + start_offset
 
 
 _LONGEST_S = 2.0 * 86_400.0

@@ -56,7 +56,7 @@ def _scale_words(yaw: YawDrift) -> str:
 
 
 def fit_problems(name: str, fit: TruthFit, yaw: YawDrift | None, known: str) -> list[str]:
-    """Return problems found by comparing truth and gyroscope, unless the text `known` has them."""
+    """Return problems found by comparing truth and gyroscope, except those in the text `known`."""
     field = f"{name}: truth"
     if not fit.consistent:
         return [

@@ -31,13 +31,13 @@ _NEAR_RAD = np.deg2rad(20.0)
 _GLITCH_RAD_S = 12.0
 """A truth that rotates faster than this [rad/s] has jumped."""
 
-_ALIKE, _AGREEING = 0.9, 0.7
+_MIN_CORRELATION, _MIN_AGREEING = 0.9, 0.7
 """Correlation, and share of agreeing truth samples, below which gyroscope and truth did not measure
 the same rotations; published recordings have at least 0.97 and 0.999. An even gait correlates with
 itself a few steps later by up to 0.94, but with a lower share."""
 
 _EDGE_S = 0.05
-"""An offset this close [s] to the largest one searched is the end of the search, not the best."""
+"""An offset this close [s] to the largest one searched is the end of the search, not a maximum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class TruthFit:
     def consistent(self) -> bool:
         """Whether both measured the same rotations, so that offset and axes are meaningful."""
         inside = abs(self.time_offset) < MAX_OFFSET_S - _EDGE_S
-        return inside and self.correlation > _ALIKE and self.agreeing > _AGREEING
+        return inside and self.correlation > _MIN_CORRELATION and self.agreeing > _MIN_AGREEING
 
     def axes(self) -> str | None:
         """Return `--axes` to rotate the IMU to the truth's axes; None if none is needed or fits."""

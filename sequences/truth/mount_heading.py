@@ -84,8 +84,8 @@ def _gyro_information(
     use &= np.arange(len(use)) % stride == 0
     phi_B = (angle[stride:] - angle[:-stride])[use]
     starts = np.flatnonzero(use)
-    seen = (attitude_WB[starts].inv() * attitude_WB[starts + stride]).as_rotvec()
-    deviation = _deviation(seen - phi_B)
+    phi_attitude = (attitude_WB[starts].inv() * attitude_WB[starts + stride]).as_rotvec()
+    deviation = _deviation(phi_attitude - phi_B)
     return float(np.square(np.cross(phi_B, up_B)).sum() / deviation**2)
 
 
@@ -109,8 +109,8 @@ def _rows(
 ) -> FloatArray:
     """Return rows (M, 10), two for each instant, whose columns are means in W.
 
-    Lever arm (3), bias (3), the force along `up_B`, the force across it, the latter rotated by 90
-    degrees, and the second difference of the position.
+    Lever arm (3), bias (3), the force along `up_B`, the force perpendicular to it, the latter
+    rotated by 90 degrees, and the second difference of the position.
     """
     dt = float(np.median(np.diff(time)))
     k = max(1, round(_H_S / dt))

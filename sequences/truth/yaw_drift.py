@@ -24,7 +24,7 @@ from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
 _LEAST_TURNED_RAD = 0.3
-"""Least deviation of the true yaw from an even rotation at which scale and bias are separable."""
+"""Minimum deviation of the true yaw from an even rotation that separates scale from bias."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     if len(off) < 3:
         return None
     even = np.column_stack([np.ones(len(off)), seconds])
-    # From the true yaw: a gyroscope that measures only a fiftieth of it is reported as well.
+    # The true yaw is tested, so that a gyroscope that measures only a fiftieth is reported as well.
     turned = yaw + off - even @ np.linalg.lstsq(even, yaw + off, rcond=None)[0]
     if float(turned.std()) < _LEAST_TURNED_RAD:
         return None

@@ -36,4 +36,4 @@ def read_packaged_list(name: str, data: Path) -> list[ListEntry]:
 
 def split_paths(data: Path, split: str) -> list[Path]:
     """Return the paths of a list's recordings; arguments and errors as `read_packaged_list`."""
-    return [one.path for one in read_packaged_list(split, data)]
+    return [entry.path for entry in read_packaged_list(split, data)]

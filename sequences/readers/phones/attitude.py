@@ -1,4 +1,4 @@
-"""The attitude that a phone's own fusion logged alongside its sensors.
+"""Attitude logged by a phone's own sensor fusion.
 
 Apps differ in the order of a quaternion and in whether it takes the body to the world or back, so
 all variants are compared with the gyroscope: over a step the attitude rotates by R_k^T R_k+1 in the
@@ -63,11 +63,11 @@ def agreeing_attitude(
         return None
     stamps, quaternion = stamps[kept], quaternion[kept]
     orders = _ORDERS[:1] if named else _ORDERS
-    ways = [Rotation.from_quat(quaternion[:, order]) for order in orders]
-    ways += [way.inv() for way in ways]
-    shares = [_explained(stamps, way, gyro) for way in ways]
+    variants = [Rotation.from_quat(quaternion[:, order]) for order in orders]
+    variants += [variant.inv() for variant in variants]
+    shares = [_explained(stamps, variant, gyro) for variant in variants]
     best = int(np.argmax(shares))
-    return (stamps, ways[best]) if shares[best] > _EXPLAINED else None
+    return (stamps, variants[best]) if shares[best] > _EXPLAINED else None
 
 
 def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> float:
@@ -82,7 +82,7 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     time = seconds(stamps_ns, stamps_ns[0])
     turned = interpolated(time, clock, angle)
-    seen = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
+    logged = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
     inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1])
     inside &= np.diff(time) < _LONGEST_STEP_S
     if not inside.any():
@@ -90,6 +90,6 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
     measured = np.diff(turned, axis=0)[inside]
     size, left = (
         float(np.median(np.linalg.norm(steps, axis=1)))
-        for steps in (measured, seen[inside] - measured)
+        for steps in (measured, logged[inside] - measured)
     )
     return 1.0 - left / size if size > 0.0 else 0.0

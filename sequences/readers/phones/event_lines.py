@@ -61,8 +61,8 @@ def read_event_lines(path: Path) -> ImuSequence:
     sensors, points = _trace(path) if trace else _logfile(path)
     for name in ("gyro", "accel"):
         if name not in sensors:
-            seen = ", ".join(sensors) or "no sensor"
-            raise ReadError(path, "events", f"those of {seen}", "those of gyro and accel")
+            found = ", ".join(sensors) or "no sensor"
+            raise ReadError(path, "events", f"those of {found}", "those of gyro and accel")
     stamps, gyro, accel = resample_to_gyro(path, *sensors["gyro"], *sensors["accel"])
     field = sensors.get("mag")
     attitude = _attitude(sensors)
@@ -82,7 +82,7 @@ def read_event_lines(path: Path) -> ImuSequence:
 
 
 def is_event_lines(path: Path) -> bool:
-    """Whether a text file's first lines hold a sensor event."""
+    """Return whether a text file's first lines hold a sensor event."""
     if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
         return False
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
@@ -125,9 +125,9 @@ def _whole_lines(path: Path, separator: str) -> list[str]:
     if len(lines) < 2 or path.read_bytes()[-1:] in (b"\n", b"\r"):
         return lines
     last = lines[-1].split(separator)
-    alike = next((c for c in _cells(lines[-2::-1], separator) if _kind(c) == _kind(last)), None)
-    whole = alike is not None and len(last) >= len(alike) and _is_number(last[-1])
-    return lines if whole else lines[:-1]
+    previous = next((c for c in _cells(lines[-2::-1], separator) if _kind(c) == _kind(last)), None)
+    is_complete = previous is not None and len(last) >= len(previous) and _is_number(last[-1])
+    return lines if is_complete else lines[:-1]
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
@@ -182,9 +182,9 @@ def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
     )
     if _POINT not in events or "ACCE" not in events:
         return sensors, None
-    apart = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
+    offsets = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
     stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
-    return sensors, (stamps - round(float(np.median(apart)) * 1e9), _metres(degrees))
+    return sensors, (stamps - round(float(np.median(offsets)) * 1e9), _metres(degrees))
 
 
 def _metres(degrees: FloatArray) -> FloatArray:

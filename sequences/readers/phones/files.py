@@ -55,11 +55,11 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
         group.tables.setdefault(sensor, []).append(table)
-    whole = [group for group in groups.values() if _is_complete(group)]
-    if whole:
-        return whole
-    lone = _merged_groups(list(groups.values()))
-    return [lone] if _is_complete(lone) else []
+    complete = [group for group in groups.values() if _is_complete(group)]
+    if complete:
+        return complete
+    merged = _merged_groups(list(groups.values()))
+    return [merged] if _is_complete(merged) else []
 
 
 def incomplete_sensors(path: Path) -> list[Sensor]:
@@ -68,8 +68,8 @@ def incomplete_sensors(path: Path) -> list[Sensor]:
     Empty if it holds both, or no sensor at all.
     """
     sensors = _sensors(path)
-    whole = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
-    return [] if whole else sensors
+    complete = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
+    return [] if complete else sensors
 
 
 def _sensors(path: Path) -> list[Sensor]:
@@ -104,10 +104,10 @@ def _is_complete(group: PhoneFiles) -> bool:
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
     """Merge groups into one recording, which is empty if a sensor occurs in several of them."""
-    lone = PhoneFiles("")
+    merged = PhoneFiles("")
     for group in groups:
         for sensor, tables in group.tables.items():
-            if sensor in lone.tables:
+            if sensor in merged.tables:
                 return PhoneFiles("")
-            lone.tables[sensor] = tables
-    return lone
+            merged.tables[sensor] = tables
+    return merged

@@ -24,7 +24,7 @@ _NAME = re.compile(r"\w+")
 
 
 def is_json_export(path: Path) -> bool:
-    """Whether a file begins with such an array; never raises."""
+    """Return whether a file begins with such an array; never raises."""
     if path.suffix.lower() != ".json" or not path.is_file():
         return False
     return _FIRST.match("\n".join(head_lines(path))) is not None

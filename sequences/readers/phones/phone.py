@@ -8,8 +8,8 @@ values without a unit are in rad/s, m/s^2 and uT.
 A wide file (AndroSensor, Physics Toolbox, phyphox, `*_IMU.txt`) has a clock and columns for each
 sensor; cells of sensors that were not sampled are empty.
 
-Both sensors are brought to the gyroscope's times in their common time span. If the accelerometer's
-file lacks gravity and there is a file of gravity, it is added. Apple's accelerometers report the
+The accelerometer is interpolated to the gyroscope's times in their common time span. If its file
+lacks gravity and there is a file of gravity, that is added. Apple's accelerometers report the
 opposite of specific force, in g: this is determined from the app and system that the folder
 indicates (Sensor Logger's `Metadata.csv`), or from the phone's own attitude. A pose that an ARCore
 or ARKit logger wrote alongside is the ground truth, see `poses`; reference points (`*_ref.csv`:
@@ -92,7 +92,7 @@ def read_wide(path: Path) -> ImuSequence:
 
 
 def is_wide(path: Path) -> bool:
-    """Whether a file's header names a clock and the axes of both sensors.
+    """Return whether a file's header names a clock and the axes of both sensors.
 
     A generic CSV does not count unless poses lie next to it or it holds two kinds of force.
     """
@@ -102,8 +102,9 @@ def is_wide(path: Path) -> bool:
     if files is None:
         return False
     axes = files.tables["gyro"][0].axes
-    more = "linear" in axes or (axes["accel"][0].title.lower().startswith("g"))  # gFx and ax
-    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or more
+    # Two kinds of force: gFx and ax.
+    has_both = "linear" in axes or axes["accel"][0].title.lower().startswith("g")
+    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or has_both
 
 
 def _wide(path: Path) -> PhoneFiles | None:
@@ -170,7 +171,7 @@ def assemble_recording(
 
 
 def is_phone(path: Path) -> bool:
-    """Whether a folder holds one recording, or a file is the gyroscope file of one of several.
+    """Return whether a folder holds one recording, or a file is the gyroscope file of one of many.
 
     Never raises.
     """
@@ -215,13 +216,13 @@ def _force(
     """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity = _gravity(files)
-    whole = _with_gravity(candidates, or_g=gravity is None)
+    total = _with_gravity(candidates, or_g=gravity is None)
     linear = files.first("linear")
-    if whole is None and not candidates and linear is not None:
+    if total is None and not candidates and linear is not None:
         candidates = [_read(linear, "linear")]
-    accel = whole or candidates[0]
-    apart = whole is None and gravity is not None
-    if apart and gravity is not None:
+    accel = total or candidates[0]
+    separate_gravity = total is None and gravity is not None
+    if separate_gravity and gravity is not None:
         folder = gyro_folder(files)
         stamps, force, gravity_B = resample_to_gyro(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
@@ -230,7 +231,7 @@ def _force(
         _log.info("%s: added gravity from its separate file", folder)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
-    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, apart)
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, separate_gravity)
     in_g &= sign < 0
     if sign < 0:
         converted |= {"accel"}
@@ -244,13 +245,13 @@ def gyro_folder(files: PhoneFiles) -> Path:
 
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
-    """Return the first that holds gravity in m/s^2, else the steadiest that may hold it in g."""
-    sizes = [np.linalg.norm(one.values, axis=1) for one in candidates]
-    for one, size in zip(candidates, sizes, strict=True):
+    """Return the first candidate with gravity in m/s^2, else the steadiest that may be in g."""
+    sizes = [np.linalg.norm(candidate.values, axis=1) for candidate in candidates]
+    for candidate, size in zip(candidates, sizes, strict=True):
         if float(np.median(size)) >= _GRAVITY_REMOVED:
-            return one
+            return candidate
     shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
-    maybe = [k for k, one in enumerate(candidates) if or_g and is_in_g(one.values)]
+    maybe = [k for k, candidate in enumerate(candidates) if or_g and is_in_g(candidate.values)]
     return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
 
 

@@ -16,8 +16,8 @@ from stario.sequences.units import TIME_UNITS
 
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
 
-_BESIDE_S = 60.0
-"""Maximum time of reference points before or after their recording."""
+_MARGIN_S = 60.0
+"""Maximum time [s] by which reference points may precede or follow their recording."""
 
 
 def reference_points(
@@ -44,7 +44,7 @@ def reference_points(
             continue
         first, delimiter, decimal = found
         table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
-        start, stop = float(start_ns) * 1e-9 - _BESIDE_S, float(stop_ns) * 1e-9 + _BESIDE_S
+        start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
         stamps = table.values[:, 0]
         # Stamps from zero fit finer units as well, but with all points at the start.
         fitting = {

@@ -175,7 +175,7 @@ def by_rows(head: FloatArray) -> Layout | None:
 
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:
-    """Whether a column next to the time is another clock: large, or as fast as the time."""
+    """Return whether a column next to the time is another clock: large, or as fast as the time."""
     if not (np.diff(column) >= 0).all():
         return False
     if abs(column[0]) > _CLOCK_FROM:

@@ -20,7 +20,7 @@ from stario.sequences.readers.text import IntArray, Table, head_lines, read_tabl
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
-_LOOKED_AT = 24
+_HEAD_ROWS = 24
 UNITS = {
     "accel": ACCEL_UNITS,
     "linear": ACCEL_UNITS,
@@ -61,7 +61,7 @@ class Samples:
 def sensor_table(file: Path) -> SensorTable | None:
     """Return how to read a file's rows, or None if that cannot be determined; never raises."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
-    numbered = numbered[: 4 * _LOOKED_AT]
+    numbered = numbered[: 4 * _HEAD_ROWS]
     if len(numbered) < 2:
         return None
     found = first_row(numbered[:-1])  # the last line may be cut
@@ -69,7 +69,7 @@ def sensor_table(file: Path) -> SensorTable | None:
         return None
     first, delimiter, decimal = found
     skip = numbered[first][0]
-    rows = [_cells(line, delimiter, decimal) for _, line in numbered[first:-1]][:_LOOKED_AT]
+    rows = [_cells(line, delimiter, decimal) for _, line in numbered[first:-1]][:_HEAD_ROWS]
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
     rows = [row for row in rows if len(row) == width]
     if len(rows) < 2:
@@ -154,7 +154,7 @@ def read_quaternion(
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
 
 
-_ROWS_SEEN = 5
+_MARK_ROWS = 5
 """Number of rows that determine the decimal mark."""
 
 
@@ -175,7 +175,7 @@ def first_row(
             cells = _cells(line, delimiter, decimal)
             numbers = sum(np.isfinite(_number(cell)) for cell in cells)
             if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                return k, delimiter, _decimal_mark(numbered[k : k + _ROWS_SEEN], delimiter, decimal)
+                return k, delimiter, _decimal_mark(numbered[k : k + _MARK_ROWS], delimiter, decimal)
     return None
 
 

@@ -1,8 +1,8 @@
 """Sensor, axis and unit of a file or a column, determined by its name.
 
 Apps spell the same things in many ways (`TotalAcceleration.csv`, `gyr_walk1.txt`, `magneticFieldX`,
-`ACCELEROMETER X (m/s²)`, `gFx`). A name is split into words at case changes and at non-letters, and
-the words decide, so that order, case and surrounding characters do not matter.
+`ACCELEROMETER X (m/s²)`, `gFx`). A name is split into words at case changes and at non-letters,
+which are then looked up, so that order, case and surrounding characters do not matter.
 """
 
 from __future__ import annotations
@@ -84,12 +84,12 @@ def sensor_of(words: Iterable[str]) -> Sensor | None:
     words = list(words)
     if set(words) & _NOT_SAMPLES:
         return None
-    told = {sensor for word in words if (sensor := _sensor(word)) is not None}
-    if "linear" in told:  # linear acceleration, user acceleration
-        return "linear" if told <= {"linear", "accel"} else None
-    if told == {"gyro", "attitude"} or (told == {"attitude"} and "rate" in words):
+    sensors = {sensor for word in words if (sensor := _sensor(word)) is not None}
+    if "linear" in sensors:  # linear acceleration, user acceleration
+        return "linear" if sensors <= {"linear", "accel"} else None
+    if sensors == {"gyro", "attitude"} or (sensors == {"attitude"} and "rate" in words):
         return "gyro"  # gyro rotation, rotation rate
-    return next(iter(told)) if len(told) == 1 else None
+    return next(iter(sensors)) if len(sensors) == 1 else None
 
 
 def _sensor(word: str) -> Sensor | None:
@@ -99,19 +99,19 @@ def _sensor(word: str) -> Sensor | None:
 
 
 def is_sensor_word(word: str) -> bool:
-    """Whether a word names a sensor or one of its variants, rather than a recording."""
+    """Return whether a word names a sensor or one of its variants, rather than a recording."""
     variants = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
     return _sensor(word) is not None or word.startswith(variants)
 
 
 def without_sensor(stem: str) -> str:
-    """Remove the sensor from a file's name, otherwise unchanged: `Eight_gyr` becomes `Eight`."""
+    """Remove the words of sensors from a file's name: `Eight_gyr` becomes `Eight`."""
     kept = _WORD.sub(lambda match: "" if is_sensor_word(match[0].lower()) else match[0], stem)
     return re.sub(r"[_\W]*$|^[_\W]*", "", re.sub(r"([_\W])[_\W]+", r"\1", kept))
 
 
 def is_uncalibrated(words: Iterable[str]) -> bool:
-    """Whether words name a sensor's raw variant."""
+    """Return whether words name a sensor's raw variant."""
     return any(word.startswith(("uncal", "raw")) for word in words)
 
 
@@ -120,10 +120,10 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
     words = words_of(name)
     if set(words) & _NOT_SAMPLES:
         return None
-    alone = [word for word in words if word in ("x", "y", "z")]
-    if len(alone) == 1:
-        return alone[0], tuple(word for word in words if word != alone[0])
-    match = _GLUED.fullmatch(words[-1]) if words and not alone else None
+    axes = [word for word in words if word in ("x", "y", "z")]
+    if len(axes) == 1:
+        return axes[0], tuple(word for word in words if word != axes[0])
+    match = _GLUED.fullmatch(words[-1]) if words and not axes else None
     if match is None or (match["stem"] and _sensor(match["stem"]) is None):
         return None
     return match["axis"], (*words[:-1], match["stem"])
@@ -132,8 +132,8 @@ def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
 def bias_axis_of(name: str) -> str | None:
     """Return the axis of a column with a raw sensor's bias; None for other columns."""
     words = words_of(name)
-    alone = [word for word in words if word in ("x", "y", "z")]
-    return alone[0] if len(alone) == 1 and {"bias", "drift", "offset"} & set(words) else None
+    axes = [word for word in words if word in ("x", "y", "z")]
+    return axes[0] if len(axes) == 1 and {"bias", "drift", "offset"} & set(words) else None
 
 
 def quaternion_of(name: str) -> str | None:
@@ -145,7 +145,7 @@ def quaternion_of(name: str) -> str | None:
 
 
 def is_time(name: str) -> bool:
-    """Whether a column is a clock."""
+    """Return whether a column is a clock."""
     words = set(words_of(name))
     return bool(words & _TIME) and not words & _NO_TIME
 

@@ -1,4 +1,4 @@
-"""Whether a phone's accelerometer reports specific force or, as Apple's do, its opposite.
+"""Sign of a phone's accelerometer: specific force or, as on Apple's phones, its opposite.
 
 The accelerometer and the gyroscope do not reveal the sign: a world upside down moves the same way.
 It is determined from the phone's own attitude if that was logged, since specific force points up,
@@ -30,11 +30,11 @@ _CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
 """Beginnings of names of files that only loggers on iOS write."""
 
 _SURE = 0.7
-"""Minimum mean cosine between an attitude's vertical and the force for it to decide."""
+"""Minimum mean cosine between an attitude's vertical and the force that determines the sign."""
 
 
 def is_in_g(values: FloatArray) -> bool:
-    """Whether an accelerometer's samples (N, 3) have norms of about one: gravity in g."""
+    """Return whether an accelerometer's samples (N, 3) have norms of about one: gravity in g."""
     size = np.linalg.norm(values, axis=1)
     low, median = np.percentile(size, [10, 50])
     return bool(_G_RANGE[0] <= median <= _G_RANGE[1] and low > _STEADY * median)
@@ -90,8 +90,8 @@ def _by_system(folder: Path, in_g: bool) -> float | None:
         return 1.0
     if "BootTime" in "".join(head_lines(names.get("description.txt", folder))):
         return -1.0
-    apples = any(name.startswith(_CORE_MOTION) for name in names)
-    return -1.0 if apples and in_g else None
+    from_apple = any(name.startswith(_CORE_MOTION) for name in names)
+    return -1.0 if from_apple and in_g else None
 
 
 def _by_metadata(file: Path) -> float | None:
@@ -99,15 +99,15 @@ def _by_metadata(file: Path) -> float | None:
     if len(lines) < 2:
         return None
     titles, cells = ([c.strip().lower() for c in row] for row in csv.reader(lines))
-    told = dict(zip(titles, cells, strict=False))
-    system = told.get("platform", "") or told.get("device name", "")
+    fields = dict(zip(titles, cells, strict=False))
+    system = fields.get("platform", "") or fields.get("device name", "")
     if not any(word in system for word in ("ios", "iphone", "ipad")):
         return 1.0 if system else None
-    return 1.0 if told.get("standardisation", told.get("standardization")) == "true" else -1.0
+    return 1.0 if fields.get("standardisation", fields.get("standardization")) == "true" else -1.0
 
 
 def _has_core_motion(files: PhoneFiles) -> bool:
-    """Whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
+    """Return whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
     titles = [
         place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
     ]
@@ -124,8 +124,8 @@ def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> 
         return None
     up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     time, clock = (seconds(ns, stamps_ns[0]) for ns in (accel.stamps_ns[inside], stamps_ns))
-    seen = interpolated(time, clock, up_B)
+    vertical = interpolated(time, clock, up_B)
     force = accel.values[inside]
-    sizes = np.linalg.norm(seen, axis=1) * np.linalg.norm(force, axis=1)
-    cosine = float(np.mean(np.sum(seen * force, axis=1) / np.maximum(sizes, 1e-9)))
+    sizes = np.linalg.norm(vertical, axis=1) * np.linalg.norm(force, axis=1)
+    cosine = float(np.mean(np.sum(vertical * force, axis=1) / np.maximum(sizes, 1e-9)))
     return float(np.sign(cosine)) if abs(cosine) > _SURE else None

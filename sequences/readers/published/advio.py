@@ -34,7 +34,7 @@ def read_advio(path: Path) -> ImuSequence:
 
 
 def is_advio(path: Path) -> bool:
-    """Whether a folder holds a phone's files in `iphone` and one of the pose files."""
+    """Return whether a folder holds a phone's files in `iphone` and one of the pose files."""
     return any((path / name).is_file() for name in _POSES) and _files(path) is not None
 
 

@@ -49,7 +49,7 @@ def read_euroc(path: Path) -> ImuSequence:
 
 
 def is_euroc(path: Path) -> bool:
-    """Whether a path leads to an `imu0/data.csv`."""
+    """Return whether a path leads to an `imu0/data.csv`."""
     return imu_file(path) is not None
 
 
@@ -72,7 +72,7 @@ def _truth_file(mav: Path) -> Path | None:
 
 
 def _holds_velocity(path: Path) -> bool:
-    """Whether the truth has velocity: some copies of EuRoC's have only the pose's eight columns."""
+    """Return whether the truth has velocity, which some copies of EuRoC's files lack."""
     if not path.parent.name.startswith("state_groundtruth"):
         return False
     rows = (line for line in read_lines(path) if not line.lstrip().startswith("#"))

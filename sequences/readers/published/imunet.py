@@ -57,7 +57,7 @@ def read_imunet(path: Path) -> ImuSequence:
 
 
 def is_imunet(path: Path) -> bool:
-    """Whether a folder holds the raw files."""
+    """Return whether a folder holds the raw files."""
     return path.is_dir() and all((path / name).is_file() for name in _FILES)
 
 

@@ -1,4 +1,4 @@
-"""Columns of a CSV, by their names in the header."""
+"""Columns of a CSV, selected by their names in the header."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class _Phone:
 def read_oxiod(path: Path) -> ImuSequence:
     """Read `imuN.csv` and, if it lies alongside, the capture.
 
-    Truth is None, with a warning logged, if too little of it agrees with the gyroscope.
+    The truth is None, with a warning logged, if too little of it agrees with the gyroscope.
 
     Raises:
         ReadError: a file is missing or cut short, or two of `syn` differ in their number of rows.
@@ -95,7 +95,7 @@ def read_oxiod(path: Path) -> ImuSequence:
 
 
 def is_oxiod(path: Path) -> bool:
-    """Whether a file starts with 16 numbers whose gravity is 1 g, or with rows of sensor codes."""
+    """Return whether a file starts with 16 numbers, with gravity of 1 g, or with sensor codes."""
     row = first_numbers(path)
     apple = len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
     return apple or _is_sensor_rows(path)
@@ -110,7 +110,7 @@ def _is_sensor_rows(path: Path) -> bool:
 
 
 def _name(path: Path) -> str:
-    """`handheld/data1/syn/imu3.csv` becomes `handheld-data1-imu3`."""
+    """Return the name of a recording: `handheld/data1/syn/imu3.csv` is `handheld-data1-imu3`."""
     parts = [p.replace(" ", "_") for p in (*path.parent.parts[-3:], path.stem) if p != "syn"]
     return "-".join(p for p in parts if p not in ("/", "..", "."))
 

@@ -76,7 +76,7 @@ def read_ridi(path: Path) -> ImuSequence:
 
 
 def is_ridi(path: Path) -> bool:
-    """Whether a path leads to a CSV with these columns, or to a pickle in its place."""
+    """Return whether a path leads to a CSV with these columns, or to a pickle in its place."""
     file = data_file(path)
     if file is None or file.name in _PICKLES:
         return file is not None
@@ -93,7 +93,7 @@ def data_file(path: Path) -> Path | None:
 
 
 def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
-    """Whether the world of an attitude has y up instead of z, from the mean specific force.
+    """Return whether the world of an attitude has y up instead of z, from the mean specific force.
 
     Args:
         path: the file, for the warning.

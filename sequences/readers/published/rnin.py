@@ -65,13 +65,13 @@ def read_rnin(path: Path) -> ImuSequence:
 
 
 def is_rnin(path: Path) -> bool:
-    """Whether a path is a folder with `SenseINS.csv` or a CSV with its columns."""
+    """Return whether a path is a folder with `SenseINS.csv` or a CSV with its columns."""
     if path.is_dir():
         return (path / _FILE).is_file()
     return path.name == _FILE or len(set(_OWN) & set(header_names(path))) >= 2
 
 
 def _name(file: Path) -> str:
-    """`data_train/12/SenseINS.csv` becomes `data_train-12`: numbers restart in each folder."""
+    """Return the name of a recording: `data_train-12`, as numbers restart in each folder."""
     folder = file.resolve().parent
     return f"{folder.parent.name}-{folder.name}" if folder.name.isdecimal() else folder.name

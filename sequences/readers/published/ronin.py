@@ -82,7 +82,7 @@ def read_ronin(path: Path) -> ImuSequence:
 
 
 def is_ronin(path: Path) -> bool:
-    """Whether a path is an HDF5 file or a folder with `data.hdf5`."""
+    """Return whether a path is an HDF5 file or a folder with `data.hdf5`."""
     return (path / "data.hdf5").is_file() or first_bytes(path, len(_MAGIC)) == _MAGIC
 
 

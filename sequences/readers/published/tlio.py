@@ -10,8 +10,8 @@ sets.
 Raw: time [ns], temperature, gyroscope [rad/s], accelerometer [m/s^2] at about 1 kHz. As in the
 authors' filter, `calibration.json` corrects them to R^-1 x - b: R is the `RectificationMatrix`, b
 the bias's `Offset`. Ground truth is the resampled pose if present. `T_Device_Imu` takes the IMU's
-axes to those of the pose, but must not be applied in copies whose pose is that of the IMU itself.
-The gyroscope decides: the rotation that matches the resampled rates better is used.
+axes to those of the pose, but must not be applied in copies whose pose is that of the IMU itself:
+with or without it, whichever matches the resampled rates better is used.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def read_tlio(path: Path) -> ImuSequence:
 
 
 def is_tlio(path: Path) -> bool:
-    """Whether a path leads to one of the two files."""
+    """Return whether a path leads to one of the two files."""
     return _file(path) is not None
 
 
@@ -96,7 +96,7 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
 
 
 def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
-    """Whether rates (N, 3) are in the body's axes, whatever their column's name.
+    """Return whether rates (N, 3) are in the body's axes, whatever their column's name.
 
     Over a step the attitude rotates by R_k^T R_k+1 in the body's axes, R_k+1 R_k^T in the world's.
     """
@@ -122,7 +122,7 @@ def _array(file: Path) -> FloatArray:
 
 
 def _places(description: Path) -> dict[str, slice]:
-    """Return the columns' places from a list such as ["ts_us(1)", ...] under any key."""
+    """Return the columns of each quantity from a list such as ["ts_us(1)", ...] under any key."""
     fields = JsonFields(description).fields
     lists = (x for x in fields.values() if isinstance(x, list) and x)
     names = next((x for x in lists if all(isinstance(c, str) for c in x)), [])
