@@ -326,9 +326,7 @@ def test_position_nees_skips_a_start_without_covariance_and_is_yaw_invariant():
     assert len(found.nees) == len(truth) - 1
     low, high = nees_bounds(3, len(found.nees), confidence=0.999)
     assert low < found.mean < high
-    assert found.median == pytest.approx(
-        2.37, abs=0.25
-    )  # median of chi-square with 3 degrees of freedom
+    assert found.median == pytest.approx(2.37, abs=0.25)  # of chi-square, 3 degrees of freedom
     # Rotating the frame must rotate the covariance with it.
     turn = about_z(0.9).as_matrix()
     other = moved(estimate, 0.9, (1, 2, 3))
