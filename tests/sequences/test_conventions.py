@@ -25,14 +25,14 @@ def walk() -> ImuSequence:
     return simulate_imu(generate_walk(3, 20.0), 100.0, seed=1)
 
 
-def linear(sequence: ImuSequence) -> ImuSequence:
-    """The same with gravity taken off by the true attitude."""
+def without_gravity(sequence: ImuSequence) -> ImuSequence:
+    """The recording with gravity removed by means of the true attitude."""
     assert sequence.truth is not None
     up_B = sequence.truth.at(sequence.time).attitude_WB.apply([0, 0, STANDARD_GRAVITY], True)
     return replace(sequence, accel=sequence.accel - up_B)
 
 
-def test_axes_take_the_files_for_the_new_ones(walk: ImuSequence) -> None:
+def test_axes_name_the_file_axis_used_as_each_new_axis(walk: ImuSequence) -> None:
     turned = with_axes(walk, "y, -x, +Z")
     assert np.array_equal(turned.gyro, walk.gyro[:, [1, 0, 2]] * [1, -1, 1])
     assert np.array_equal(turned.accel, walk.accel[:, [1, 0, 2]] * [1, -1, 1])
@@ -62,16 +62,16 @@ def test_left_handed_axes_are_refused(walk: ImuSequence, axes: str) -> None:
 
 
 @pytest.mark.parametrize("axes", ["", "x,y", "x,x,z", "x,y,w", "x y z", "--x,y,z", "x,y,z,z", ",,"])
-def test_what_is_no_permutation_is_refused(walk: ImuSequence, axes: str) -> None:
+def test_axes_that_are_not_a_permutation_are_refused(walk: ImuSequence, axes: str) -> None:
     with pytest.raises(InputError, match=r"axes: found .* expected x, y and z once each"):
         with_axes(walk, axes)
 
 
-def test_gravity_comes_back_with_the_true_attitude(walk: ImuSequence) -> None:
-    np.testing.assert_allclose(with_gravity(linear(walk)).accel, walk.accel, atol=1e-9)
+def test_gravity_is_restored_by_the_true_attitude(walk: ImuSequence) -> None:
+    np.testing.assert_allclose(with_gravity(without_gravity(walk)).accel, walk.accel, atol=1e-9)
 
 
-def test_apples_sign_is_turned_over_unless_the_reader_did(walk: ImuSequence) -> None:
+def test_apples_sign_is_reversed_unless_the_reader_did_so(walk: ImuSequence) -> None:
     apple = replace(walk, accel=-walk.accel / STANDARD_GRAVITY)
     back = with_conventions(apple, accel_unit="g", accel_sign="apple")
     np.testing.assert_allclose(back.accel, walk.accel)
@@ -81,13 +81,13 @@ def test_apples_sign_is_turned_over_unless_the_reader_did(walk: ImuSequence) -> 
         with_conventions(walk, accel_sign="left")
 
 
-def test_conventions_are_undone_in_one_go(walk: ImuSequence) -> None:
-    """Apple's user acceleration in g, rates in degrees, axes turned against the truth's."""
-    bare = with_axes(linear(walk), "-y,x,z")
+def test_all_conventions_are_undone_at_once(walk: ImuSequence) -> None:
+    """Apple's user acceleration in g, rates in deg/s, axes rotated relative to the truth's."""
+    bare = with_axes(without_gravity(walk), "-y,x,z")
     apple = replace(bare, gyro=np.degrees(bare.gyro), accel=-bare.accel / STANDARD_GRAVITY)
-    mended = with_conventions(apple, "deg/s", "-g", "y,-x,z", "removed")
-    np.testing.assert_allclose(mended.gyro, walk.gyro, atol=1e-12)
-    np.testing.assert_allclose(mended.accel, walk.accel, atol=1e-9)
+    corrected = with_conventions(apple, "deg/s", "-g", "y,-x,z", "removed")
+    np.testing.assert_allclose(corrected.gyro, walk.gyro, atol=1e-12)
+    np.testing.assert_allclose(corrected.accel, walk.accel, atol=1e-9)
 
 
 def test_samples_of_unknown_attitude_are_dropped_and_counted(
@@ -96,13 +96,13 @@ def test_samples_of_unknown_attitude_are_dropped_and_counted(
     assert walk.truth is not None
     time = walk.time.copy()
     time[7] = np.nan
-    half = replace(linear(walk), time=time, truth=walk.truth.slice(0.0, 10.0))
+    half = replace(without_gravity(walk), time=time, truth=walk.truth.slice(0.0, 10.0))
     with caplog.at_level(logging.WARNING):
-        mended = with_gravity(half)
-    assert f"{len(walk) - len(mended)} of {len(walk)} samples dropped" in caplog.text
-    assert mended.time[-1] == pytest.approx(10.0)
-    assert np.isfinite(mended.time).all()
-    np.testing.assert_allclose(mended.accel[:7], walk.accel[:7], atol=1e-9)
+        corrected = with_gravity(half)
+    assert f"{len(walk) - len(corrected)} of {len(walk)} samples dropped" in caplog.text
+    assert corrected.time[-1] == pytest.approx(10.0)
+    assert np.isfinite(corrected.time).all()
+    np.testing.assert_allclose(corrected.accel[:7], walk.accel[:7], atol=1e-9)
 
 
 def test_without_an_attitude_gravity_is_not_guessed(walk: ImuSequence) -> None:
@@ -116,7 +116,7 @@ def test_without_an_attitude_gravity_is_not_guessed(walk: ImuSequence) -> None:
             with_gravity(blind)
 
 
-def test_unknown_words_are_refused(walk: ImuSequence) -> None:
+def test_unknown_options_are_refused(walk: ImuSequence) -> None:
     with pytest.raises(InputError, match="gravity: found 'gone', expected one of included, rem"):
         with_conventions(walk, gravity="gone")
     with pytest.raises(InputError, match="gyro_unit"):

@@ -17,7 +17,7 @@ from stario.sequences.errors import ConfigError, InputError, ReadError, StarioEr
     ],
 )
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_errors_come_back_whole_from_another_process(error: StarioError, protocol: int) -> None:
+def test_errors_survive_pickling_unchanged(error: StarioError, protocol: int) -> None:
     again = pickle.loads(pickle.dumps(error, protocol))
     assert type(again) is type(error)
     assert str(again) == str(error)

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, and what was written is read back."""
+"""Files are written completely or not at all, and are read back as written."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def track(n: int = 50, start: float = 0.0, seed: int = 1) -> Trajectory:
     )
 
 
-def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_an_exception_leaves_only_the_old_file(tmp_path):
     path = tmp_path / "result.txt"
     path.write_text("old")
 
@@ -45,7 +45,7 @@ def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path):
         with atomic_write(path) as file:
             file.write("new, half ")
             file.flush()
-            assert path.read_text() == "old"  # nobody sees the half
+            assert path.read_text() == "old"  # the partial file is not visible
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -72,7 +72,7 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_missing_folder_and_other_modes_are_named(tmp_path):
+def test_a_missing_folder_and_an_unsupported_mode_are_named(tmp_path):
     with pytest.raises(InputError, match="existing folder"), atomic_write(tmp_path / "no" / "f"):
         pass
     with pytest.raises(InputError, match="mode: found 'a'"), atomic_write(tmp_path / "f", "a"):
@@ -81,10 +81,10 @@ def test_missing_folder_and_other_modes_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("write", [atomic_write, atomic_folder])
-def test_what_the_system_refuses_names_path_reason_and_fix(tmp_path, write):
+def test_an_operating_system_error_names_path_reason_and_fix(tmp_path, write):
     long = tmp_path / ("x" * 300)
-    told = rf"path: found .*{long.name}: File name too long, expected .*; choose another folder"
-    with pytest.raises(InputError, match=told), write(long):
+    expected = rf"path: found .*{long.name}: File name too long, expected .*; choose another folder"
+    with pytest.raises(InputError, match=expected), write(long):
         pass
 
     def fill() -> None:
@@ -119,7 +119,7 @@ def test_tum_lines_are_what_other_tools_expect(tmp_path):
     ]
 
 
-def test_tum_leaves_out_poses_that_must_not_be_used(tmp_path):
+def test_tum_files_omit_invalid_poses(tmp_path):
     whole = track(10)
     valid = np.arange(10) % 3 != 0
     position = np.where(valid[:, None], whole.position_W, np.nan)
@@ -169,7 +169,7 @@ class Sample:
     where: Path
 
 
-def test_json_keeps_order_and_says_null_for_nan(tmp_path):
+def test_json_keeps_order_and_writes_nan_as_null(tmp_path):
     path = tmp_path / "metrics.json"
     write_json(
         path,
@@ -192,7 +192,7 @@ def test_json_keeps_order_and_says_null_for_nan(tmp_path):
     assert text.endswith("}\n")
 
 
-def test_json_that_cannot_be_written_leaves_the_old_file(tmp_path):
+def test_json_that_cannot_be_written_leaves_the_old_file_unchanged(tmp_path):
     path = tmp_path / "metrics.json"
     write_json(path, {"a": 1})
     with pytest.raises(InputError, match="found set"):

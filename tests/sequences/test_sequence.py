@@ -23,7 +23,7 @@ def screw(time: FloatArray) -> Trajectory:
 
 
 def marked(track: Trajectory, lost: slice) -> Trajectory:
-    """The track with nonsense where it is marked as not valid."""
+    """The track with rows `lost` marked invalid and their positions set to NaN."""
     valid = np.ones(len(track), dtype=np.bool_)
     valid[lost] = False
     position = np.where(valid[:, None], track.position_W, np.nan)
@@ -71,14 +71,14 @@ def test_interpolation_never_crosses_a_gap(missing: bool) -> None:
     assert np.allclose(wider.position_W, screw(time).position_W)
 
 
-def test_short_losses_are_bridged_by_valid_neighbours_alone() -> None:
+def test_short_gaps_are_bridged_by_their_valid_neighbours() -> None:
     read = marked(screw(GRID), slice(40, 43)).at(GRID)
     assert read.valid.all()
     assert np.allclose(read.position_W, screw(GRID).position_W)
 
 
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
-def test_truth_at_the_slowest_rate_is_whole_whatever_rounding_does(start: float) -> None:
+def test_truth_at_the_lowest_rate_has_no_gaps_despite_rounding(start: float) -> None:
     """0.3 - 0.2 > 0.1 in floating point."""
     track = screw(start + np.round(np.arange(201) * 0.1, 1))
     assert track.covers(start + np.linspace(0.05, 19.95, 400)).all()
@@ -87,7 +87,7 @@ def test_truth_at_the_slowest_rate_is_whole_whatever_rounding_does(start: float)
 
 
 def test_gaps_are_not_bridged_at_times_since_1970() -> None:
-    """A second after 1970 has digits to spare: 1e-9 of it is 1.7 s."""
+    """A relative tolerance of 1e-9 is 1.7 s at such times."""
     kept = np.delete(1.7e9 + GRID, np.arange(40, 55))
     outside = 1.7e9 + np.array([-0.5, 0.9, 2.5])
     assert not screw(kept).covers(outside).any()
@@ -107,7 +107,7 @@ def test_a_slice_keeps_both_ends() -> None:
     assert len(part) == len(part.attitude_WB) == len(part.velocity_W) == 26
 
 
-def test_path_length_is_of_the_way_and_not_of_the_noise() -> None:
+def test_path_length_is_hardly_affected_by_noise() -> None:
     time = np.arange(1001) / 100.0
     circle = np.stack([np.cos(0.5 * time), np.sin(0.5 * time), 0 * time], axis=1)
     rest = Rotation.identity(len(time))
@@ -117,7 +117,7 @@ def test_path_length_is_of_the_way_and_not_of_the_noise() -> None:
     assert marked(Trajectory(time, circle, rest), slice(1, None)).path_length() == 0.0
 
 
-def test_a_clock_that_jumps_by_decades_costs_no_memory() -> None:
+def test_a_clock_jump_of_decades_does_not_exhaust_memory() -> None:
     time = np.concatenate([[0.0], 1.7e9 + np.arange(1001) / 100.0])
     position = np.outer(np.append(0.0, np.arange(1001) / 100.0), [1.0, 0.0, 0.0])
     track = Trajectory(time, position, Rotation.identity(len(time)))
@@ -125,7 +125,7 @@ def test_a_clock_that_jumps_by_decades_costs_no_memory() -> None:
     assert len(whole_seconds(time)) < 20
 
 
-def test_a_trajectory_is_checked_at_the_edge() -> None:
+def test_a_trajectory_is_validated_on_construction() -> None:
     track = screw(GRID)
     back, bad = GRID.copy(), track.position_W.copy()
     back[7] = back[6]
@@ -146,8 +146,8 @@ def test_a_trajectory_is_checked_at_the_edge() -> None:
         screw(np.empty(0))
 
 
-def test_an_imu_sequence_is_checked_for_shape_alone() -> None:
-    """Bad samples are the navigator's to drop and count."""
+def test_an_imu_sequence_is_validated_for_shape_only() -> None:
+    """Dropping and counting bad samples is left to the navigator."""
     time, zeros = np.array([0.0, 0.01, 0.01, np.nan]), np.zeros((4, 3))
     sequence = ImuSequence("odd", time, np.nan * zeros, zeros)
     assert len(sequence) == 4
@@ -161,7 +161,7 @@ def test_an_imu_sequence_is_checked_for_shape_alone() -> None:
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
 
 
-def test_a_sequence_is_cut_with_its_truth() -> None:
+def test_slicing_a_sequence_also_slices_its_truth() -> None:
     zeros = np.zeros((len(GRID), 3))
     sequence = ImuSequence("cut", GRID, zeros, zeros, screw(GRID))
     part = sequence.slice(0.5, 1.0)
@@ -172,20 +172,20 @@ def test_a_sequence_is_cut_with_its_truth() -> None:
     assert sequence.without_truth().truth is None
 
 
-def test_about_z_and_yaw_are_each_others_inverse() -> None:
+def test_about_z_and_yaw_of_are_inverses() -> None:
     yaw = np.linspace(-3.1, 3.1, 63)
     assert np.allclose(yaw_of(about_z(yaw)), yaw)
     assert np.allclose(about_z(0.5 * np.pi).apply([1.0, 0.0, 0.0]), [0.0, 1.0, 0.0])
 
 
-def test_turning_the_world_adds_to_the_yaw_at_any_tilt() -> None:
+def test_rotating_the_world_adds_to_the_yaw_at_any_tilt() -> None:
     attitudes = Rotation.random(200, rng=np.random.default_rng(1))
     for yaw in (-2.0, 0.3, 3.0):
         turned = yaw_of(about_z(yaw) * attitudes)
         assert np.allclose(wrap_angle(turned - yaw_of(attitudes) - yaw), 0.0, atol=1e-9)
 
 
-def test_wrapped_angles_lie_in_half_open_turn() -> None:
+def test_wrapped_angles_lie_in_a_half_open_interval() -> None:
     angle = np.linspace(-20.0, 20.0, 1001)
     wrapped = wrap_angle(angle)
     assert (wrapped > -np.pi).all()
@@ -194,7 +194,7 @@ def test_wrapped_angles_lie_in_half_open_turn() -> None:
     assert wrap_angle(np.array([-np.pi]))[0] == pytest.approx(np.pi)
 
 
-def test_tilt_aligning_takes_up_to_z_by_the_shortest_way() -> None:
+def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle() -> None:
     rng = np.random.default_rng(2)
     for up in rng.standard_normal((100, 3)):
         R_WB = tilt_aligning(9.8 * up)

@@ -1,4 +1,4 @@
-"""Which samples count, whatever a clock does: what the streams' intake decides as they come in."""
+"""Which samples are kept under clock errors, as the stream intake decides on arrival."""
 
 import numpy as np
 import pytest
@@ -15,44 +15,44 @@ def moved(rows: slice, by: float) -> FloatArray:
     return time
 
 
-def left_out(time: FloatArray) -> list[int]:
-    counts = increasing_mask(time)
-    assert (np.diff(time[counts]) > 0.0).all()
-    return np.flatnonzero(~counts).tolist()
+def dropped_rows(time: FloatArray) -> list[int]:
+    kept = increasing_mask(time)
+    assert (np.diff(time[kept]) > 0.0).all()
+    return np.flatnonzero(~kept).tolist()
 
 
-def test_times_in_order_all_count_whatever_the_gaps() -> None:
+def test_increasing_times_are_all_kept_whatever_the_gaps() -> None:
     gaps = np.concatenate([TIME[:100], 5.0 + TIME[:1], 1e9 + TIME])
-    assert left_out(TIME) == left_out(gaps) == []
+    assert dropped_rows(TIME) == dropped_rows(gaps) == []
     assert increasing_mask(np.empty(0)).tolist() == []
 
 
-def test_repeated_and_late_times_do_not_count() -> None:
+def test_repeated_and_late_times_are_dropped() -> None:
     time = TIME.copy()
     time[20], time[30] = time[19], time[11]
-    assert left_out(time) == [20, 30]
+    assert dropped_rows(time) == [20, 30]
 
 
 @pytest.mark.parametrize("by", [0.3, 5.0, 100.0, 1e9])
 @pytest.mark.parametrize("row", [0, 1, 200, 398])
-def test_one_wild_time_costs_its_own_sample(row: int, by: float) -> None:
-    assert left_out(moved(slice(row, row + 1), by)) == [row]
+def test_one_outlying_time_drops_only_its_own_sample(row: int, by: float) -> None:
+    assert dropped_rows(moved(slice(row, row + 1), by)) == [row]
 
 
-def test_several_from_the_far_future_are_not_believed_either() -> None:
+def test_several_times_from_the_far_future_are_dropped_too() -> None:
     last = 100 + CONFIRMED_FAR - 1
-    assert left_out(moved(slice(100, last), 1e6)) == list(range(100, last))
+    assert dropped_rows(moved(slice(100, last), 1e6)) == list(range(100, last))
     time = moved(slice(100, 102), 1e6)
     time[101] += 1e3
     time[200] -= 3.0
-    assert left_out(time) == [100, 101, 200]
+    assert dropped_rows(time) == [100, 101, 200]
 
 
-def test_a_jump_that_enough_samples_confirm_makes_the_others_late() -> None:
-    assert left_out(moved(slice(100, 102), 0.3)) == list(range(102, 132))
-    assert left_out(moved(slice(100, 100 + CONFIRMED_FAR), 1e6)) == list(range(120, 400))
+def test_after_a_confirmed_jump_earlier_times_are_dropped() -> None:
+    assert dropped_rows(moved(slice(100, 102), 0.3)) == list(range(102, 132))
+    assert dropped_rows(moved(slice(100, 100 + CONFIRMED_FAR), 1e6)) == list(range(120, 400))
 
 
 def test_late_times_do_not_refute_a_gap() -> None:
     time = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[201:]])
-    assert left_out(time) == list(range(101, 111))
+    assert dropped_rows(time) == list(range(101, 111))

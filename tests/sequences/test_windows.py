@@ -47,18 +47,18 @@ def smooth(time: FloatArray) -> FloatArray:
 def test_resampling_reproduces_a_smooth_signal(rate: float) -> None:
     time = np.arange(0.0, 4.0, 1.0 / rate)
     grid = np.arange(time[0], time[-1], 1.0 / 200.0)
-    # A chord of a sine at f is off by (pi f / rate)^2 / 2; averaging over a step by less.
+    # The chord of a sine at f is off by (pi f / rate)^2 / 2, the average over a step by less.
     bound = 1.1 * (np.pi * 2.0 / min(rate, 200.0)) ** 2 / 2.0
     assert np.abs(resample(time, smooth(time), grid) - smooth(grid))[1:-1].max() < bound
 
 
 @pytest.mark.parametrize("rate", [100.0, 1000.0])
-def test_resampling_stands_jitter_and_drops(rate: float) -> None:
+def test_resampling_tolerates_jitter_and_lost_samples(rate: float) -> None:
     rng = np.random.default_rng(0)
     time = np.arange(0.0, 4.0, 1.0 / rate) + rng.uniform(-0.3, 0.3, round(4 * rate)) / rate
     time = time[rng.random(len(time)) > 0.1]
     grid = np.arange(time[0], time[-1], 1.0 / 200.0)
-    # A chord over the longest hole, of a sine at 2 Hz; uneven steps leave some of their own.
+    # The chord of a 2 Hz sine over the longest gap; uneven steps add a small error of their own.
     bound = (2.0 * np.pi * 2.0 * max(np.diff(time).max(), 1.0 / 200.0)) ** 2 / 8.0
     assert np.abs(resample(time, smooth(time), grid) - smooth(grid))[1:-1].max() < bound + 0.005
 
@@ -66,14 +66,14 @@ def test_resampling_stands_jitter_and_drops(rate: float) -> None:
 def test_faster_sensors_are_averaged_and_do_not_alias() -> None:
     time = np.arange(0.0, 4.0, 1e-3)
     grid = np.arange(0.0, 3.9, 1.0 / 200.0)
-    buzz = np.sin(2 * np.pi * 200.0 * time + 0.5)[:, None]  # picked out, it would be constant
+    buzz = np.sin(2 * np.pi * 200.0 * time + 0.5)[:, None]  # decimated, it would be constant
     assert np.abs(resample(time, buzz, grid)[1:-1]).max() < 0.05
     noise = np.random.default_rng(0).standard_normal((len(time), 1))
     assert resample(time, noise, grid).std() < 0.6
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 199.36, 500.0, 1000.0])
-def test_streams_of_any_rate_show_the_same_walk(
+def test_streams_of_any_rate_contain_the_same_walk(
     track: Trajectory, walk: ImuSequence, rate: float
 ) -> None:
     (true,) = world_streams(walk, attitude="true")
@@ -85,7 +85,7 @@ def test_streams_of_any_rate_show_the_same_walk(
     assert np.abs(stream.position_W[:n] - true.position_W[:n]).max() < 2e-3
 
 
-def test_the_target_is_the_displacement_of_the_windows_second(walk: ImuSequence) -> None:
+def test_the_target_is_the_displacement_over_the_window(walk: ImuSequence) -> None:
     (stream,) = world_streams(walk, attitude="true")
     windows, targets = windows_of(stream, stride=50)
     assert windows.shape == (len(targets), 6, 200)
@@ -101,21 +101,21 @@ def test_the_target_is_the_displacement_of_the_windows_second(walk: ImuSequence)
         assert np.abs(windows[k, :3].T - rate).max() < 1e-5
 
 
-def test_a_window_holds_the_motion_of_its_target(walk: ImuSequence) -> None:
-    """Force integrated twice from the true first velocity gives the target: no shift in time."""
+def test_a_window_contains_the_motion_of_its_target(walk: ImuSequence) -> None:
+    """Force integrated twice from the true initial velocity gives the target: no time shift."""
     (stream,) = world_streams(walk, attitude="true")
     velocity = truth_of(walk).velocity_W
     assert velocity is not None
     windows, targets = windows_of(stream, stride=100)
     for k, (window, target) in enumerate(zip(windows, targets, strict=True)):
         accel = window[3:].T.astype(np.float64) - [0.0, 0.0, 9.80665]
-        lasting = 1.0 - np.arange(200) / 200.0
-        lasting[0] = 0.5  # the trapezoidal rule
-        moved = velocity[100 * k] + (accel * lasting[:, None]).sum(axis=0) / 200.0
+        remaining = 1.0 - np.arange(200) / 200.0
+        remaining[0] = 0.5  # the trapezoidal rule
+        moved = velocity[100 * k] + (accel * remaining[:, None]).sum(axis=0) / 200.0
         assert np.abs(moved - target).max() < 0.004
 
 
-def test_no_window_spans_a_gap_of_the_truth(walk: ImuSequence) -> None:
+def test_no_window_spans_a_gap_in_the_truth(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     valid = np.ones(len(truth), dtype=np.bool_)
     valid[1600:1700] = False
@@ -127,25 +127,25 @@ def test_no_window_spans_a_gap_of_the_truth(walk: ImuSequence) -> None:
     assert np.allclose(windows_of(streams[1], 200)[1][0], ends[1] - ends[0], atol=0.01)
 
 
-def test_no_window_spans_a_gap_of_the_imu(walk: ImuSequence) -> None:
+def test_no_window_spans_a_gap_in_the_imu(walk: ImuSequence) -> None:
     kept = (walk.time < 8.0) | (walk.time > 8.3)
-    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    first, second = world_streams(holed)
+    gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    first, second = world_streams(gappy)
     assert len(first) / 200.0 == pytest.approx(8.0, abs=0.011)
     assert len(second) / 200.0 == pytest.approx(11.7, abs=0.011)
 
 
 def test_short_gaps_are_bridged_and_short_stretches_dropped(walk: ImuSequence) -> None:
     kept = (walk.time < 8.0) | (walk.time > 8.05)
-    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    assert len(world_streams(holed)) == 1
+    gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    assert len(world_streams(gappy)) == 1
     truth = truth_of(walk)
     valid = np.ones(len(truth), dtype=np.bool_)
     valid[1000:1100] = valid[1300:1400] = False
     assert len(world_streams(replace(walk, truth=replace(truth, valid=valid)))) == 2
 
 
-def test_turning_the_world_turns_window_and_target_alike(walk: ImuSequence) -> None:
+def test_rotating_the_world_rotates_window_and_target_equally(walk: ImuSequence) -> None:
     truth, turn = truth_of(walk), about_z(2.1)
     turned = replace(
         walk,
@@ -153,15 +153,15 @@ def test_turning_the_world_turns_window_and_target_alike(walk: ImuSequence) -> N
     )
     (stream,), (other,) = world_streams(walk), world_streams(turned)
     windows, targets = windows_of(stream, 100)
-    rotated_windows, turned_targets = windows_of(other, 100)
+    turned_windows, turned_targets = windows_of(other, 100)
     assert np.abs(turn.apply(targets) - turned_targets).max() < 1e-5
     for k in (slice(0, 3), slice(3, 6)):
         rows = turn.apply(windows[:, k].transpose(0, 2, 1).reshape(-1, 3))
-        assert np.abs(rows - rotated_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
+        assert np.abs(rows - turned_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
 
 
-def test_a_truth_that_is_mounted_askew_does_not_show_in_levelled_windows() -> None:
-    """Under it the mean specific force leans to where the device faces: a clue that use lacks."""
+def test_a_misaligned_truth_does_not_affect_levelled_windows() -> None:
+    """It tilts the mean specific force towards the facing of the device, a clue absent in use."""
     style = WalkStyle(carry="handheld")
     walk = simulate_imu(generate_walk(7, 60.0, rate=200.0, style=style), 200.0, PERFECT_IMU)
     truth = truth_of(walk)
@@ -179,7 +179,7 @@ def test_a_truth_that_is_mounted_askew_does_not_show_in_levelled_windows() -> No
     assert off("levelled") < 0.02
 
 
-def test_levelled_windows_are_the_navigators_but_for_their_heading() -> None:
+def test_levelled_windows_equal_the_navigators_except_for_heading() -> None:
     walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
     (stream,) = world_streams(walk)
     epochs, _ = cut_recording(walk, NavigatorConfig())
@@ -198,7 +198,7 @@ def test_levelled_windows_are_the_navigators_but_for_their_heading() -> None:
     assert compared > 25
 
 
-def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
+def test_bad_samples_are_dropped(walk: ImuSequence) -> None:
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
     time[10], time[20], time[30] = time[9], time[5], np.nan
     gyro[40], accel[50, 2] = np.nan, np.inf
@@ -211,23 +211,23 @@ def test_bad_samples_are_left_out(walk: ImuSequence) -> None:
     assert np.abs(stream.position_W - true.position_W).max() < 1e-4
 
 
-def test_a_wild_time_costs_its_own_sample_alone(
+def test_an_outlying_time_drops_only_its_own_sample(
     walk: ImuSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
     time = walk.time.copy()
     time[100] += 1e6
-    wild = replace(walk, time=time)
-    assert np.array_equal(clean_samples(wild)[0], np.delete(walk.time, 100))
+    outlying = replace(walk, time=time)
+    assert np.array_equal(clean_samples(outlying)[0], np.delete(walk.time, 100))
     assert "samples ahead of their time dropped: 1" in caplog.text
-    (stream,), (whole,) = world_streams(wild), world_streams(walk)
+    (stream,), (whole,) = world_streams(outlying), world_streams(walk)
     assert len(stream) == len(whole)
 
 
 @pytest.mark.parametrize("attitude", ["true", "levelled"])
-def test_a_first_time_of_zero_before_seconds_since_1970_costs_no_memory(
+def test_a_zero_time_before_times_since_1970_does_not_exhaust_memory(
     walk: ImuSequence, attitude: Attitude
 ) -> None:
-    """A grid over all the time between would not fit into any memory."""
+    """A grid over the whole time between would not fit in memory."""
     start = 1.7e9 - 0.01
     truth = truth_of(walk)
     late = replace(walk, time=start + walk.time, truth=replace(truth, time=start + truth.time))
@@ -239,21 +239,21 @@ def test_a_first_time_of_zero_before_seconds_since_1970_costs_no_memory(
     assert len(stream) == pytest.approx(len(whole), abs=5)
 
 
-def test_behind_a_long_gap_the_grid_goes_on_evenly(walk: ImuSequence) -> None:
-    """Index arithmetic meets the same times as on the whole grid: whole seconds are left out."""
+def test_after_a_long_gap_the_grid_continues_evenly(walk: ImuSequence) -> None:
+    """Whole seconds are skipped, so that index arithmetic gives the same times as without a gap."""
     kept = (walk.time < 4.0) | (walk.time > 12.345)
-    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    world = imu_in_world(holed, truth_of(walk), "true")
+    gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
+    world = imu_in_world(gappy, truth_of(walk), "true")
     grid, usable = world.time, world.usable
     index = (grid - grid[0]) * 200.0
     assert np.abs(index - np.round(index)).max() < 1e-6
-    left_out = np.round(index) - np.arange(len(grid))
-    assert set(left_out) == {0.0, 7 * 200.0}
+    skipped = np.round(index) - np.arange(len(grid))
+    assert set(skipped) == {0.0, 7 * 200.0}
     assert not usable[(grid > 4.01) & (grid < 12.345)].any()
     assert usable[grid > 12.36].all()
 
 
-def test_what_gives_no_windows_is_refused(walk: ImuSequence) -> None:
+def test_recordings_that_give_no_windows_are_refused(walk: ImuSequence) -> None:
     with pytest.raises(InputError, match="truth: found none"):
         world_streams(walk.without_truth())
     with pytest.raises(InputError, match="is the time column in seconds"):
@@ -262,8 +262,8 @@ def test_what_gives_no_windows_is_refused(walk: ImuSequence) -> None:
         clean_samples(replace(walk, gyro=np.nan * walk.gyro))
 
 
-def test_heading_is_the_turn_about_the_vertical_at_any_tilt_but_upside_down() -> None:
-    """A phone that stands upright or lies on its side has a heading too."""
+def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
+    """A phone held upright or on its side has a heading too."""
     for tilt in ([0.0, 0.0, 0.0], [1.57, 0.0, 0.0], [0.0, 1.57, 0.0], [-2.5, 0.5, 0.0]):
         R_tilt = Rotation.from_rotvec(tilt)
         for yaw in (-3.0, 0.2, 1.7):
@@ -274,7 +274,7 @@ def test_heading_is_the_turn_about_the_vertical_at_any_tilt_but_upside_down() ->
     np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
 
 
-def test_turning_a_window_turns_its_vectors() -> None:
+def test_rotating_a_window_rotates_its_vectors() -> None:
     rng = np.random.default_rng(0)
     windows = rng.normal(size=(3, 6, 200)).astype(np.float32)
     yaw = np.array([0.3, -1.0, 2.0])

@@ -1,4 +1,4 @@
-"""Metrics: against evo, against closed forms, and under turns and shifts that must not matter."""
+"""Metrics against evo and closed forms, and their invariance to rotations and shifts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ERRORS = ("ate_m", "rte_m", "pde", "aye_rad")
 
 
 def walk(duration: float = 100.0, rate: float = 20.0) -> Trajectory:
-    """A smooth way with height, turns and a tilting body."""
+    """Smooth trajectory with changing height, turns and a tilting body."""
     t = np.arange(round(duration * rate) + 1) / rate
     position = np.stack([8 * np.sin(0.11 * t), 5 * np.sin(0.23 * t), 0.4 * np.sin(0.5 * t)], axis=1)
     tilt = Rotation.from_rotvec(np.stack([0.3 * np.sin(t), 0.2 * np.cos(t), 0 * t], axis=1))
@@ -33,7 +33,7 @@ def walk(duration: float = 100.0, rate: float = 20.0) -> Trajectory:
 
 
 def drifted(truth: Trajectory, seed: int = 3) -> Trajectory:
-    """The truth with a random-walk error in position and yaw that starts at zero."""
+    """Ground truth plus a random-walk error in position and yaw that starts at zero."""
     rng = np.random.default_rng(seed)
     step = rng.normal(0, 0.02, (len(truth), 3))
     yaw = np.cumsum(rng.normal(0, 0.003, len(truth)))
@@ -62,7 +62,7 @@ def assert_same_errors(a: TrackMetrics, b: TrackMetrics) -> None:
 def evo_ape_rmse(estimate: Trajectory, truth: Trajectory, alignment: str) -> float:
     pytest.importorskip("evo")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of evo's own imports
+        warnings.simplefilter("ignore")  # raised by evo's own imports
         from evo.core.metrics import APE, PoseRelation
         from evo.core.trajectory import PoseTrajectory3D
 
@@ -96,14 +96,14 @@ def test_ate_agrees_with_evo_in_3d(alignment):
 
 
 def test_yaw_alignment_agrees_with_evos_umeyama_on_a_plane():
-    # On a plane the rotation that Umeyama finds is about the vertical, so the two must agree.
+    # On a plane, Umeyama's rotation is about the vertical, so the two must agree.
     truth = flat(walk())
     estimate = flat(moved(drifted(truth), -2.4, (30.0, 5.0, 0.0)))
     found = evaluate_track(estimate, truth, alignment="yaw").ate_m
     assert found == pytest.approx(evo_ape_rmse(estimate, truth, "yaw"), rel=1e-9)
 
 
-def test_yaw_alignment_is_the_least_squares_turn():
+def test_yaw_alignment_is_the_least_squares_solution():
     truth = walk()
     aligned = align(moved(drifted(truth), 1.3, (4.0, 4.0, 1.0)), truth, "yaw")
     best = evaluate_track(aligned, truth, alignment="none", horizontal=False).ate_m
@@ -113,25 +113,25 @@ def test_yaw_alignment_is_the_least_squares_turn():
 
 
 @pytest.mark.parametrize("mode", ["none", "first", "yaw"])
-def test_alignment_never_tilts(mode):
+def test_alignment_never_changes_the_tilt(mode):
     truth = walk()
     estimate = moved(drifted(truth), 1.0, (3.0, 2.0, 1.0))
-    tipped = replace(estimate, attitude_WB=Rotation.from_rotvec([0.2, 0, 0]) * estimate.attitude_WB)
-    aligned = align(tipped, truth, mode)
+    tilted = replace(estimate, attitude_WB=Rotation.from_rotvec([0.2, 0, 0]) * estimate.attitude_WB)
+    aligned = align(tilted, truth, mode)
     np.testing.assert_allclose(
-        aligned.attitude_WB.as_matrix()[:, 2], tipped.attitude_WB.as_matrix()[:, 2], atol=1e-12
+        aligned.attitude_WB.as_matrix()[:, 2], tilted.attitude_WB.as_matrix()[:, 2], atol=1e-12
     )
     np.testing.assert_allclose(
-        np.diff(aligned.position_W[:, 2]), np.diff(tipped.position_W[:, 2]), atol=1e-12
+        np.diff(aligned.position_W[:, 2]), np.diff(tilted.position_W[:, 2]), atol=1e-12
     )
 
 
-def test_first_alignment_starts_on_the_truth_and_turns_velocity_and_covariance_too():
+def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covariance():
     truth = walk()
     covariance = np.broadcast_to(np.diag([4.0, 1.0, 9.0]), (len(truth), 3, 3))
     velocity = np.broadcast_to([1.0, 0.0, 0.5], (len(truth), 3))
     estimate = replace(truth, velocity_W=velocity, position_covariance_W=covariance)
-    turned = moved(estimate, -np.pi / 2, (5.0, 0.0, 0.0))  # leaves velocity and covariance
+    turned = moved(estimate, -np.pi / 2, (5.0, 0.0, 0.0))  # does not rotate velocity and covariance
     aligned = align(turned, truth, "first")
     np.testing.assert_allclose(aligned.position_W, truth.position_W, atol=1e-9)
     np.testing.assert_allclose(aligned.velocity_W[0], [0.0, 1.0, 0.5], atol=1e-12)
@@ -140,7 +140,7 @@ def test_first_alignment_starts_on_the_truth_and_turns_velocity_and_covariance_t
     )
 
 
-def test_first_alignment_uses_the_first_pose_that_both_know():
+def test_first_alignment_uses_the_first_pose_valid_in_both_tracks():
     truth = walk()
     late = replace(truth, valid=truth.time >= 10.0)
     estimate = moved(truth, 0.5, (1.0, 2.0, 3.0))
@@ -149,18 +149,18 @@ def test_first_alignment_uses_the_first_pose_that_both_know():
 
 
 @pytest.mark.parametrize("alignment", ["none", "first", "yaw"])
-def test_turning_and_shifting_both_changes_no_error(alignment):
+def test_moving_both_tracks_leaves_the_errors_unchanged(alignment):
     truth = walk()
     estimate = drifted(truth)
-    there = [moved(track, 2.0, (100.0, -40.0, 7.0)) for track in (estimate, truth)]
+    moved_tracks = [moved(track, 2.0, (100.0, -40.0, 7.0)) for track in (estimate, truth)]
     assert_same_errors(
-        evaluate_track(*there, alignment=alignment),
+        evaluate_track(*moved_tracks, alignment=alignment),
         evaluate_track(estimate, truth, alignment=alignment),
     )
 
 
 @pytest.mark.parametrize("alignment", ["first", "yaw"])
-def test_with_alignment_turning_the_estimate_alone_changes_no_error(alignment):
+def test_with_alignment_moving_only_the_estimate_leaves_the_errors_unchanged(alignment):
     truth = walk()
     estimate = drifted(truth)
     assert_same_errors(
@@ -193,16 +193,16 @@ def test_a_constant_velocity_error_gives_the_analytic_errors(duration, scaled):
     assert in_3d.rte_m == pytest.approx(0.13 * 60.0)
 
 
-def test_relative_error_forgets_a_constant_offset():
+def test_relative_error_ignores_a_constant_offset():
     truth = walk()
     late_jump = np.where(truth.time[:, None] > 5.0, 2.0, 0.0) * [1.0, 0.0, 0.0]
     found = evaluate_track(replace(truth, position_W=truth.position_W + late_jump), truth)
-    # Only the pairs that straddle the jump, 5 s of the 40 s in which a pair can start, see it.
+    # Only pairs that straddle the jump contain it: 5 s of the 40 s in which a pair can start.
     assert found.rte_m == pytest.approx(2.0 * np.sqrt(5.0 / 40.0), rel=0.01)
     assert found.ate_m == pytest.approx(2.0 * np.sqrt(95.0 / 100.0), rel=0.01)
 
 
-def test_ronins_convention_is_smaller_by_root_two_and_tlios_is_the_mean():
+def test_ronin_convention_divides_by_root_dimension_and_tlio_takes_the_mean():
     truth = walk()
     estimate = drifted(truth)
     rms = evaluate_track(estimate, truth)
@@ -228,7 +228,7 @@ def test_yaw_error_is_wrapped():
     assert evaluate_track(estimate, truth).aye_rad == pytest.approx(0.1 * np.sqrt(0.5), rel=0.01)
 
 
-def test_truth_is_not_interpolated_across_its_gaps_and_coverage_says_so():
+def test_truth_is_not_interpolated_across_gaps_and_coverage_excludes_them():
     truth = walk(rate=100.0)
     gap = (truth.time > 40.0) & (truth.time < 60.0)
     wild = np.where((truth.time > 41)[:, None] & (truth.time < 59)[:, None], 1e3, 0.0)
@@ -241,7 +241,7 @@ def test_truth_is_not_interpolated_across_its_gaps_and_coverage_says_so():
         assert found.duration_s == pytest.approx(100.0)
 
 
-def test_a_gap_that_leaves_no_pair_leaves_no_relative_error():
+def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
     truth = walk(duration=70.0)
     ends = (truth.time < 5.0) | (truth.time > 66.0)
     found = evaluate_track(replace(drifted(truth), valid=ends), truth)
@@ -250,7 +250,7 @@ def test_a_gap_that_leaves_no_pair_leaves_no_relative_error():
     assert found.ate_m > 0
 
 
-def test_estimate_denser_than_truth_and_off_its_grid():
+def test_estimate_may_be_denser_than_truth_and_off_its_time_grid():
     truth = straight(80.0, rate=100.0)
     estimate = with_velocity_error(straight(80.0, rate=200.0), (0.1, 0.0, 0.0)).slice(3.0, 75.0)
     found = evaluate_track(estimate, truth)
@@ -259,7 +259,7 @@ def test_estimate_denser_than_truth_and_off_its_grid():
     assert found.duration_s == pytest.approx(72.0)
 
 
-def test_estimate_that_outlasts_the_truth_is_covered_in_part():
+def test_estimate_longer_than_the_truth_is_only_partly_covered():
     truth = straight(100.0)
     found = evaluate_track(truth, truth.slice(50.0, 75.0))
     assert found.coverage == pytest.approx(0.25, abs=1e-3)
@@ -285,14 +285,14 @@ def test_unknown_choices_are_refused():
         evaluate_track(truth, truth, rte_interval=0.0)
 
 
-def test_standing_still_has_no_drift_per_metre():
+def test_drift_per_metre_of_a_stationary_track_is_nan():
     truth = straight(10.0, speed=0.0)
     assert np.isnan(evaluate_track(truth, truth).pde)
 
 
-def test_every_number_has_its_meaning_in_words():
-    stated = {"rte_interval_s", "rte_scaled"}  # said within rte_m
-    assert set(TrackMetrics.__dataclass_fields__) - stated <= set(CONVENTIONS)
+def test_every_metric_has_a_description():
+    described_elsewhere = {"rte_interval_s", "rte_scaled"}  # described under rte_m
+    assert set(TrackMetrics.__dataclass_fields__) - described_elsewhere <= set(CONVENTIONS)
     assert {"nees", "nis"} <= set(CONVENTIONS)
 
 
@@ -303,21 +303,21 @@ def gaussian_samples(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray
     return scale * error, factor @ factor.transpose(0, 2, 1)
 
 
-def test_nees_of_gaussian_samples_lies_in_its_bounds():
+def test_nees_of_gaussian_samples_lies_within_its_bounds():
     low, high = nees_bounds(3, 500, confidence=0.999)
     assert low < nees(*gaussian_samples(500)).mean() < high
     assert nees(*gaussian_samples(500, scale=1.3)).mean() > high
     assert nees(*gaussian_samples(500, scale=0.7)).mean() < low
 
 
-def test_nees_bounds_hold_the_stated_share_of_means():
+def test_nees_bounds_contain_the_stated_share_of_means():
     rng = np.random.default_rng(5)
     means = (rng.normal(size=(4000, 20, 3)) ** 2).sum(axis=2).mean(axis=1)
     low, high = nees_bounds(3, 20)
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.015)
 
 
-def test_position_nees_of_a_track_and_its_unstated_start():
+def test_position_nees_skips_a_start_without_covariance_and_is_yaw_invariant():
     truth = walk(duration=100.0)
     error, covariance = gaussian_samples(len(truth))
     error[0], covariance[0] = 0, 0
@@ -326,15 +326,15 @@ def test_position_nees_of_a_track_and_its_unstated_start():
     assert len(found.nees) == len(truth) - 1
     low, high = nees_bounds(3, len(found.nees), confidence=0.999)
     assert low < found.mean < high
-    assert found.median == pytest.approx(2.37, abs=0.25)  # of chi-square with 3 degrees
-    # A turned frame must turn the covariance with it.
+    assert found.median == pytest.approx(2.37, abs=0.25)  # of chi-square, 3 degrees of freedom
+    # Rotating the frame must rotate the covariance with it.
     turn = about_z(0.9).as_matrix()
     other = moved(estimate, 0.9, (1, 2, 3))
     other = replace(other, position_covariance_W=turn @ covariance @ turn.T)
     np.testing.assert_allclose(position_nees(other, truth).nees, found.nees, rtol=1e-6)
 
 
-def test_nees_refuses_what_has_no_meaning():
+def test_nees_refuses_invalid_covariances_and_run_counts():
     with pytest.raises(InputError, match="row 1 not positive definite"):
         nees(np.ones((2, 3)), np.stack([np.eye(3), np.diag([1.0, 1.0, -1.0])]))
     with pytest.raises(InputError, match=r"covariance: found shape \(2, 2\)"):
@@ -346,8 +346,8 @@ def test_nees_refuses_what_has_no_meaning():
 
 
 @pytest.mark.parametrize("poses", [1, 600])
-def test_positions_at_rest_tell_no_yaw(poses: int) -> None:
-    """A millimetre of noise turned the track by any angle; its attitudes know better."""
+def test_yaw_alignment_of_a_stationary_track_uses_its_attitudes(poses: int) -> None:
+    """Millimetre noise in the positions would give an arbitrary yaw; the attitudes do not."""
     rng = np.random.default_rng(0)
     time = np.arange(poses) / 10.0
     about = np.linspace(0.0, 2.0 * np.pi, poses)

@@ -1,4 +1,4 @@
-"""Attitude from gravity and its levelling, against simulated truth."""
+"""Attitude from gravity and levelling, against simulated ground truth."""
 
 import numpy as np
 import pytest
@@ -18,19 +18,19 @@ from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generat
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def a_walk(seed: int, seconds: float, carry: str, errors: ImuErrors) -> ImuSequence:
+def simulated_walk(seed: int, seconds: float, carry: str, errors: ImuErrors) -> ImuSequence:
     style = WalkStyle(carry=carry, mount_rotvec=(0.4, -0.7, 1.1))
     return simulate_imu(generate_walk(seed, seconds, style=style), 200.0, errors, seed)
 
 
 def tilt_error(R_NB: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """Angle [deg] between the true and the estimated vertical, both seen in B."""
+    """Angle [deg] between the true and the estimated vertical, both in B."""
     cosine = np.sum(R_NB[..., 2, :] * R_WB[..., 2, :], axis=-1)
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (1.4, 0.3, -2.0), (3.14, 0.0, 0.0)])
-def test_a_device_at_rest_starts_level_to_its_noise(mount: tuple[float, ...]) -> None:
+def test_a_device_at_rest_starts_level_to_within_its_noise(mount: tuple[float, ...]) -> None:
     rng = np.random.default_rng(0)
     R_WB = Rotation.from_rotvec(mount)
     time = np.arange(201) / 200.0
@@ -38,15 +38,15 @@ def test_a_device_at_rest_starts_level_to_its_noise(mount: tuple[float, ...]) ->
     start = start_from_gravity(time, 1e-3 * rng.standard_normal((201, 3)), accel)
     assert start.still
     assert tilt_error(start.R_WB, R_WB.as_matrix()) < 0.1
-    yaw_free = Rotation.from_matrix(start.R_WB).as_quat()
-    assert abs(yaw_free[2]) < 1e-9  # the turn's axis is horizontal
+    quat_xyzw = Rotation.from_matrix(start.R_WB).as_quat()
+    assert abs(quat_xyzw[2]) < 1e-9  # the rotation axis is horizontal
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_a_walker_starts_level_within_the_sigma_stated(carry: str) -> None:
+def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry: str) -> None:
     errors = []
     for seed in range(6):
-        walk = a_walk(seed, 5.0, carry, PHONE_IMU)
+        walk = simulated_walk(seed, 5.0, carry, PHONE_IMU)
         for first in (0, 400, 700):
             part = slice(first, first + 201)
             start = start_from_gravity(walk.time[part], walk.gyro[part], walk.accel[part])
@@ -54,36 +54,36 @@ def test_a_walker_starts_level_within_the_sigma_stated(carry: str) -> None:
             errors.append(tilt_error(start.R_WB, truth))
             if start.still:
                 assert errors[-1] < 3 * np.degrees(0.01) + 0.3
-    # FilterConfig.tilt_sigma is 0.05 rad, 2.9 degrees, for each of two axes.
+    # FilterConfig.tilt_sigma is 0.05 rad (2.9 degrees) for each of two axes.
     assert np.sqrt(np.mean(np.square(errors))) < 2.9 * np.sqrt(2.0)
 
 
-def test_levelling_holds_tilt_against_a_bias_that_integration_does_not() -> None:
-    kept, lost = [], []
+def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not() -> None:
+    levelled, integrated = [], []
     for seed in range(6):
-        walk = a_walk(seed, 90.0, "handheld", PERFECT_IMU)
+        walk = simulated_walk(seed, 90.0, "handheld", PERFECT_IMU)
         truth = walk.truth.attitude_WB.as_matrix()
         gyro = walk.gyro + 0.005 * np.eye(3)[seed % 3]
         R_NB = levelled_attitudes(walk.time, gyro, walk.accel)
-        kept.append(tilt_error(R_NB, truth[: len(R_NB)]))
-        lost.append(tilt_error(integrate(truth[0], walk.time, gyro), truth)[: len(R_NB)])
-    assert np.sqrt(np.mean(np.square(kept))) < 2.0
-    assert np.percentile(kept, 95) < 4.0
-    assert np.sqrt(np.mean(np.square(lost))) > 5.0
-    assert np.max(lost) > 10.0
+        levelled.append(tilt_error(R_NB, truth[: len(R_NB)]))
+        integrated.append(tilt_error(integrate(truth[0], walk.time, gyro), truth)[: len(R_NB)])
+    assert np.sqrt(np.mean(np.square(levelled))) < 2.0
+    assert np.percentile(levelled, 95) < 4.0
+    assert np.sqrt(np.mean(np.square(integrated))) > 5.0
+    assert np.max(integrated) > 10.0
 
 
-def test_raw_rates_do_not_tilt_a_walker() -> None:
-    """A phone that does not correct its gyroscope: 5 deg/s about an axis that turns with it."""
-    walk = a_walk(1, 90.0, "handheld", PERFECT_IMU)
+def test_levelling_tolerates_uncorrected_gyroscope_rates() -> None:
+    """A phone that does not correct its gyroscope: a bias of 5 deg/s about a body axis."""
+    walk = simulated_walk(1, 90.0, "handheld", PERFECT_IMU)
     truth = walk.truth.attitude_WB.as_matrix()
     R_NB = levelled_attitudes(walk.time, walk.gyro + np.array([0.087, 0.0, 0.0]), walk.accel)
     error = tilt_error(R_NB, truth[: len(R_NB)])[len(R_NB) // 2 :]
     assert np.sqrt(np.mean(np.square(error))) < 3.0
 
 
-def test_levelling_does_not_touch_yaw() -> None:
-    """On a tilted device at rest the tilt is corrected about a horizontal axis alone."""
+def test_levelling_leaves_yaw_unchanged() -> None:
+    """The tilt of a device at rest is corrected about a horizontal axis only."""
     time = np.arange(11) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (11, 1))
     tilted = exp_so3(np.array([0.08, -0.04, 0.0]))
@@ -92,14 +92,14 @@ def test_levelling_does_not_touch_yaw() -> None:
         before = attitude.R_NB
         attitude.advance(time, np.zeros((11, 3)), accel)
         turn = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()
-        # The bias it suspects is horizontal, too; what remains is of second order.
+        # The estimated bias is horizontal too; what remains is of second order.
         assert abs(turn[2]) < 0.1 * np.linalg.norm(turn[:2]) + 1e-12
     assert tilt_error(attitude.R_NB, np.eye(3)) < 0.5
     yaw = Rotation.from_matrix(attitude.R_NB @ tilted.T).as_rotvec()[2]
     assert abs(yaw) < 0.01
 
 
-def test_levelling_leaves_a_level_device_that_turns_alone() -> None:
+def test_levelling_leaves_a_rotating_level_device_unchanged() -> None:
     time = np.arange(11) / 200.0
     gyro, accel = np.tile([0.0, 0.0, 2.0], (11, 1)), np.tile(STANDARD_GRAVITY * UP, (11, 1))
     attitude = LevelledAttitude(np.eye(3))
@@ -119,7 +119,7 @@ def test_free_fall_and_a_dead_accelerometer_leave_the_attitude_finite() -> None:
     assert np.isfinite(start.R_WB).all()
 
 
-def test_integrate_turns_at_a_constant_rate_exactly() -> None:
+def test_integration_of_a_constant_rate_is_exact() -> None:
     rate = np.array([0.7, -1.9, 2.3])
     time = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.02, 300))
     R = integrate(np.eye(3), time, np.tile(rate, (300, 1)))
@@ -127,8 +127,8 @@ def test_integrate_turns_at_a_constant_rate_exactly() -> None:
     np.testing.assert_allclose(R, expected, atol=1e-12)
 
 
-def test_integrate_follows_coning_as_fine_steps_do() -> None:
-    """A rate whose axis turns: the mean rate alone would drift steadily."""
+def test_integration_of_coning_motion_matches_fine_steps() -> None:
+    """The rotation axis itself rotates; integrating the mean rate alone would drift steadily."""
     w = 2.0 * np.pi * 5.0
     time = np.arange(0.0, 2.0001, 1.0 / 100.0)
     gyro = np.stack([3.0 * np.cos(w * time), 3.0 * np.sin(w * time), 0.2 + 0.0 * time], axis=1)

@@ -26,7 +26,7 @@ def test_exp_agrees_with_scipy(angle: float) -> None:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_log_undoes_exp(angle: float) -> None:
+def test_log_inverts_exp(angle: float) -> None:
     theta = rotation_vectors(angle)
     np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-9, atol=1e-14)
 
@@ -49,7 +49,7 @@ def test_the_left_jacobian_agrees_with_finite_differences(angle: float) -> None:
         np.testing.assert_allclose(so3.exp_and_left_jacobian(theta)[1], left, atol=1e-6)
 
 
-def test_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
+def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     singly = np.stack([so3.exp_so3(row) for row in theta])
     np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-15)

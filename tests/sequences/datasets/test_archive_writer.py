@@ -1,4 +1,4 @@
-"""What is written to an archive comes back, bit for bit, whatever a recording has."""
+"""Recordings written to an archive are read back unchanged, whatever they contain."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from stario.sequences.simulation.walks import generate_walk
 
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
-    """A recording with everything: lost samples, a truth in pieces, velocity, magnetometer."""
+    """A recording with everything: lost samples, ground truth with gaps, velocity, magnetometer."""
     rng = np.random.default_rng(1)
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, seed=3, name="hall/walk")
     truth = sequence.truth
@@ -33,7 +33,7 @@ def walk() -> ImuSequence:
     gyro = sequence.gyro.copy()
     gyro[17, 1] = np.nan
     time = sequence.time[::3]
-    taps = np.array([[1.0, 2.0], [3.0, 4.0]])
+    waypoints = np.array([[1.0, 2.0], [3.0, 4.0]])
     return replace(
         sequence,
         gyro=gyro,
@@ -43,7 +43,7 @@ def walk() -> ImuSequence:
             position_covariance_W=np.tile(np.eye(3), (len(truth), 1, 1)),
         ),
         magnetometer=Magnetometer(time + 1e-3, rng.normal(0.0, 40.0, (len(time), 3))),
-        positions=PositionTrack(np.array([0.5, 3.0]), taps, "waypoints"),
+        positions=PositionTrack(np.array([0.5, 3.0]), waypoints, "waypoints"),
         attributes={"person": "ann", "minutes": 0.1},
         device_attitude=DeviceAttitude(time, Rotation.random(len(time), random_state=2)),
     )
@@ -61,18 +61,18 @@ def assert_equal(found: ImuSequence, given: ImuSequence) -> None:
         ("magnetometer", ("time", "field")),
         ("positions", ("time", "position_W")),
     ):
-        there, here = getattr(found, part), getattr(given, part)
-        assert (there is None) == (here is None)
-        for name in columns if here is not None else ():
-            np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+        read_back, original = getattr(found, part), getattr(given, part)
+        assert (read_back is None) == (original is None)
+        for name in columns if original is not None else ():
+            np.testing.assert_array_equal(getattr(read_back, name), getattr(original, name))
     assert dict(found.attributes) == dict(given.attributes)
     if given.device_attitude is not None:
         assert found.device_attitude is not None
-        off = found.device_attitude.attitude_WB.inv() * given.device_attitude.attitude_WB
-        assert off.magnitude().max() < 1e-15
+        error = found.device_attitude.attitude_WB.inv() * given.device_attitude.attitude_WB
+        assert error.magnitude().max() < 1e-15
 
 
-def test_everything_comes_back(walk: ImuSequence, tmp_path: Path) -> None:
+def test_recordings_are_read_back_as_written(walk: ImuSequence, tmp_path: Path) -> None:
     path = tmp_path / "walks.h5"
     tracked = replace(
         walk,
@@ -84,8 +84,8 @@ def test_everything_comes_back(walk: ImuSequence, tmp_path: Path) -> None:
     names = write_archive(path, given)
     assert names == ["hall-walk", "hall-walk-2", "hall-walk-3"]
     found = [read_recording(one) for one in find_recordings(path)]
-    for there, here in zip(found, given, strict=True):
-        assert_equal(there, here)
+    for read_back, original in zip(found, given, strict=True):
+        assert_equal(read_back, original)
     assert found[1].positions is not None
     assert found[1].positions.kind == "positions"
     np.testing.assert_array_equal(found[1].positions.valid, walk.time > 1.0)

@@ -11,8 +11,8 @@ from stario.sequences.errors import InputError
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])
-def test_what_fails_is_skipped_with_its_reason(jobs: int | None) -> None:
-    """Errors have arguments of their own, which a process could not hand over by pickling."""
+def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
+    """The errors take arguments of their own, with which plain pickling between processes fails."""
 
     def halve(number: int) -> int:
         if number % 2:
@@ -23,16 +23,16 @@ def test_what_fails_is_skipped_with_its_reason(jobs: int | None) -> None:
     assert list(each(halve, [2, 3, 8], jobs)) == [1, odd, 4]
 
 
-def test_results_come_one_by_one() -> None:
-    seen: list[int] = []
+def test_results_are_yielded_one_by_one() -> None:
+    processed: list[int] = []
 
-    def note(number: int) -> int:
-        seen.append(number)
+    def record(number: int) -> int:
+        processed.append(number)
         return number
 
-    results = each(note, range(10))
+    results = each(record, range(10))
     assert next(results) == 0
-    assert len(seen) < 10
+    assert len(processed) < 10
     assert list(results) == list(range(1, 10))
 
 
@@ -40,18 +40,18 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def test_a_backend_that_hands_out_nothing_before_the_end_works_too() -> None:
-    """As Ray's; joblib's own of the kind runs processes without loky."""
+def test_a_backend_that_returns_nothing_before_the_end_works_too() -> None:
+    """Like Ray's; joblib's own backend of this kind runs processes without loky."""
     with parallel_config("multiprocessing"):
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
-def test_a_bug_ends_the_batch() -> None:
+def test_an_unexpected_exception_ends_the_batch() -> None:
     with pytest.raises(ZeroDivisionError):
         list(each(lambda number: 1 // number, [1, 0]))
 
 
-def test_jobs_are_processes() -> None:
+def test_several_jobs_run_in_separate_processes() -> None:
     def process(delay: float) -> int:
         time.sleep(delay)
         return os.getpid()

@@ -18,7 +18,7 @@ from stario.sequences.simulation.walks import generate_walk
 
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
-    """Uneven nanosecond stamps, a truth that starts earlier, has a gap and stamps of its own."""
+    """Uneven nanosecond timestamps; the ground truth has its own, starts earlier and has gaps."""
     rng = np.random.default_rng(4)
     sequence = simulate_imu(generate_walk(5, 12.0), 200.0, seed=3, name="walk").slice(2.0, 10.0)
     truth = sequence.truth
@@ -43,15 +43,17 @@ def assert_same(found: ImuSequence, expected: ImuSequence) -> None:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     for a, b in zip(nanoseconds(found), nanoseconds(expected), strict=True):
         np.testing.assert_array_equal(a, b)
-    there, here = found.truth, expected.truth
-    assert there is not None
-    assert here is not None
-    np.testing.assert_array_equal(there.position_W, here.position_W[here.valid])
-    np.testing.assert_allclose(there.quat_xyzw, here.quat_xyzw[here.valid], rtol=0, atol=3e-16)
+    actual, original = found.truth, expected.truth
+    assert actual is not None
+    assert original is not None
+    np.testing.assert_array_equal(actual.position_W, original.position_W[original.valid])
+    np.testing.assert_allclose(
+        actual.quat_xyzw, original.quat_xyzw[original.valid], rtol=0, atol=3e-16
+    )
 
 
 @pytest.mark.parametrize("layout", ["csv", "euroc"])
-def test_nothing_is_lost(walk: ImuSequence, tmp_path: Path, layout: str) -> None:
+def test_conversion_loses_nothing(walk: ImuSequence, tmp_path: Path, layout: str) -> None:
     gyro = walk.gyro.copy()
     gyro[17, 1] = np.nan
     given = replace(walk, gyro=gyro)
@@ -64,7 +66,7 @@ def test_nothing_is_lost(walk: ImuSequence, tmp_path: Path, layout: str) -> None
     assert_same(found, given)
 
 
-def test_there_and_back_are_the_same_bytes(walk: ImuSequence, tmp_path: Path) -> None:
+def test_converting_there_and_back_gives_the_same_bytes(walk: ImuSequence, tmp_path: Path) -> None:
     convert(walk, tmp_path / "a.csv")
     convert(read_recording(tmp_path / "a.csv"), tmp_path / "b")
     convert(read_recording(tmp_path / "b"), tmp_path / "c.csv")
@@ -82,8 +84,8 @@ def test_there_and_back_are_the_same_bytes(walk: ImuSequence, tmp_path: Path) ->
     assert first[imu] == second[imu]
 
 
-def test_the_euroc_layout_is_the_one_of_its_authors(walk: ImuSequence, tmp_path: Path) -> None:
-    """Whole nanoseconds without a sign, w first."""
+def test_the_euroc_layout_is_that_of_its_authors(walk: ImuSequence, tmp_path: Path) -> None:
+    """Unsigned whole nanoseconds, quaternions with w first."""
     imu, truth = (file.read_text().splitlines() for file in convert(walk, tmp_path / "r"))
     for lines in (imu, truth):
         assert lines[0].startswith("#timestamp")
@@ -94,7 +96,7 @@ def test_the_euroc_layout_is_the_one_of_its_authors(walk: ImuSequence, tmp_path:
     np.testing.assert_allclose(row[4:8], walk.truth.quat_xyzw[first, [3, 0, 1, 2]], atol=3e-16)
 
 
-def test_a_known_velocity_is_kept_by_euroc_and_missed_in_csv(
+def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(
     walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     truth = walk.truth
@@ -110,24 +112,28 @@ def test_a_known_velocity_is_kept_by_euroc_and_missed_in_csv(
     assert "velocity has no column" in caplog.text
 
 
-def test_without_truth_there_is_none(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_recording_without_truth_is_converted_without_truth(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
     for path in (tmp_path / "a.csv", tmp_path / "a"):
         convert(walk.without_truth(), path)
         assert read_recording(path).truth is None
 
 
-def test_wrong_units_are_not_passed_on(walk: ImuSequence, tmp_path: Path) -> None:
+def test_wrong_units_are_refused_and_nothing_is_written(walk: ImuSequence, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--accel-unit g"):
         convert(replace(walk, accel=walk.accel / STANDARD_GRAVITY), tmp_path / "a.csv")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_second_is_too_short_to_judge_and_is_converted(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_recording_too_short_to_check_is_converted(walk: ImuSequence, tmp_path: Path) -> None:
     convert(walk.without_truth().slice(0.0, 0.5), tmp_path / "short")
     assert read_recording(tmp_path / "short").duration < 0.5
 
 
-def test_what_cannot_be_written_is_said(walk: ImuSequence, tmp_path: Path) -> None:
+def test_what_cannot_be_converted_is_refused_with_the_reason(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
     time = walk.time.copy()
     time[3] = np.nan
     with pytest.raises(InputError, match=r"time of sample 3: found nan.*convert to csv"):
@@ -155,8 +161,8 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_truth_alone_before_the_imu_keeps_the_offset(tmp_path: Path) -> None:
-    """Stamps have no sign: both files move together."""
+def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path: Path) -> None:
+    """Timestamps are unsigned, so both files are shifted together."""
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, name="w")
     truth = sequence.truth
     assert truth is not None

@@ -28,7 +28,7 @@ def phone(path: Path) -> Path:
     return path
 
 
-def test_the_papers_split_is_by_recording_and_by_seed() -> None:
+def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
     paths = [Path(f"{k:02d}.csv") for k in range(40)]
     split = random_split(paths, seed=7)
     assert [len(split.training), len(split.validation), len(split.test)] == [32, 4, 4]
@@ -41,7 +41,7 @@ def test_the_papers_split_is_by_recording_and_by_seed() -> None:
         random_split(paths[:2], seed=0)
 
 
-def test_a_list_of_any_mixture_is_read(tmp_path: Path) -> None:
+def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
     ronin(tmp_path, "a000_1")
     (tmp_path / "own.csv").write_text(ROW)
     imu = phone(tmp_path / "handheld/data1/syn/imu1.csv")
@@ -59,8 +59,8 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
         find_recordings(path)
     errors: list[StarioError] = []
     assert find_recordings(path, errors.append) == [tmp_path / "own.csv"]
-    told = [str(error).removeprefix(str(tmp_path)) for error in errors]
-    assert [text.split(", expected")[0] for text in told] == [
+    messages = [str(error).removeprefix(str(tmp_path)) for error in errors]
+    assert [text.split(", expected")[0] for text in messages] == [
         "/list.txt: line 2: found an empty entry",
         "/list.txt: line 3: found an empty entry",
         "/list.txt: line 4: found no gone.csv",
@@ -95,7 +95,7 @@ def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -
         read_list(file, tmp_path)
 
 
-def test_the_packages_lists_hold_groups_apart() -> None:
+def test_the_packaged_lists_keep_groups_apart() -> None:
     folder = importlib.resources.files("stario.network.training.splits")
     names = {}
     for name in NAMES:
@@ -103,12 +103,12 @@ def test_the_packages_lists_hold_groups_apart() -> None:
         names[name] = dict(line.split(", ") for line in lines if not line.startswith("#"))
     assert len(names["test"]) == len(names["validation"]) == 4
     assert not set(names["test"]) & set(names["all"])
-    held = set(names["holdout"])
-    assert held < set(names["all"])
-    assert not held & set(names["training"])
+    held_out = set(names["holdout"])
+    assert held_out < set(names["all"])
+    assert not held_out & set(names["training"])
     assert set(names["open"]) < set(names["all"])
     assert not any(word in name for name in names["open"] for word in ("ridi", "kipd", "rocip"))
-    kept = {group for name, group in names["all"].items() if name not in held}
+    kept = {group for name, group in names["all"].items() if name not in held_out}
     for group in ("tyrex Thibaud", "ridi dan", "ridi huayi", "kipd yk", "ilc site2 F1"):
         assert group in names["holdout"].values()
         assert group not in kept

@@ -25,7 +25,7 @@ WALK = simulate_imu(generate_walk(6, 9.0), 100.0, seed=4, name="walk")
 
 
 class Reader:
-    """Reads, and counts how often."""
+    """Reader that counts its calls."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -37,16 +37,16 @@ class Reader:
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """A walk whose truth has a hole, so that it makes two streams."""
+    """A walk whose ground truth has a gap, so that it gives two streams."""
     truth = WALK.truth
     assert truth is not None
-    hole = (truth.time > 4.0) & (truth.time < 4.5)
+    gap = (truth.time > 4.0) & (truth.time < 4.5)
     path = tmp_path / "walk.csv"
-    write_csv(path, replace(WALK, truth=replace(truth, valid=~hole)))
+    write_csv(path, replace(WALK, truth=replace(truth, valid=~gap)))
     return path
 
 
-def one(path: Path, folder: Path, read: Reader, **options: object) -> list[WorldStream]:
+def streams_of(path: Path, folder: Path, read: Reader, **options: object) -> list[WorldStream]:
     (streams,) = recorded([path], read, options, folder)
     assert not isinstance(streams, Skipped)
     return streams
@@ -67,44 +67,44 @@ def is_mapped(array: np.ndarray) -> bool:
     return isinstance(base, np.memmap)
 
 
-def test_streams_from_the_cache_are_those_that_are_built(recording: Path, tmp_path: Path) -> None:
+def test_cached_streams_equal_built_streams(recording: Path, tmp_path: Path) -> None:
     read = Reader()
     expected = world_streams(read_recording(recording))
     assert len(expected) == 2
     for _ in range(3):
-        found = one(recording, tmp_path / "cache", read)
+        found = streams_of(recording, tmp_path / "cache", read)
         assert_equal(found, expected)
         assert all(is_mapped(s.imu_W) and is_mapped(s.position_W) for s in found)
     assert read.calls == 1
 
 
-def test_another_content_option_or_code_is_another_key(
+def test_changed_content_options_or_code_change_the_key(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, folder = Reader(), tmp_path / "cache"
-    one(recording, folder, read)
-    one(recording, folder, read, axes="y,-x,z")
+    streams_of(recording, folder, read)
+    streams_of(recording, folder, read, axes="y,-x,z")
     assert read.calls == 2
-    one(recording, folder, read)
+    streams_of(recording, folder, read)
     assert read.calls == 2
     write_csv(recording, WALK.slice(0.0, 5.0))
-    assert len(one(recording, folder, read)) == 1
+    assert len(streams_of(recording, folder, read)) == 1
     assert read.calls == 3
     os.utime(recording, ns=(0, 0))
-    one(recording, folder, read)
+    streams_of(recording, folder, read)
     assert read.calls == 4
     monkeypatch.setattr(stream_cache, "_code", lambda: "later")
-    one(recording, folder, read)
+    streams_of(recording, folder, read)
     assert read.calls == 5
 
 
 @pytest.mark.parametrize("damage", ["cut", "header", "empty", "noise", "longer"])
-def test_a_file_that_is_not_whole_is_built_anew(
+def test_a_damaged_cache_file_is_rebuilt(
     recording: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     read, folder = Reader(), tmp_path / "cache"
     expected = world_streams(read_recording(recording))
-    one(recording, folder, read)
+    streams_of(recording, folder, read)
     (file,) = folder.iterdir()
     whole = file.read_bytes()
     broken = {
@@ -115,17 +115,17 @@ def test_a_file_that_is_not_whole_is_built_anew(
         "longer": whole + b"\0",
     }[damage]
     file.write_bytes(broken)
-    assert_equal(one(recording, folder, read), expected)
+    assert_equal(streams_of(recording, folder, read), expected)
     assert read.calls == 2
     assert "incomplete" in caplog.text
     assert file.read_bytes() == whole
 
 
-def test_writers_at_once_do_not_harm_each_other(recording: Path, tmp_path: Path) -> None:
+def test_concurrent_writers_do_not_interfere(recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     expected = world_streams(read_recording(recording))
     with ThreadPoolExecutor(8) as pool:
-        calls = [pool.submit(one, recording, folder, Reader()) for _ in range(16)]
+        calls = [pool.submit(streams_of, recording, folder, Reader()) for _ in range(16)]
         for call in calls:
             assert_equal(call.result(), expected)
     assert len(list(folder.iterdir())) == 1
@@ -144,29 +144,29 @@ def test_a_killed_writer_leaves_nothing_that_is_read(recording: Path, tmp_path: 
     )
     killed = subprocess.run([sys.executable, "-c", code, recording, folder])
     assert killed.returncode == -signal.SIGKILL
-    (left,) = folder.iterdir()
-    assert left.name.endswith(".tmp")
+    (leftover,) = folder.iterdir()
+    assert leftover.name.endswith(".tmp")
     read = Reader()
-    assert_equal(one(recording, folder, read), world_streams(read_recording(recording)))
+    assert_equal(streams_of(recording, folder, read), world_streams(read_recording(recording)))
     assert read.calls == 1
-    # What is left is swept away by the next writer, once it is surely abandoned.
-    os.utime(left, (0, 0))
-    (whole,) = (p for p in folder.iterdir() if p != left)
+    # The next writer removes the leftover once it is certainly abandoned.
+    os.utime(leftover, (0, 0))
+    (whole,) = (p for p in folder.iterdir() if p != leftover)
     whole.unlink()
-    one(recording, folder, read)
+    streams_of(recording, folder, read)
     assert [p.name for p in folder.iterdir()] == [whole.name]
 
 
-def test_without_a_folder_to_write_to_it_works_from_memory(
+def test_without_a_writable_folder_streams_are_built_in_memory(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").touch()
-    streams = one(recording, tmp_path / "file" / "cache", Reader())
+    streams = streams_of(recording, tmp_path / "file" / "cache", Reader())
     assert_equal(streams, world_streams(read_recording(recording)))
     assert "not kept" in caplog.text
 
 
-def test_processes_hand_over_files(recording: Path, tmp_path: Path) -> None:
+def test_processes_return_memory_mapped_files(recording: Path, tmp_path: Path) -> None:
     paths = [recording, tmp_path / "missing.csv", recording]
     first, missing, second = recorded(paths, read_recording, {}, tmp_path / "cache", jobs=2)
     assert isinstance(missing, Skipped)
@@ -176,26 +176,26 @@ def test_processes_hand_over_files(recording: Path, tmp_path: Path) -> None:
         assert all(is_mapped(s.imu_W) for s in streams)
 
 
-def test_what_cannot_be_learned_from_is_skipped(tmp_path: Path) -> None:
+def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path: Path) -> None:
     truth = WALK.truth
     assert truth is not None
-    wrong = {
+    unsuitable = {
         "blind": WALK.without_truth(),
         "degrees": replace(WALK, gyro=np.degrees(WALK.gyro)),
         "short": replace(WALK, truth=truth.slice(1.0, 2.5)),
         "sparse": replace(WALK, truth=truth.at(truth.time[::20])),
     }
-    for name, sequence in wrong.items():
+    for name, sequence in unsuitable.items():
         write_csv(tmp_path / f"{name}.csv", sequence)
-    paths = [tmp_path / f"{name}.csv" for name in wrong]
+    paths = [tmp_path / f"{name}.csv" for name in unsuitable]
     outcomes = list(recorded(paths, read_recording, {}, tmp_path / "cache"))
     reasons = [outcome.reason for outcome in outcomes if isinstance(outcome, Skipped)]
-    told = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz; at least 10 Hz are needed")
-    for reason, words in zip(reasons, told, strict=True):
+    parts = ("truth", "--gyro-unit", "no unbroken stretch", "at 5 Hz; at least 10 Hz are needed")
+    for reason, words in zip(reasons, parts, strict=True):
         assert words in reason
 
 
-def test_what_is_built_is_kept_by_its_key(tmp_path: Path) -> None:
+def test_built_streams_are_cached_by_key(tmp_path: Path) -> None:
     calls: list[int] = []
 
     def build() -> list[WorldStream]:
@@ -208,8 +208,8 @@ def test_what_is_built_is_kept_by_its_key(tmp_path: Path) -> None:
     assert cached({"seed": 3}, list, tmp_path) == []
 
 
-def test_the_files_of_a_recording(tmp_path: Path) -> None:
-    """A neighbour that is not read must not make a recording be built anew, its truth must."""
+def test_the_files_of_a_recording_are_those_that_are_read(tmp_path: Path) -> None:
+    """Changing a neighbouring file must trigger a rebuild only if the recording reads it."""
     mav = tmp_path / "room" / "mav0"
     for name in ("imu0", "mocap0"):
         (mav / name).mkdir(parents=True)
@@ -233,21 +233,23 @@ def test_the_files_of_a_recording(tmp_path: Path) -> None:
     assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]
 
 
-def test_a_recording_of_an_archive_is_kept_by_its_name(tmp_path: Path) -> None:
+def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path: Path) -> None:
     archive, read = tmp_path / "walks.h5", Reader()
     write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
     whole, part = find_recordings(archive)
     for _ in range(2):
         for path in (whole, part):
-            (stream,) = one(path, tmp_path / "cache", read)
+            (stream,) = streams_of(path, tmp_path / "cache", read)
             assert is_mapped(stream.imu_W)
     assert read.calls == 2
     write_archive(archive, [WALK.slice(0.0, 6.0)])
-    one(whole, tmp_path / "cache", read)
+    streams_of(whole, tmp_path / "cache", read)
     assert read.calls == 3
 
 
-def test_the_folder_is_the_users_choice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_cache_folder_is_set_by_environment_variables(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
     monkeypatch.delenv("STARIO_CACHE")

@@ -1,4 +1,4 @@
-"""Figures fit the good tracks, break at gaps, say what they cut, and touch no global state."""
+"""Figures fit the good tracks, break at gaps, label what they cut and change no global state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def truth() -> Trajectory:
     return Trajectory(t, position, Rotation.identity(len(t)))
 
 
-def off_by(track: Trajectory, growth: float, power: int = 1) -> Trajectory:
+def with_growing_error(track: Trajectory, growth: float, power: int = 1) -> Trajectory:
     error = growth * track.time**power
     return replace(track, position_W=track.position_W + np.outer(error, [1.0, 0.5, 0.1]))
 
@@ -38,21 +38,21 @@ def tracks(truth: Trajectory) -> dict[str, Trajectory]:
     sigma = 0.02 * truth.time + 0.01
     covariance = np.einsum("n,ij->nij", sigma**2, np.eye(3))
     return {
-        "inertial": off_by(truth, 0.5, power=2),
-        "network": off_by(truth, 0.03),
-        "ekf": replace(off_by(truth, 0.01), position_covariance_W=covariance),
+        "inertial": with_growing_error(truth, 0.5, power=2),
+        "network": with_growing_error(truth, 0.03),
+        "ekf": replace(with_growing_error(truth, 0.01), position_covariance_W=covariance),
     }
 
 
-def labels(holder) -> list[str]:
-    return [text.get_text() for text in holder.get_texts()]
+def labels(parent) -> list[str]:
+    return [text.get_text() for text in parent.get_texts()]
 
 
 def line(axes, label: str):
     return next(item for item in axes.get_lines() if item.get_label().startswith(label))
 
 
-def test_plan_view_fits_the_truth_and_says_who_leaves(truth, tracks):
+def test_plan_view_fits_the_truth_and_labels_tracks_that_leave_it(truth, tracks):
     fig = plan_view(tracks, truth, "a walk")
     (axes,) = fig.axes
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0  # the inertial track runs to 1.8 km
@@ -65,12 +65,12 @@ def test_plan_view_fits_the_truth_and_says_who_leaves(truth, tracks):
         assert (track.position_W[:, 1] > axes.get_ylim()[0]).all()
 
 
-def test_plan_view_without_truth_is_not_stretched_by_a_runaway(tracks):
+def test_plan_view_without_truth_is_not_stretched_by_a_diverging_track(tracks):
     (axes,) = plan_view(tracks, None, "a walk").axes
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0
 
 
-def test_colours_are_those_of_the_name_whatever_is_drawn_beside(truth, tracks):
+def test_colours_depend_on_the_track_name_only(truth, tracks):
     (all_axes,) = plan_view(tracks, truth, "").axes
     (one_axes,) = plan_view({"ekf": tracks["ekf"]}, truth, "").axes
     assert line(all_axes, "EKF").get_color() == line(one_axes, "EKF").get_color()
@@ -80,7 +80,7 @@ def test_colours_are_those_of_the_name_whatever_is_drawn_beside(truth, tracks):
 
 
 @pytest.mark.parametrize("kind", ["marked", "missing"])
-def test_gaps_of_the_truth_are_breaks(truth, kind):
+def test_gaps_in_the_truth_break_the_line(truth, kind):
     keep = (truth.time < 20.0) | (truth.time > 34.0)
     if kind == "marked":
         cut = replace(truth, valid=keep)
@@ -90,7 +90,7 @@ def test_gaps_of_the_truth_are_breaks(truth, kind):
     x = np.asarray(line(axes, "truth").get_xdata())
     assert np.isnan(x).sum() == 1
     assert np.isnan(x[np.searchsorted(truth.time, 20.0)])
-    errors = error_over_time({"network": off_by(truth, 0.03)}, cut).axes[0]
+    errors = error_over_time({"network": with_growing_error(truth, 0.03)}, cut).axes[0]
     assert np.isnan(np.asarray(line(errors, "network").get_ydata())).sum() == 1
 
 
@@ -102,7 +102,7 @@ def test_error_panels_show_the_error_and_three_sigma(truth, tracks):
     )
     assert top.get_ylim()[1] < 5.0
     assert "inertial (leaves the figure, up to 2.0 km)" in labels(top.get_legend())
-    # Per axis only the track that states a covariance, within a band of three sigma.
+    # The panels per axis show only the track with a covariance, within a three-sigma band.
     assert labels(in_x.get_legend()) == ["EKF", "EKF, 3 sigma"]
     (band,) = in_x.collections
     edge = np.abs(band.get_paths()[0].vertices[:, 1]).max()
@@ -115,7 +115,7 @@ def test_errors_without_any_covariance_are_drawn_per_axis_too(truth, tracks):
     assert len(in_x.collections) == 0
 
 
-def test_innovations_mark_what_was_gated_and_keep_it_in_the_frame():
+def test_gated_innovations_are_marked_and_kept_within_the_axes():
     rng = np.random.default_rng(2)
     time, residual = np.arange(0.0, 30.0, 0.2), rng.normal(0, 0.1, (150, 3))
     residual[40] = 50.0
@@ -131,7 +131,7 @@ def test_innovations_mark_what_was_gated_and_keep_it_in_the_frame():
     assert line(fig.axes[3], "expected 3").get_ydata()[0] == 3
 
 
-def test_imu_overview_survives_the_samples_that_readers_keep(truth):
+def test_imu_overview_tolerates_the_bad_samples_that_readers_keep(truth):
     rng = np.random.default_rng(4)
     n = 20_000
     time = np.arange(n) / 200.0
@@ -144,7 +144,7 @@ def test_imu_overview_survives_the_samples_that_readers_keep(truth):
     tallest = max(
         path.vertices[:, 1].max() for band in fig.axes[0].collections for path in band.get_paths()
     )
-    assert tallest == 30.0  # a single spike outlives the thinning
+    assert tallest == 30.0  # a single spike survives the decimation
     assert len(imu_overview(ImuSequence("walk", time[:50], gyro[:50], accel[:50])).axes) == 2
 
 
@@ -169,7 +169,7 @@ def test_what_cannot_be_drawn_is_refused(truth):
         imu_overview(ImuSequence("empty", np.arange(3.0), empty, empty))
 
 
-def test_matplotlib_is_imported_late_and_pyplot_never():
+def test_matplotlib_is_imported_lazily_and_pyplot_never():
     code = """
 import sys
 import numpy as np
@@ -185,16 +185,16 @@ assert "matplotlib.pyplot" not in sys.modules
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_a_track_is_marked_where_it_goes_on_behind_a_gap(tracks):
+def test_a_track_is_marked_where_it_resumes_after_a_gap(tracks):
     whole = tracks["ekf"]
     keep = np.ones(len(whole.time), dtype=bool)
     keep[len(keep) // 2 : len(keep) // 2 + round(2.5 / np.median(np.diff(whole.time)))] = False
     broken = Trajectory(whole.time[keep], whole.position_W[keep], whole.attitude_WB[keep])
-    # The network's first pose but one comes a window later, the others two in a second.
+    # The network's second pose comes one window after the first, the others two per second.
     half = round(0.5 / float(np.median(np.diff(whole.time))))
-    begun = np.r_[0, 2 * half : len(whole.time) : half]
-    waits = Trajectory(whole.time[begun], whole.position_W[begun], whole.attitude_WB[begun])
-    cases = (("ekf", whole, 0), ("ekf", broken, 1), ("pdr", broken, 0), ("network", waits, 0))
+    rows = np.r_[0, 2 * half : len(whole.time) : half]
+    delayed = Trajectory(whole.time[rows], whole.position_W[rows], whole.attitude_WB[rows])
+    cases = (("ekf", whole, 0), ("ekf", broken, 1), ("pdr", broken, 0), ("network", delayed, 0))
     for name, track, marks in cases:
         (axes,) = plan_view({name: track}, None, "").axes
         found = [line for line in axes.lines if line.get_label() == "after a gap"]

@@ -32,7 +32,7 @@ def without_gravity(sequence: ImuSequence) -> ImuSequence:
     return replace(sequence, accel=sequence.accel - sequence.truth.attitude_WB.apply(UP, True))
 
 
-def refused(sequence: ImuSequence) -> str:
+def refusal(sequence: ImuSequence) -> str:
     with pytest.raises(InputError) as caught:
         check_units(sequence)
     text = str(caught.value)
@@ -43,72 +43,72 @@ def refused(sequence: ImuSequence) -> str:
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_walks_pass_and_their_units_are_told(carry: str, seed: int) -> None:
-    """Swinging arms and pockets turn fast and press the device outward: still rad/s and m/s^2."""
+def test_walks_pass_and_their_wrong_units_are_named(carry: str, seed: int) -> None:
+    """Swinging arms and pockets rotate the device fast and press it outward, yet units are SI."""
     style = WalkStyle(carry=carry, preferred_speed=1.4, vigor=1.5)
     walk = simulate_imu(generate_walk(seed, 30.0, style=style), 100.0, PHONE_IMU, seed)
     check_units(walk)
     check_units(walk.without_truth())
-    assert "--gyro-unit deg/s" in refused(in_degrees(walk).without_truth())
-    assert "--accel-unit g" in refused(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
-    assert "--gravity removed" in refused(without_gravity(walk))
+    assert "--gyro-unit deg/s" in refusal(in_degrees(walk).without_truth())
+    assert "--accel-unit g" in refusal(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
+    assert "--gravity removed" in refusal(without_gravity(walk))
     check_units(with_conventions(without_gravity(walk), gravity="removed"))
-    assert "record the raw accelerometer" in refused(without_gravity(walk).without_truth())
+    assert "record the raw accelerometer" in refusal(without_gravity(walk).without_truth())
 
 
-def test_a_device_shaken_harder_than_it_weighs_passes_and_its_motion_alone_does_not() -> None:
-    """Its samples are of 14 m/s^2 in the median, their average is gravity all the same."""
+def test_a_hard_shaken_device_passes_but_not_without_gravity() -> None:
+    """The median norm of its samples exceeds 14 m/s^2, yet their average is gravity."""
     shaken = simulate_imu(generate_walk(19, 10.0), 200.0, PHONE_IMU, 19)
     assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 14.0
     check_units(shaken)
-    assert "--gravity removed" in refused(without_gravity(shaken))
+    assert "--gravity removed" in refusal(without_gravity(shaken))
 
 
-def test_a_resting_device_passes_and_its_drift_in_degrees_does_not() -> None:
-    """In deg/s even a bias of 0.01 rad/s turns gravity away within seconds."""
+def test_a_device_at_rest_passes_but_not_with_its_bias_in_degrees() -> None:
+    """In deg/s, even a bias of 0.01 rad/s rotates gravity away within seconds."""
     t = np.arange(2001) / 100.0
     rest = Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
     still = simulate_imu(rest, 100.0, PHONE_IMU).without_truth()
     biased = replace(still, gyro=still.gyro + np.array([0.01, -0.004, 0.002]))
     check_units(still)
     check_units(biased)
-    assert "contradict the accelerometer" in refused(in_degrees(biased))
-    assert "record the raw accelerometer" in refused(replace(still, accel=still.accel - UP))
+    assert "contradict the accelerometer" in refusal(in_degrees(biased))
+    assert "record the raw accelerometer" in refusal(replace(still, accel=still.accel - UP))
 
 
-def test_both_wrong_are_told_one_after_the_other(walk: ImuSequence) -> None:
+def test_two_wrong_units_are_named_one_after_the_other(walk: ImuSequence) -> None:
     both = in_degrees(replace(walk, accel=walk.accel / STANDARD_GRAVITY))
-    assert "--gyro-unit deg/s" in refused(both)
-    half = with_units(both, gyro_unit="deg/s")
-    assert "--accel-unit g" in refused(half)
-    check_units(with_units(half, accel_unit="g"))
+    assert "--gyro-unit deg/s" in refusal(both)
+    gyro_fixed = with_units(both, gyro_unit="deg/s")
+    assert "--accel-unit g" in refusal(gyro_fixed)
+    check_units(with_units(gyro_fixed, accel_unit="g"))
 
 
-def test_force_in_a_unit_nobody_knows_is_refused(walk: ImuSequence) -> None:
+def test_specific_force_in_an_unknown_unit_is_refused(walk: ImuSequence) -> None:
     for factor in (1000.0 / STANDARD_GRAVITY, 100.0, 0.5, STANDARD_GRAVITY):
-        assert "accelerometer" in refused(replace(walk, accel=factor * walk.accel))
-    assert "accelerometer" in refused(replace(walk, accel=0.0 * walk.accel))
+        assert "accelerometer" in refusal(replace(walk, accel=factor * walk.accel))
+    assert "accelerometer" in refusal(replace(walk, accel=0.0 * walk.accel))
 
 
-def test_a_turned_sign_is_seen_in_a_true_attitude_only(walk: ImuSequence) -> None:
+def test_a_reversed_sign_is_detected_only_with_a_true_attitude(walk: ImuSequence) -> None:
     apple = replace(walk, accel=-walk.accel)
-    assert "--accel-unit=-m/s^2" in refused(apple)
+    assert "--accel-unit=-m/s^2" in refusal(apple)
     check_units(with_units(apple, accel_unit="-m/s^2"))
     check_units(apple.without_truth())
 
 
-def test_a_truth_with_its_quaternion_in_another_order_is_refused(walk: ImuSequence) -> None:
+def test_a_truth_with_another_quaternion_order_is_refused(walk: ImuSequence) -> None:
     assert walk.truth is not None
     shuffled = Rotation.from_quat(walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
-    text = refused(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
+    text = refusal(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
     assert "x y z w" in text
 
 
-def test_axes_that_are_not_the_truths_are_named(walk: ImuSequence) -> None:
-    """Also where gravity points exactly down, which a wrong sign would explain as well."""
+def test_axes_that_differ_from_the_truths_are_named(walk: ImuSequence) -> None:
+    """Also if gravity points exactly down, which a wrong sign would explain too."""
     for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
         turned = with_axes(walk, axes)
-        assert f"--axes={undone}" in refused(turned)
+        assert f"--axes={undone}" in refusal(turned)
         check_units(with_axes(turned, undone))
         check_units(turned.without_truth())
 
@@ -117,26 +117,26 @@ def test_axes_that_are_not_the_truths_are_named(walk: ImuSequence) -> None:
 def test_time_in_another_unit_is_named(walk: ImuSequence, unit: str) -> None:
     factor = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
     alone = walk.without_truth()
-    assert f"`t [{unit}]`" in refused(replace(alone, time=factor * alone.time))
-    assert "`t [s]`" in refused(replace(alone, time=alone.time / factor))
+    assert f"`t [{unit}]`" in refusal(replace(alone, time=factor * alone.time))
+    assert "`t [s]`" in refusal(replace(alone, time=alone.time / factor))
 
 
-def test_a_rate_out_of_range_is_told(walk: ImuSequence) -> None:
+def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
-    assert "found 10 samples/s, expected 50 to 1000" in refused(slow)
+    assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)
 
 
-def test_too_short_and_empty_of_numbers(walk: ImuSequence) -> None:
-    assert "duration" in refused(walk.without_truth().slice(0.0, 1.2))
+def test_recordings_too_short_or_without_finite_samples_are_refused(walk: ImuSequence) -> None:
+    assert "duration" in refusal(walk.without_truth().slice(0.0, 1.2))
     check_units(walk.without_truth().slice(0.0, 1.6))
     one = ImuSequence("one", walk.time[:1], walk.gyro[:1], walk.accel[:1])
-    assert "samples: found 1" in refused(one)
+    assert "samples: found 1" in refusal(one)
     for field in ("time", "gyro", "accel"):
-        void = replace(walk.without_truth(), **{field: np.nan * getattr(walk, field)})
-        assert f"{field}: found no finite sample" in refused(void)
+        no_numbers = replace(walk.without_truth(), **{field: np.nan * getattr(walk, field)})
+        assert f"{field}: found no finite sample" in refusal(no_numbers)
     never = ImuSequence("never", walk.time, walk.gyro.copy(), walk.accel.copy())
     never.gyro[::2], never.accel[1::2] = np.nan, np.nan
-    assert "usable" in refused(never)
+    assert "usable" in refusal(never)
 
 
 def test_bad_samples_do_not_disturb_the_check(walk: ImuSequence) -> None:
@@ -148,29 +148,29 @@ def test_bad_samples_do_not_disturb_the_check(walk: ImuSequence) -> None:
     keep = rng.random(len(time)) > 0.2
     dirty = ImuSequence("dirty", time[keep], gyro[keep], accel[keep])
     check_units(dirty)
-    assert "--gyro-unit" in refused(in_degrees(dirty))
+    assert "--gyro-unit" in refusal(in_degrees(dirty))
 
 
 @pytest.mark.parametrize(("period", "lost"), [(4.0, 1.0), (3.0, 0.5), (4.0, 0.3), (30.0, 20.0)])
 @pytest.mark.parametrize("carry", ["swinging", "rig", "pocket"])
-def test_gaps_are_not_taken_for_wrong_units(carry: str, period: float, lost: float) -> None:
-    """The device turns within them and nobody sees it; the stretches between tell the units."""
+def test_gaps_are_not_mistaken_for_wrong_units(carry: str, period: float, lost: float) -> None:
+    """The device rotates unobserved during gaps; the stretches between determine the units."""
     style = WalkStyle(carry=carry)
     walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
     kept = walk.time % period > lost
-    holed = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept])
-    check_units(holed)
-    assert "--gyro-unit deg/s" in refused(in_degrees(holed))
+    gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept])
+    check_units(gappy)
+    assert "--gyro-unit deg/s" in refusal(in_degrees(gappy))
 
 
-def test_stretches_too_short_to_tell_are_not_asked() -> None:
+def test_stretches_too_short_to_determine_the_units_are_ignored() -> None:
     style = WalkStyle(carry="pocket")
     walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2)
     kept = walk.time % 0.9 > 0.6
     check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
 
 
-def test_units_by_name(walk: ImuSequence) -> None:
+def test_units_are_converted_by_name(walk: ImuSequence) -> None:
     assert np.array_equal(with_units(walk).gyro, walk.gyro)
     assert np.allclose(with_units(in_degrees(walk), "deg/s").gyro, walk.gyro)
     assert np.allclose(with_units(walk, accel_unit="g").accel, STANDARD_GRAVITY * walk.accel)
@@ -182,19 +182,19 @@ def test_units_by_name(walk: ImuSequence) -> None:
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
-def test_recordings_pass_and_their_units_are_told() -> None:
+def test_real_recordings_pass_and_their_wrong_units_are_named() -> None:
     paths = [path for name in ("euroc", "oxiod", "tumvi") for path in find_recordings(DATA / name)]
     for path in paths[::3]:
         recording = read_recording(path)
         check_units(recording)
-        assert "--gyro-unit deg/s" in refused(in_degrees(recording))
+        assert "--gyro-unit deg/s" in refusal(in_degrees(recording))
         alone = recording.without_truth()
         in_g = replace(alone, accel=alone.accel / STANDARD_GRAVITY)
-        assert "--accel-unit g" in refused(in_g)
-        assert "points down" in refused(replace(recording, accel=-recording.accel))
+        assert "--accel-unit g" in refusal(in_g)
+        assert "points down" in refusal(replace(recording, accel=-recording.accel))
 
 
-def test_a_clock_among_the_values_is_no_sensor() -> None:
+def test_timestamps_among_the_sensor_values_are_refused() -> None:
     walk = simulate_imu(generate_walk(3, 5.0), 100.0)
     clock = 1.7e18 + 1e7 * np.arange(len(walk))
     for name in ("gyro", "accel"):
@@ -203,17 +203,17 @@ def test_a_clock_among_the_values_is_no_sensor() -> None:
             check_units(replace(walk, **{name: values}))
 
 
-def test_a_gyroscope_that_never_changes_is_refused_while_the_accelerometer_moves(
+def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(
     walk: ImuSequence,
 ) -> None:
     for value in (0.0, 0.3):
         dead = replace(walk, gyro=np.full_like(walk.gyro, value))
-        assert "gyroscope: found values that never change" in refused(dead)
+        assert "gyroscope: found values that never change" in refusal(dead)
         assert len(inspect_recording(dead.without_truth()).problems) == 1
 
 
 def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
-    """Lying, in a circle, and in place about a leaning axis."""
+    """At rest, on a circle, and rotating in place about an inclined axis."""
     time = np.arange(0.0, 20.0, 0.01)
     turns = Rotation.from_rotvec(np.outer(time, [0.0, 0.5, 0.5]))
     circle = np.tile([0.0, 1.5, STANDARD_GRAVITY], (len(time), 1))
@@ -229,7 +229,7 @@ def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
-def test_a_sensor_that_repeats_itself_for_seconds_is_named(walk: ImuSequence, sensor: str) -> None:
+def test_a_sensor_stuck_for_seconds_is_named(walk: ImuSequence, sensor: str) -> None:
     values = getattr(walk, sensor).copy()
     values[2000:2800], values[4000:4300] = values[2000], values[4000]
     stuck = replace(walk, **{sensor: values}).without_truth()
@@ -242,29 +242,29 @@ def test_a_sensor_that_repeats_itself_for_seconds_is_named(walk: ImuSequence, se
     assert "repeat" not in " ".join(inspect_recording(in_ms).problems)
 
 
-def test_turns_of_a_hand_that_the_accelerometer_does_not_see_are_no_degrees() -> None:
-    """At the ear it turns by 1.3 rad/s: its axes mixed up, deg/s are not the reason."""
+def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees() -> None:
+    """At the ear the device turns at 1.3 rad/s; the cause is swapped axes, not deg/s."""
     style = WalkStyle(carry="call", preferred_speed=1.4, vigor=1.5)
     walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1).without_truth()
-    text = refused(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
+    text = refusal(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
     assert "contradict the accelerometer" in text
     assert "--gyro-unit" not in text
     assert "axes and signs" in text
 
 
-def test_no_option_is_named_that_the_file_refuses(walk: ImuSequence) -> None:
+def test_no_option_is_suggested_that_the_file_rules_out(walk: ImuSequence) -> None:
     named = replace(walk, converted=frozenset({"gyro", "accel"}))
-    for spoiled in (
+    for altered in (
         in_degrees(named),
         replace(named, accel=named.accel / STANDARD_GRAVITY),
         replace(named, accel=-named.accel),
     ):
-        text = refused(spoiled)
+        text = refusal(altered)
         assert "--" not in text
         assert "the one named in the file" in text
 
 
-def test_a_sensor_at_its_limit_is_named_with_its_share() -> None:
+def test_a_sensor_at_its_limit_is_named_with_the_share_of_samples() -> None:
     style = WalkStyle(carry="swinging", preferred_speed=1.6, vigor=1.5)
     free = simulate_imu(generate_walk(2, 30.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
     limits = {"gyro": 3.5, "accel": 16.0}
@@ -275,6 +275,6 @@ def test_a_sensor_at_its_limit_is_named_with_its_share() -> None:
         clipped = replace(free, **{sensor: np.clip(values, -limit, limit)})
         (problem,) = (p for p in inspect_recording(clipped).problems if "limit" in p)
         assert f"limit of {limit:.3g}" in problem
-        told = float(problem.split("%")[0].split()[-1]) / 100.0
-        assert 0.5 * share < told < share
+        reported = float(problem.split("%")[0].split()[-1]) / 100.0
+        assert 0.5 * share < reported < share
     assert not [p for p in inspect_recording(free).problems if "limit" in p]

@@ -1,4 +1,4 @@
-"""What is told of a magnetometer is what the simulation put there."""
+"""The assessment of a magnetometer recovers what was simulated."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def walk(magnetic_field: MagneticField) -> ImuSequence:
     return simulate_imu(track, 100.0, PERFECT_IMU, 1, magnetic_field=magnetic_field)
 
 
-def test_size_dip_lag_iron_and_drift_come_back() -> None:
+def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
     sequence = walk(MagneticField(hard_iron=IRON, lag=0.04))
     drift = np.radians(0.5)
     truth = sequence.truth
@@ -53,19 +53,19 @@ def test_size_dip_lag_iron_and_drift_come_back() -> None:
 
 
 @pytest.mark.parametrize("lag", [-0.08, 0.2])
-def test_a_lag_beyond_what_is_looked_for_is_not_told_as_measured(lag: float) -> None:
+def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag: float) -> None:
     inspected = inspect_recording(walk(MagneticField(hard_iron=IRON, lag=lag)))
     found = inspected.magnetic
     assert found is not None
     assert found.lag_s is None
     assert found.hard_iron_uT is None
-    told = "\n".join(inspected.lines())
-    assert "lag outside -50 to +150 ms" in told
-    assert "constant field" not in told
+    report = "\n".join(inspected.lines())
+    assert "lag outside -50 to +150 ms" in report
+    assert "constant field" not in report
     assert found.correlation is not None
 
 
-def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
+def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
     good = walk(MagneticField())
     assert good.magnetometer is not None
     magnets = tuple((t, t + 4.0, 150.0) for t in np.arange(2.0, 56.0, 8.0).tolist())
@@ -83,18 +83,18 @@ def test_a_magnet_a_wrong_axis_and_apples_sign_are_found() -> None:
     assert "another unit" in " ".join(inspect_recording(replace(good, magnetometer=unit)).problems)
 
 
-def test_a_field_that_the_device_carries_on_itself_is_told_by_its_size() -> None:
+def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm() -> None:
     measured = walk(MagneticField())
     assert measured.magnetometer is not None
     time, field = measured.magnetometer.time, measured.magnetometer.field
     size = np.linalg.norm(field, axis=1, keepdims=True)
-    carried = replace(measured, magnetometer=Magnetometer(time, 44.0 * field / size))
-    told = [" ".join(inspect_recording(one).lines()) for one in (measured, carried)]
-    assert "extrapolated by the device's own gyroscope" not in told[0]
-    assert "extrapolated by the device's own gyroscope 100%" in told[1]
+    extrapolated = replace(measured, magnetometer=Magnetometer(time, 44.0 * field / size))
+    report = [" ".join(inspect_recording(one).lines()) for one in (measured, extrapolated)]
+    assert "extrapolated by the device's own gyroscope" not in report[0]
+    assert "extrapolated by the device's own gyroscope 100%" in report[1]
 
 
-def test_a_sensor_that_gives_zeros_at_first_is_looked_over_all_the_same() -> None:
+def test_a_magnetometer_that_starts_with_zeros_is_assessed() -> None:
     late = walk(MagneticField())
     assert late.magnetometer is not None
     field = late.magnetometer.field.copy()
@@ -107,44 +107,44 @@ def test_a_sensor_that_gives_zeros_at_first_is_looked_over_all_the_same() -> Non
     assert found.held < 0.5
 
 
-def test_inspection_tells_of_a_good_magnetometer_and_of_none() -> None:
+def test_inspection_reports_a_good_magnetometer_and_a_missing_one() -> None:
     good = inspect_recording(walk(MagneticField()))
     assert not good.problems
     assert any(line.startswith("magnetometer: ") and "dip 63 deg" in line for line in good.lines())
-    told = good.as_dict()["magnetometer"]
-    assert isinstance(told, dict)
-    assert told["verdict"] == "good"
+    report = good.as_dict()["magnetometer"]
+    assert isinstance(report, dict)
+    assert report["verdict"] == "good"
     bare = inspect_recording(replace(walk(MagneticField()), magnetometer=None))
     assert bare.as_dict()["magnetometer"] is None
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
 @pytest.mark.parametrize(
-    ("name", "verdict", "sure"),
+    ("name", "verdict", "tolerance"),
     [
         ("imu3", "good", 0.06),
-        # The bearing is unsteady by 18 deg: its slope over a minute is known to no better.
+        # The bearing scatters by 18 deg, which limits the accuracy of its slope over a minute.
         ("imu2", "coarse", 0.15),
     ],
 )
-def test_recorded_magnetometers_know_the_gyroscopes_drift(
-    name: str, verdict: str, sure: float
+def test_recorded_magnetometers_measure_the_gyroscopes_drift(
+    name: str, verdict: str, tolerance: float
 ) -> None:
-    """With its sign, against how the yaw by the gyroscope leaves the true one [deg/s]."""
+    """With its sign, against the drift of the gyroscope's yaw from the true yaw [deg/s]."""
     recording = read_recording(DATA / f"oxiod/handheld/data1/syn/{name}.csv")
     time, gyro, accel = clean_samples(recording)
     levelled = Rotation.from_matrix(levelled_attitudes(time, gyro, accel))
     known = recording.truth.covers(time)
-    off = np.unwrap(yaw_of(levelled * recording.truth.at(time).attitude_WB.inv())[known])
-    drift = np.polyfit(time[known], off, 1)[0]
+    yaw_error = np.unwrap(yaw_of(levelled * recording.truth.at(time).attitude_WB.inv())[known])
+    drift = np.polyfit(time[known], yaw_error, 1)[0]
     found = assess_magnetometer(recording)
     assert found is not None
     assert found.verdict == verdict
-    assert math.degrees(found.drift_rad_s) == pytest.approx(math.degrees(drift), abs=sure)
+    assert math.degrees(found.drift_rad_s) == pytest.approx(math.degrees(drift), abs=tolerance)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
-def test_magnets_beside_a_phone_are_not_trusted() -> None:
+def test_a_magnetometer_next_to_magnets_is_not_usable() -> None:
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = assess_magnetometer(read_recording(DATA / name))
     assert magnets is not None

@@ -35,7 +35,7 @@ def problem(sequence: ImuSequence) -> str:
     return text
 
 
-def test_nothing_is_wrong_with_a_good_recording(walk: ImuSequence) -> None:
+def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:
     found = inspect_recording(walk)
     assert found.problems == ()
     assert "no problems found" in found.lines()[-1]
@@ -48,7 +48,7 @@ def test_nothing_is_wrong_with_a_good_recording(walk: ImuSequence) -> None:
     assert found.coverage.path_m == pytest.approx(truth_of(walk).path_length())
 
 
-def test_gaps_and_times_are_counted(walk: ImuSequence) -> None:
+def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     keep = np.ones(len(walk), dtype=bool)
     keep[500:750] = keep[1200:1203] = False
     time = walk.time.copy()
@@ -64,13 +64,13 @@ def test_gaps_and_times_are_counted(walk: ImuSequence) -> None:
     assert timing.repeated == 1
     assert timing.backward == 1
     assert timing.not_finite == 1
-    # The two samples with wrong times leave a hole where they should have been.
+    # The two samples with wrong times leave gaps where they should have been.
     assert timing.lost >= 250 + 3
     assert timing.jitter_s < 1e-9
 
 
 @pytest.mark.parametrize(
-    ("spoil", "option"),
+    ("corrupt", "option"),
     [
         (lambda s: replace(s, gyro=np.degrees(s.gyro), truth=None), "--gyro-unit deg/s"),
         (lambda s: replace(s, accel=s.accel / STANDARD_GRAVITY), "--accel-unit g"),
@@ -86,8 +86,8 @@ def test_gaps_and_times_are_counted(walk: ImuSequence) -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_named_with_the_option_that_mends_it(walk, spoil, option) -> None:
-    assert option in problem(spoil(walk))
+def test_a_problem_is_named_with_the_option_that_fixes_it(walk, corrupt, option) -> None:
+    assert option in problem(corrupt(walk))
 
 
 def test_a_truth_on_another_clock_is_named_with_the_offset(walk: ImuSequence) -> None:
@@ -95,8 +95,8 @@ def test_a_truth_on_another_clock_is_named_with_the_offset(walk: ImuSequence) ->
     assert "add +0.25" in problem(late)
 
 
-def test_a_truth_too_slow_to_compare_is_named_as_that(walk: ImuSequence) -> None:
-    """Nothing is known of its attitude between two poses: no clock and no axes are to be blamed."""
+def test_a_truth_too_slow_to_compare_is_named_as_such(walk: ImuSequence) -> None:
+    """Its attitude between two poses is unknown, so neither clock nor axes may be blamed."""
     truth = walk.truth
     assert truth is not None
     found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
@@ -107,7 +107,7 @@ def test_a_truth_too_slow_to_compare_is_named_as_that(walk: ImuSequence) -> None
 
 def test_a_truth_of_another_body_is_named_in_degrees(walk: ImuSequence) -> None:
     truth = truth_of(walk)
-    # About the vertical of a device held level, so that gravity says nothing.
+    # Rotated about the vertical of a level device, so that gravity gives no information.
     turned = truth.attitude_WB * Rotation.from_rotvec([0.0, 0.0, 0.6])
     text = problem(replace(walk, truth=replace(truth, attitude_WB=turned)))
     assert "34." in text
@@ -126,7 +126,7 @@ def test_rest_is_reported(walk: ImuSequence) -> None:
     assert "truth: none" in found.lines()
 
 
-def test_findings_are_plain_values(walk: ImuSequence) -> None:
+def test_findings_are_plain_json_values(walk: ImuSequence) -> None:
     content = json.loads(json_text(inspect_recording(walk).as_dict()))
     assert content["truth"]["coverage"] > 0.99
     assert abs(content["truth_against_gyroscope"]["time_offset_s"]) < 0.005
@@ -151,7 +151,7 @@ def test_poor_recordings_are_described_not_refused(walk: ImuSequence) -> None:
         inspect_recording(replace(walk, gyro=np.nan * walk.gyro))
 
 
-def test_the_figure_shows_rest_gaps_and_the_truths_rotation(walk: ImuSequence) -> None:
+def test_the_figure_shows_rest_gaps_and_the_rotation_of_the_truth(walk: ImuSequence) -> None:
     fit = inspect_recording(walk).fit
     assert fit is not None
     figure = imu_overview(walk, (fit.times, fit.speed), rest=[(1.0, 2.0)], gaps=[(5.0, 6.0)])
@@ -167,7 +167,7 @@ def test_the_figure_shows_rest_gaps_and_the_truths_rotation(walk: ImuSequence) -
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 @pytest.mark.parametrize("name", ["tumvi/dataset-room1_512_16", "oxiod/trolley/data2/syn/imu4.csv"])
-def test_real_recordings_are_in_order(name: str) -> None:
+def test_real_recordings_have_no_problems(name: str) -> None:
     found = inspect_recording(read_recording(DATA / name))
     assert found.problems == ()
     assert found.fit is not None

@@ -13,8 +13,8 @@ NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
 BIAS = np.array([0.01, -0.02, 0.005])
 
 
-def lying(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
-    """A device on a table, tilted."""
+def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
+    """A tilted device lying still."""
     rng = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     gyro = BIAS + NOISE.gyro_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))
@@ -25,8 +25,8 @@ def lying(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
-def test_noise_and_bias_are_those_of_the_sensor_at_any_rate(rate: float) -> None:
-    rest = find_rest(lying(60.0, rate))
+def test_noise_and_bias_match_the_sensor_at_any_rate(rate: float) -> None:
+    rest = find_rest(device_at_rest(60.0, rate))
     assert rest is not None
     assert rest.seconds == pytest.approx(60.0, abs=0.6)
     assert len(rest.stretches) == 1
@@ -36,12 +36,12 @@ def test_noise_and_bias_are_those_of_the_sensor_at_any_rate(rate: float) -> None
     assert rest.accel_noise == pytest.approx(NOISE.accel_noise, rel=0.1)
 
 
-def test_a_walk_is_no_rest() -> None:
+def test_a_walk_contains_no_rest() -> None:
     assert find_rest(simulate_imu(generate_walk(2, 20.0, style=WalkStyle()), 200.0)) is None
 
 
-def test_rest_between_motions_is_found_and_not_across_a_gap() -> None:
-    still = lying(10.0, 100.0)
+def test_rest_is_found_between_motions_but_not_across_a_gap() -> None:
+    still = device_at_rest(10.0, 100.0)
     rng = np.random.default_rng(1)
     gyro = still.gyro.copy()
     gyro[300:500] += rng.normal(size=(200, 3)).cumsum(axis=0) * 0.05
@@ -57,12 +57,12 @@ def test_rest_between_motions_is_found_and_not_across_a_gap() -> None:
     assert f == pytest.approx(12.0, abs=0.5)
 
 
-def test_a_slow_turn_is_not_taken_for_bias() -> None:
-    still = lying(10.0, 100.0)
+def test_a_slow_turn_is_not_mistaken_for_bias() -> None:
+    still = device_at_rest(10.0, 100.0)
     turning = ImuSequence("t", still.time, still.gyro + np.array([0.0, 0.0, 0.1]), still.accel)
     assert find_rest(turning) is None
 
 
-def test_a_moment_is_too_short() -> None:
-    assert find_rest(lying(0.8, 100.0)) is None
-    assert find_rest(lying(0.2, 100.0)) is None
+def test_less_than_a_second_of_rest_is_too_short() -> None:
+    assert find_rest(device_at_rest(0.8, 100.0)) is None
+    assert find_rest(device_at_rest(0.2, 100.0)) is None

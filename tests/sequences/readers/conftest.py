@@ -1,4 +1,4 @@
-"""Writers of every published format, from simulated walks: names, orders, units and quirks."""
+"""Writers of every published format for simulated walks: names, orders, units and quirks."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 START_NS = 1520531124153717567
-"""A start that float64 cannot hold: it is off by up to 128 ns there."""
+"""A start time that float64 cannot represent: its rounding error is up to 128 ns."""
 
 Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
-"""From a world with z up to ARCore's with y up."""
+"""Rotation from a world with z up to ARCore's with y up."""
 
 FIELD_W = np.array([18.0, 5.0, -43.0])
-"""A magnetic field [uT] that is the same everywhere."""
+"""Uniform magnetic field [uT]."""
 
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.005]), np.array([0.1, 0.05, -0.2])
 
 
 @dataclass(frozen=True)
 class Written:
-    """A recording that a test wrote: where, and what a reader must make of it."""
+    """A recording written by a test: its path and what a reader must return."""
 
     path: Path
     expected: ImuSequence
@@ -52,7 +52,7 @@ def pose_of(walk: ImuSequence) -> Trajectory:
 
 
 def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
-    """Part of a walk, as a reader returns it: time from its first row on."""
+    """Part of a walk as a reader returns it, with time starting at its first row."""
     truth, time = pose_of(walk), walk.time[rows] - walk.time[rows][0]
     return ImuSequence(
         name=walk.name,
@@ -77,15 +77,15 @@ def stamps_ns(time: FloatArray, start: int = START_NS) -> list[int]:
     return [start + round(t * 1e9) for t in time.tolist()]
 
 
-def text(*columns: list[int] | FloatArray, joint: str = ",") -> list[str]:
-    """Rows with every digit that a float64 has."""
+def text(*columns: list[int] | FloatArray, sep: str = ",") -> list[str]:
+    """Rows with all digits of a float64."""
     parts = [
         [str(x) for x in column]
         if isinstance(column, list)
-        else [joint.join(map(repr, np.atleast_1d(row).tolist())) for row in column]
+        else [sep.join(map(repr, np.atleast_1d(row).tolist())) for row in column]
         for column in columns
     ]
-    return [joint.join(row) for row in zip(*parts, strict=True)]
+    return [sep.join(row) for row in zip(*parts, strict=True)]
 
 
 def save(path: Path, header: str, rows: list[str]) -> None:
@@ -130,7 +130,7 @@ def write_ronin(folder: Path, walk: ImuSequence, **info: object) -> Written:
 
 
 def pandas_table(folder: Path, walk: ImuSequence, ori: Rotation, rv: Rotation) -> Path:
-    """RIDI's columns as pandas writes them, with an index that has no name."""
+    """RIDI's columns as pandas writes them, with an unnamed index."""
     truth = pose_of(walk)
     header = ",time," + ",".join(map(names, ("gyro", "acce", "linacce", "grav", "magnet", "pos")))
     header += f",{names('ori', 'wxyz')},{names('rv', 'wxyz')}"
@@ -150,14 +150,14 @@ def write_ridi(folder: Path, walk: ImuSequence) -> Written:
 
 
 def write_imunet(folder: Path, walk: ImuSequence) -> Written:
-    """Positions turned upright by its authors, attitudes left in ARCore's world."""
+    """Positions are z-up as converted by its authors; attitudes remain in ARCore's world."""
     attitude_WB = pose_of(walk).attitude_WB
     pandas_table(folder, walk, Y_UP * attitude_WB, about_z(1.2) * attitude_WB)
     return Written(folder, replace(cut(walk, slice(None)), name=folder.name))
 
 
 def write_imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) -> Written:
-    """Each sensor at its own stretch; the pose at about 30 Hz in a world with y up."""
+    """Each sensor over its own time span; the pose at about 30 Hz in a world with y up."""
     truth, poses = pose_of(walk), slice(21, -30, 7)
     quat = (about_z(1.2) * truth.attitude_WB).as_quat()
     pose = np.hstack([world.apply(truth.position_W), (world * truth.attitude_WB).as_quat()])
@@ -169,7 +169,7 @@ def write_imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) ->
         ("magnet", field_of(walk), slice(11, None, 4)),
     ):
         stamps = stamps_ns(walk.time[rows])
-        save(folder / f"{name}.txt", f"# {name}", text(stamps, values[rows], joint=" "))
+        save(folder / f"{name}.txt", f"# {name}", text(stamps, values[rows], sep=" "))
     expected = cut(walk, slice(8, -12))
     time = truth.time[poses] - truth.time[8]
     known = trajectory(time, truth.position_W[poses], truth.attitude_WB[poses])
@@ -223,7 +223,7 @@ def write_tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
 def write_tlio_raw(
     folder: Path, walk: ImuSequence, R_DI: Rotation | None = None, every: int = 5
 ) -> Written:
-    """Raw samples with a calibration, and the resampled pose of a device the IMU is turned in."""
+    """Raw samples with a calibration; the resampled pose of a device with the IMU turned in it."""
     mount = Rotation.identity() if R_DI is None else R_DI
     lever = np.zeros(3) if R_DI is None else np.array([0.01, 0.03, -0.02])
     truth = pose_of(walk)
@@ -261,7 +261,7 @@ def write_tlio_raw(
 
 
 def write_android(folder: Path, walk: ImuSequence) -> Written:
-    """Two files with headers, one beginning and one ending earlier; values in z, y, x order."""
+    """Files with headers; the gyroscope's begins and ends earlier; values in z, y, x order."""
     header = "time,seconds_elapsed,z,y,x"
     for name, values, rows in (
         ("Gyroscope", walk.gyro, slice(0, -20)),
@@ -291,7 +291,7 @@ def write_bag(
     pose_topics: tuple[tuple[str, str], ...] = (("/odom", "nav_msgs/msg/Odometry"),),
     other_topics: tuple[tuple[str, str], ...] = (("/mag", "sensor_msgs/msg/MagneticField"),),
 ) -> Path:
-    """A bag with Imu topics and poses, in one of the storages `ros1`, `sqlite3` and `mcap`."""
+    """Write a bag with Imu topics and poses in the storage `ros1`, `sqlite3` or `mcap`."""
     pytest.importorskip("rosbags")
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
@@ -371,7 +371,7 @@ WRITERS: dict[str, tuple[str, float, Writer]] = {
     "bag sqlite3": ("bag", 200.0, bag_writer("sqlite3")),
     "bag mcap": ("bag", 200.0, bag_writer("mcap")),
 }
-"""What can be written: the format it is recognised as, the rate to simulate at, the writer."""
+"""Writers by name, each with the format to be recognised and the rate to simulate [Hz]."""
 
 
 @pytest.fixture(scope="session")
@@ -388,7 +388,7 @@ def walks() -> Callable[[float], ImuSequence]:
 
 @pytest.fixture
 def formats() -> SimpleNamespace:
-    """The writers by name: modules of tests cannot import each other."""
+    """The writers by name, since test modules cannot import each other."""
     return SimpleNamespace(
         ronin=write_ronin,
         ridi=write_ridi,
@@ -411,6 +411,6 @@ def written(
     tmp_path_factory: pytest.TempPathFactory,
     walks: Callable[[float], ImuSequence],
 ) -> tuple[str, Written]:
-    """A recording in each format, with the name it must be recognised by; not to be changed."""
+    """A recording in each format and the format name to be recognised; not to be modified."""
     name, rate, write = WRITERS[request.param]
     return name, write(tmp_path_factory.mktemp("set") / "seq_1", walks(rate))

@@ -1,4 +1,4 @@
-"""Archives: recordings by name, the three kinds of truth, what is not there."""
+"""Archives: recordings by name, the three kinds of ground truth, missing entries."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _archive(path: Path) -> Path:
 
 def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
-    pose, track, taps = (read_recording(found) for found in find_recordings(path))
+    pose, track, waypoints = (read_recording(found) for found in find_recordings(path))
     assert pose.truth is not None
     assert pose.positions is None
     assert pose.magnetometer is not None
@@ -42,46 +42,46 @@ def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
     assert track.positions is not None
     assert track.positions.kind == "positions"
     assert track.positions.position_W.shape == (50, 3)
-    assert taps.positions is not None
-    assert taps.positions.kind == "waypoints"
-    assert taps.positions.position_W.shape == (2, 2)
-    assert taps.attributes["person"] == "ann"
+    assert waypoints.positions is not None
+    assert waypoints.positions.kind == "waypoints"
+    assert waypoints.positions.position_W.shape == (2, 2)
+    assert waypoints.attributes["person"] == "ann"
 
 
-def test_recordings_are_chosen_by_attribute(tmp_path: Path) -> None:
+def test_recordings_are_selected_by_attribute(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
     assert archive_members(path, {"person": ["ann"]}) == [Path(f"{path}:a"), Path(f"{path}:c")]
 
 
-def test_patterns_lists_and_folders_choose_alike(tmp_path: Path) -> None:
+def test_patterns_lists_and_folders_select_the_same_recordings(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
-    annes = [Path(f"{path}:a"), Path(f"{path}:c")]
-    assert archive_members(path, {"person": ["a*"], "name": ["[ac]"]}) == annes
-    assert find_recordings(tmp_path, where={"person": ["ann"]}) == annes
+    of_ann = [Path(f"{path}:a"), Path(f"{path}:c")]
+    assert archive_members(path, {"person": ["a*"], "name": ["[ac]"]}) == of_ann
+    assert find_recordings(tmp_path, where={"person": ["ann"]}) == of_ann
     listed = tmp_path / "split.txt"
     listed.write_text('walks.h5:b\nwalks.h5 person=ann name=a  # hers\nwalks.h5 person="ann"\n')
-    assert find_recordings(listed) == [Path(f"{path}:b"), *annes]
-    assert find_recordings(listed, where={"name": ["c"]}) == annes[1:]
+    assert find_recordings(listed) == [Path(f"{path}:b"), *of_ann]
+    assert find_recordings(listed, where={"name": ["c"]}) == of_ann[1:]
 
 
-def test_what_nobody_has_is_told_with_what_they_have(tmp_path: Path) -> None:
+def test_an_unknown_attribute_value_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
     with pytest.raises(ReadError, match=r"person=eve: found none, .* person to be one of ann, bob"):
         find_recordings(path, where={"person": ["eve"]})
 
 
-def test_a_name_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
     with pytest.raises(ReadError, match="'d', expected a name in it, such as a, b, c"):
         read_recording(f"{path}:d")
 
 
-def test_an_archive_of_many_needs_a_name(tmp_path: Path) -> None:
+def test_an_archive_of_several_recordings_requires_a_name(tmp_path: Path) -> None:
     with pytest.raises(ReadError, match=r"3 recordings, expected the name of one; use walks\.h5:a"):
         read_recording(_archive(tmp_path / "walks.h5"))
 
 
-def test_a_cut_archive_is_an_error_that_names_the_file(tmp_path: Path) -> None:
+def test_a_truncated_archive_is_refused_with_its_file_name(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ReadError, match=r"walks\.h5: content: found .*truncated.*complete"):
@@ -89,7 +89,7 @@ def test_a_cut_archive_is_an_error_that_names_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")
-def test_gravity_stands_up_in_the_true_frame_of_the_archives() -> None:
+def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives() -> None:
     for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):
         recording = read_recording(ARCHIVES / name)
         assert recording.truth is not None

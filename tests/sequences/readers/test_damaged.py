@@ -1,4 +1,4 @@
-"""Damaged files end in one line that names them, whatever is wrong in them."""
+"""Damaged files raise a one-line error that names them, whatever is wrong with them."""
 
 import shutil
 import zipfile
@@ -33,21 +33,21 @@ def archive(walk: ImuSequence, tmp_path: Path) -> Path:
     return tmp_path / "two.h5"
 
 
-def test_flipped_bytes_of_an_archive_are_a_read_error(archive: Path, tmp_path: Path) -> None:
+def test_flipped_bytes_in_an_archive_raise_input_errors_only(archive: Path, tmp_path: Path) -> None:
     data, rng = archive.read_bytes(), np.random.default_rng(0)
-    spoiled = tmp_path / "spoiled.h5"
+    damaged = tmp_path / "spoiled.h5"
     for _ in range(40):
         changed = bytearray(data)
         for place in rng.integers(0, len(data), 20):
             changed[place] ^= 0xFF
-        spoiled.write_bytes(changed)
+        damaged.write_bytes(changed)
         with suppress(InputError):
-            for path in find_recordings(spoiled):
+            for path in find_recordings(damaged):
                 with suppress(InputError):
                     read_recording(path)
 
 
-def test_arrays_of_other_shapes_are_a_read_error(archive: Path) -> None:
+def test_arrays_of_wrong_shapes_are_a_read_error(archive: Path) -> None:
     with h5py.File(archive, "r+") as file:
         del file["walk/truth/p"]
         file["walk/truth/p"] = np.zeros((3, 3))
@@ -60,7 +60,7 @@ def test_arrays_of_other_shapes_are_a_read_error(archive: Path) -> None:
             read_recording(f"{archive}:{name}")
 
 
-def test_an_archive_with_its_end_in_capitals_is_read(archive: Path, tmp_path: Path) -> None:
+def test_an_archive_with_an_upper_case_suffix_is_read(archive: Path, tmp_path: Path) -> None:
     shutil.copy(archive, tmp_path / "TWO.H5")
     paths = find_recordings(tmp_path / "TWO.H5")
     assert [read_recording(path).name for path in paths] == ["other", "walk"]
@@ -79,7 +79,7 @@ def test_a_damaged_zip_is_a_read_error(walk: ImuSequence, tmp_path: Path) -> Non
             read_recording(tmp_path / "walk.zip")
 
 
-def test_what_a_killed_writer_left_is_no_recording(walk: ImuSequence, tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_writer_are_not_recordings(walk: ImuSequence, tmp_path: Path) -> None:
     from stario.sequences.datasets.convert import convert
 
     convert(walk, tmp_path / ".rec.abcd.tmp", "euroc")
@@ -94,7 +94,7 @@ def test_a_truth_is_not_levelled_by_a_dead_accelerometer(walk: ImuSequence) -> N
     assert MIN_GRAVITY_FORCE > 0.0
 
 
-def test_a_pose_of_another_clock_costs_no_memory(walk: ImuSequence) -> None:
+def test_a_pose_on_another_clock_does_not_exhaust_memory(walk: ImuSequence) -> None:
     truth = walk.truth
     time = truth.time + 1.7e9
     time[0] = 0.0
@@ -102,7 +102,7 @@ def test_a_pose_of_another_clock_costs_no_memory(walk: ImuSequence) -> None:
         clock_offset(walk.time, walk.gyro, time, truth.attitude_WB, truth.valid)
 
 
-def test_a_part_without_truth_has_none(walk: ImuSequence) -> None:
+def test_a_slice_outside_the_truth_has_none(walk: ImuSequence) -> None:
     short = replace(walk, truth=walk.truth.slice(0.0, 1.0))
     assert short.slice(5.0, 6.0).truth is None
 
@@ -117,7 +117,7 @@ def test_a_part_without_truth_has_none(walk: ImuSequence) -> None:
         "GYRO;12.345;12.340;0.01;-0.02;0.03;3",
     ],
 )
-def test_an_event_that_was_cut_off_costs_itself_alone(tmp_path: Path, cut: str) -> None:
+def test_a_truncated_event_loses_only_itself(tmp_path: Path, cut: str) -> None:
     rows = []
     for k in range(200):
         t = 10.0 + 0.01 * k
@@ -128,7 +128,7 @@ def test_an_event_that_was_cut_off_costs_itself_alone(tmp_path: Path, cut: str) 
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
-def test_reference_points_are_in_the_unit_in_which_they_lie_in_the_recording(
+def test_reference_points_take_the_time_unit_that_fits_the_recording(
     tmp_path: Path, unit: float
 ) -> None:
     from stario.sequences.readers.phones.reference_points import reference_points
@@ -140,21 +140,21 @@ def test_reference_points_are_in_the_unit_in_which_they_lie_in_the_recording(
     np.testing.assert_allclose(found.time, [0.0, 2.0, 10.0, 28.0])
 
 
-def test_a_first_row_of_whole_numbers_has_the_decimal_mark_of_those_below() -> None:
+def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below() -> None:
     rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
     assert first_row(list(enumerate(rows))) == (1, ";", ",")
     points = [row.replace(",", ".") for row in rows]
     assert first_row(list(enumerate(points))) == (1, ";", ".")
 
 
-@pytest.mark.parametrize(("apart", "sorts"), [(2, True), (60, False)])
-def test_rows_out_of_order_by_little_are_sorted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, apart: int, sorts: bool
+@pytest.mark.parametrize(("delay", "sorts"), [(2, True), (60, False)])
+def test_slightly_disordered_rows_are_sorted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, delay: int, sorts: bool
 ) -> None:
-    """Every eighth row lies two rows too late: 20 ms; by 0.6 s nobody knows what happened."""
+    """Every eighth row is late; a delay of 20 ms is sorted out, but 0.6 s has no clear cause."""
     walk = simulate_imu(generate_walk(2, 12.0), 100.0)
     row = np.arange(len(walk))
-    order = np.argsort(row + np.where(row % 8 == 3, apart + 0.5, 0.0))
+    order = np.argsort(row + np.where(row % 8 == 3, delay + 0.5, 0.0))
     write_csv(tmp_path / "plain.csv", walk.without_truth())
     lines = (tmp_path / "plain.csv").read_text().splitlines()
     shuffled = [lines[0], *(lines[1:][k] for k in order)]

@@ -30,12 +30,12 @@ def walk() -> ImuSequence:
     return simulate_imu(generate_walk(4, 10.0, style=WalkStyle()), rate=200.0)
 
 
-def written(path: Path, *lines: str) -> Path:
+def write_lines(path: Path, *lines: str) -> Path:
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
-def test_what_is_written_comes_back_to_the_last_bit(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_recording_is_read_back_to_the_last_bit(tmp_path: Path, walk: ImuSequence) -> None:
     write_csv(tmp_path / "walk.csv", walk)
     read = read_recording(tmp_path / "walk.csv")
     assert read.name == "walk"
@@ -46,11 +46,11 @@ def test_what_is_written_comes_back_to_the_last_bit(tmp_path: Path, walk: ImuSeq
     assert walk.truth is not None
     assert np.array_equal(read.truth.time, walk.truth.time)
     assert np.array_equal(read.truth.position_W, walk.truth.position_W)
-    off = (read.truth.attitude_WB.inv() * walk.truth.attitude_WB).magnitude()
-    assert off.max() < 1e-15
+    error = (read.truth.attitude_WB.inv() * walk.truth.attitude_WB).magnitude()
+    assert error.max() < 1e-15
 
 
-def test_without_truth_there_is_none(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_file_without_truth_is_read_without_truth(tmp_path: Path, walk: ImuSequence) -> None:
     write_csv(tmp_path / "walk.csv", walk.without_truth())
     assert (tmp_path / "walk.csv").read_text().startswith(HEADER + "\n0.0,")
     read = read_generic_csv(tmp_path / "walk.csv")
@@ -58,7 +58,7 @@ def test_without_truth_there_is_none(tmp_path: Path, walk: ImuSequence) -> None:
     assert np.array_equal(read.accel, walk.accel)
 
 
-def test_a_magnetometer_comes_back_in_shared_rows_and_in_rows_of_its_own(
+def test_a_magnetometer_is_read_back_from_shared_and_separate_rows(
     tmp_path: Path, walk: ImuSequence
 ) -> None:
     time = np.concatenate([walk.time[2:40:3], walk.time[40:900:7] + 0.001])
@@ -74,8 +74,8 @@ def test_a_magnetometer_comes_back_in_shared_rows_and_in_rows_of_its_own(
     assert len(read.truth) == len(walk)
 
 
-def test_the_fields_unit_is_the_headers_and_what_is_no_sample_is_left_out(tmp_path: Path) -> None:
-    path = written(
+def test_the_header_gives_the_magnetic_unit_and_empty_samples_are_skipped(tmp_path: Path) -> None:
+    path = write_lines(
         tmp_path / "a.csv",
         f"{HEADER},mx [nT],my [nT],mz [nT]",
         "0.0,0,0,0,0,0,9.8,1000,2000,3000",
@@ -88,13 +88,13 @@ def test_the_fields_unit_is_the_headers_and_what_is_no_sample_is_left_out(tmp_pa
     assert np.array_equal(read.time, [0.0, 0.1, 0.2])
     assert np.array_equal(read.magnetometer.time, [0.0, 0.3])
     assert np.allclose(read.magnetometer.field, [[1, 2, 3], [4, 5, 6]])
-    written(path, f"{HEADER},mx [uT]", "0.0,0,0,0,0,0,9.8,1")
+    write_lines(path, f"{HEADER},mx [uT]", "0.0,0,0,0,0,0,9.8,1")
     with pytest.raises(ReadError, match="no my, mz"):
         read_generic_csv(path)
 
 
-def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence) -> None:
-    """As motion capture gives it: other times, before and after the IMU, some not valid."""
+def test_truth_with_its_own_times_is_read_back(tmp_path: Path, walk: ImuSequence) -> None:
+    """As from motion capture: its own times, before and after the IMU's, some invalid."""
     time = np.arange(-1.003, 11.0, 1.0 / 120.0)
     valid = np.ones(len(time), dtype=np.bool_)
     valid[300:400] = False
@@ -113,7 +113,7 @@ def test_truth_at_times_of_its_own_comes_back(tmp_path: Path, walk: ImuSequence)
     assert not read.truth.at(np.array([time[350]])).valid.any()
 
 
-def test_bad_samples_and_their_order_survive(tmp_path: Path, walk: ImuSequence) -> None:
+def test_bad_samples_and_their_order_are_kept(tmp_path: Path, walk: ImuSequence) -> None:
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
     time[5], time[7] = time[4], time[3]
     gyro[9], accel[11, 1] = np.nan, np.inf
@@ -142,13 +142,13 @@ def test_time_is_read_exactly_from_any_epoch(tmp_path: Path, unit: str, per_seco
         cut = len(whole) - 9 + digits
         rows.append(f"{whole[:cut]}.{whole[cut:]}".rstrip(".") + f",{ROW}")
     header = f"timestamp [{unit}],gx,gy,gz,ax,ay,az"
-    read = read_generic_csv(written(tmp_path / "epoch.csv", header, *rows))
+    read = read_generic_csv(write_lines(tmp_path / "epoch.csv", header, *rows))
     assert read.time.tolist() == [step / 1e9 for step in steps.tolist()]
 
 
-def test_units_are_brought_to_si(tmp_path: Path) -> None:
+def test_units_are_converted_to_si(tmp_path: Path) -> None:
     def read(header: str) -> tuple[FloatArray, FloatArray]:
-        imu = read_generic_csv(written(tmp_path / "units.csv", header, f"0,{ROW}"))
+        imu = read_generic_csv(write_lines(tmp_path / "units.csv", header, f"0,{ROW}"))
         return imu.gyro[0], imu.accel[0]
 
     gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.0])
@@ -169,16 +169,16 @@ def test_units_are_brought_to_si(tmp_path: Path) -> None:
         "#timestamp,w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z,a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z",
     ],
 )
-def test_common_names_are_understood(tmp_path: Path, header: str) -> None:
-    read = read_recording(written(tmp_path / "names.csv", header, f"0,{ROW}", f"0.01,{ROW}"))
+def test_common_column_names_are_recognised(tmp_path: Path, header: str) -> None:
+    read = read_recording(write_lines(tmp_path / "names.csv", header, f"0,{ROW}", f"0.01,{ROW}"))
     assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
 
 
-def test_order_is_free_and_unknown_columns_are_ignored(
+def test_column_order_is_free_and_unknown_columns_are_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = written(
+    path = write_lines(
         tmp_path / "order.csv",
         "# phone in the left hand",
         "",
@@ -194,26 +194,26 @@ def test_order_is_free_and_unknown_columns_are_ignored(
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
 
 
-def test_slower_truth_is_valid_on_its_rows_only(tmp_path: Path) -> None:
+def test_slower_truth_has_only_its_own_rows(tmp_path: Path) -> None:
     rows = [
         f"{0.01 * k},{ROW}," + (f"{k},0,1,0,0,0,1" if k % 5 == 0 else ",,,,,,") for k in range(21)
     ]
     rows[20] = rows[20].replace("20,0,1", "20,,nan")
-    path = written(tmp_path / "slow.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+    path = write_lines(tmp_path / "slow.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
     read = read_generic_csv(path)
     assert len(read) == 21
     assert read.truth is not None
     assert np.allclose(read.truth.time, [0.0, 0.05, 0.1, 0.15])
     assert np.allclose(read.truth.position_W[:, 0], [0, 5, 10, 15])
     none = [row.rsplit(",", 7)[0] + ",,,,,,," for row in rows]
-    assert read_generic_csv(written(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
+    assert read_generic_csv(write_lines(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
 
 
 GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
 
 
 @pytest.mark.parametrize(
-    ("lines", "told"),
+    ("lines", "message"),
     [
         (GOOD[1:], "line 1, header: found '0,0.1,0.2"),
         ([HEADER.replace("gz", "yaw"), *GOOD[1:]], "header: found no gz, expected t [s],gx"),
@@ -241,12 +241,12 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         ),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, lines: list[str], told: str) -> None:
-    path = written(tmp_path / "own.csv", *lines)
+def test_an_error_is_reported_in_one_line(tmp_path: Path, lines: list[str], message: str) -> None:
+    path = write_lines(tmp_path / "own.csv", *lines)
     with pytest.raises(ReadError) as caught:
         read_generic_csv(path)
     assert "own.csv" in str(caught.value)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -264,7 +264,7 @@ def test_separators_and_comments_above_the_header_are_recognised(
 ) -> None:
     lines = [line.replace(",", separator) for line in (*GOOD, f"0.03,{ROW[:-3]}")]
     lines[-1] += separator  # az is blank
-    path = written(tmp_path / f"walk{suffix}", "# left hand", "", "# again", *lines)
+    path = write_lines(tmp_path / f"walk{suffix}", "# left hand", "", "# again", *lines)
     assert find_recordings(path) == [path]
     read = read_recording(path)
     assert read.time.tolist() == [0.0, 0.01, 0.02, 0.03]
@@ -273,52 +273,54 @@ def test_separators_and_comments_above_the_header_are_recognised(
     assert np.allclose(read.accel[:3], [1.0, 2.0, 9.0])
 
 
-def test_rows_that_begin_and_end_with_blank_cells_stay_apart(tmp_path: Path) -> None:
+def test_rows_that_begin_and_end_with_blank_cells_stay_separate(tmp_path: Path) -> None:
     header = f"{TRUTH_HEADER},{HEADER},note"
     truths = ["1,2,3,0,0,0,1", ",,,,,,", " , , ,,,,", "4,5,6,0,0,0,1"]
     rows = [f"{truth},{0.01 * k:.2f},{ROW}," for k, truth in enumerate(truths)]
-    read = read_generic_csv(written(tmp_path / "both.csv", header, *rows))
+    read = read_generic_csv(write_lines(tmp_path / "both.csv", header, *rows))
     assert np.allclose(read.time, [0.0, 0.01, 0.02, 0.03])
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
     assert read.truth is not None
     assert read.truth.time.tolist() == [0.0, 0.03]
 
 
-def test_a_wild_time_does_not_cost_the_truth_behind_it(tmp_path: Path) -> None:
+def test_an_outlying_time_does_not_lose_the_truth_after_it(tmp_path: Path) -> None:
     rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
     truth = read_generic_csv(
-        written(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+        write_lines(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
     ).truth
     assert truth is not None
     assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize("names", ["x,y,z,qx,qy,qz,qw", "qx,qy,qz,qw", "pos_x_m,pos_y_m,pos_z_m"])
-def test_columns_like_truth_that_are_not_read_are_warned_of(
+def test_unread_columns_that_look_like_truth_give_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, names: str
 ) -> None:
     count = names.count(",") + 1
-    path = written(tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1))
+    path = write_lines(
+        tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1)
+    )
     assert read_generic_csv(path).truth is None
     (record,) = (r for r in caplog.records if r.levelno == logging.WARNING)
     assert f"no ground truth is read from {names.replace(',', ', ')}: " in record.getMessage()
 
 
-def test_a_unit_that_the_header_names_is_not_converted_once_more(tmp_path: Path) -> None:
+def test_a_unit_named_in_the_header_is_not_converted_again(tmp_path: Path) -> None:
     header = "t,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
-    read = read_generic_csv(written(tmp_path / "named.csv", header, *GOOD[1:]))
+    read = read_generic_csv(write_lines(tmp_path / "named.csv", header, *GOOD[1:]))
     for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
         with pytest.raises(InputError, match=r"for named, whose file names its unit, .*omit the"):
             with_units(read, **options)
     assert np.array_equal(with_units(read).gyro, read.gyro)
-    plain = read_generic_csv(written(tmp_path / "plain.csv", *GOOD))  # the owner knows better
+    plain = read_generic_csv(write_lines(tmp_path / "plain.csv", *GOOD))  # SI may be overridden
     assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))
 
 
 @pytest.mark.parametrize(
     ("every", "columns", "kind"), [(4.0, 2, "waypoints"), (0.5, 3, "positions")]
 )
-def test_positions_alone_are_kept_as_such(
+def test_positions_without_attitude_are_kept_as_such(
     tmp_path: Path, walk: ImuSequence, every: float, columns: int, kind: str
 ) -> None:
     time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)

@@ -1,4 +1,4 @@
-"""What cannot be read ends in one line that names file, field, found, expected."""
+"""Unreadable files raise a one-line error with file, field, found and expected."""
 
 import json
 import pickle
@@ -13,8 +13,8 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording
 
 
-def refused(path: Path, *told: str) -> None:
-    """Reading raises one line that names a file of the recording and holds every text."""
+def assert_refused(path: Path, *texts: str) -> None:
+    """Assert that reading raises a one-line error with the recording's folder and every text."""
     with pytest.raises(ReadError) as caught:
         read_recording(path)
     line = str(caught.value)
@@ -22,7 +22,7 @@ def refused(path: Path, *told: str) -> None:
     assert len(line) < 700
     assert str(path.parent) in line
     assert re.search(r": found .+, expected .+", line)
-    for text in told:
+    for text in texts:
         assert text in line, line
 
 
@@ -31,7 +31,7 @@ def csv_of(path: Path) -> Path:
 
 
 def change(path: Path, row: int, column: str, cell: str) -> None:
-    """Put a cell into a CSV, counted in rows below the header."""
+    """Replace a cell of a CSV file; rows are counted below the header."""
     lines = path.read_text().splitlines()
     cells = lines[row + 1].split(",")
     cells[lines[0].split(",").index(column)] = cell
@@ -46,42 +46,42 @@ def ronin(tmp_path, walks, formats) -> Path:
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-def test_a_truncated_hdf5(ronin, share) -> None:
+def test_a_truncated_hdf5_is_refused(ronin, share) -> None:
     content = (ronin / "data.hdf5").read_bytes()
     (ronin / "data.hdf5").write_bytes(content[: int(share * len(content))])
-    refused(ronin, "data.hdf5: file: found ", "expected HDF5")
+    assert_refused(ronin, "data.hdf5: file: found ", "expected HDF5")
     assert find_recordings(ronin) == [ronin]
 
 
-def test_an_hdf5_with_a_field_missing_or_of_another_length(ronin) -> None:
+def test_an_hdf5_with_a_missing_or_shorter_field_is_refused(ronin) -> None:
     import h5py
 
     with h5py.File(ronin / "data.hdf5", "a") as data:
         del data["synced/acce"]
-    refused(ronin, "data.hdf5: synced/acce: found no such field")
+    assert_refused(ronin, "data.hdf5: synced/acce: found no such field")
     with h5py.File(ronin / "data.hdf5", "a") as data:
         data["synced/acce"] = np.zeros((50, 3))
-    refused(ronin, "synced/acce: found shape (50, 3), expected (4001, 3)")
+    assert_refused(ronin, "synced/acce: found shape (50, 3), expected (4001, 3)")
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "message"),
     [
         ("synced/gyro_uncalib", np.nan, "row 17, synced/gyro_uncalib: found nan"),
         ("synced/game_rv", 0.0, "row 17, synced/game_rv: found norm 0, expected a unit quaternion"),
         ("synced/time", np.inf, "row 17, synced/time: found inf"),
     ],
 )
-def test_an_hdf5_with_a_bad_row(ronin, name, value, told) -> None:
+def test_an_hdf5_with_a_bad_row_is_refused(ronin, name, value, message) -> None:
     import h5py
 
     with h5py.File(ronin / "data.hdf5", "a") as data:
         data[name][17] = value
-    refused(ronin, told)
+    assert_refused(ronin, message)
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "told"),
+    ("field", "value", "message"),
     [
         ("imu_acce_scale", None, "info.json: imu_acce_scale: found no such field"),
         ("imu_init_gyro_bias", [1, 2], "imu_init_gyro_bias: found [1, 2], expected 3 finite"),
@@ -90,50 +90,52 @@ def test_an_hdf5_with_a_bad_row(ronin, name, value, told) -> None:
         ("grv_ori_error", "large", "grv_ori_error: found 'large', expected a finite number"),
     ],
 )
-def test_an_info_that_does_not_fit(ronin, field, value, told) -> None:
+def test_an_info_with_an_invalid_field_is_refused(ronin, field, value, message) -> None:
     info = json.loads((ronin / "info.json").read_text())
     info[field] = value
     (ronin / "info.json").write_text(json.dumps({k: v for k, v in info.items() if v is not None}))
-    refused(ronin, told)
+    assert_refused(ronin, message)
 
 
-def test_an_info_that_is_missing_or_no_json(ronin) -> None:
+def test_an_info_that_is_missing_or_not_json_is_refused(ronin) -> None:
     (ronin / "info.json").write_text("{")
-    refused(ronin, "info.json: file: found Expecting property name")
+    assert_refused(ronin, "info.json: file: found Expecting property name")
     (ronin / "info.json").write_text("[1]")
-    refused(ronin, "info.json: file: found list, expected a JSON object")
+    assert_refused(ronin, "info.json: file: found list, expected a JSON object")
     (ronin / "info.json").unlink()
-    refused(ronin, "info.json: file: found no such file")
+    assert_refused(ronin, "info.json: file: found no such file")
 
 
 @pytest.mark.parametrize(
     ("which", "quaternion", "missing"), [("ridi", "rv", "rv_w"), ("rnin", "gt_q", "vio_p_z")]
 )
-def test_a_csv_with_named_columns(tmp_path, walks, formats, which, quaternion, missing) -> None:
+def test_a_damaged_csv_with_named_columns_is_refused(
+    tmp_path, walks, formats, which, quaternion, missing
+) -> None:
     path = getattr(formats, which)(tmp_path / "seq", walks(200.0)).path
     csv = csv_of(path)
     good = csv.read_text()
     change(csv, 40, "acce_y", "nan")
-    refused(path, csv.name, "row 42, acce_y: found nan, expected finite numbers")
+    assert_refused(path, csv.name, "row 42, acce_y: found nan, expected finite numbers")
     csv.write_text(good)
     change(csv, 40, "acce_y", "")
-    refused(path, "row 42, acce_y: found nan")
+    assert_refused(path, "row 42, acce_y: found nan")
     csv.write_text(good)
     change(csv, 40, "acce_y", "high")
-    refused(path, "line 42, column ", "found 'high', expected a number")
+    assert_refused(path, "line 42, column ", "found 'high', expected a number")
     csv.write_text(good)
     for axis in "wxyz":
         change(csv, 40, f"{quaternion}_{axis}", "0.0")
-    refused(path, f"row 42, {quaternion}: found norm 0, expected a unit quaternion")
+    assert_refused(path, f"row 42, {quaternion}: found norm 0, expected a unit quaternion")
     csv.write_text(good[: int(0.7 * len(good))].rsplit(",", 4)[0])
-    refused(path, "values, expected", "cut short")
+    assert_refused(path, "values, expected", "cut short")
     csv.write_text(good.replace(f"{missing},", "other,", 1).replace(f",{missing}\n", ",other\n", 1))
-    refused(path, f"{csv.name}: header: found no {missing}")
+    assert_refused(path, f"{csv.name}: header: found no {missing}")
     csv.write_text(good.split("\n")[0] + "\n")
-    refused(path, "rows: found none below the header")
+    assert_refused(path, "rows: found none below the header")
 
 
-def test_pickles_are_refused_unopened(tmp_path, walks, formats) -> None:
+def test_pickles_are_refused_without_being_loaded(tmp_path, walks, formats) -> None:
     class Harm:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "harm",))
@@ -142,97 +144,97 @@ def test_pickles_are_refused_unopened(tmp_path, walks, formats) -> None:
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     (path / "processed/data.csv").unlink()
     (path / "processed/data.pkl").write_bytes(content)
-    refused(path, "data.pkl: file: found a pickle", "expected processed/data.csv")
+    assert_refused(path, "data.pkl: file: found a pickle", "expected processed/data.csv")
     assert find_recordings(path) == [path]
     (tmp_path / "walk.npy").write_bytes(content)
-    refused(tmp_path / "walk.npy", "walk.npy: content: found a pickle")
+    assert_refused(tmp_path / "walk.npy", "walk.npy: content: found a pickle")
     path = formats.tlio(tmp_path / "7", walks(200.0)).path
     np.save(path / "imu0_resampled.npy", np.array([Harm()], dtype=object))
-    refused(path, "imu0_resampled.npy: array: found pickled objects, which may run code")
+    assert_refused(path, "imu0_resampled.npy: array: found pickled objects, which may run code")
     assert not (tmp_path / "harm").exists()
 
 
-def test_an_npy_that_does_not_fit_its_description(tmp_path, walks, formats) -> None:
+def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks, formats) -> None:
     path = formats.tlio(tmp_path / "7", walks(200.0)).path
     file, description = path / "imu0_resampled.npy", path / "imu0_resampled_description.json"
     table, text = np.load(file), description.read_text()
-    for column, value, told in (
+    for column, value, message in (
         (4, np.nan, "row 9, array: found nan"),
         (slice(7, 11), 0.0, "row 9, qxyzw_World_Device: found norm 0"),
     ):
         bad = table.copy()
         bad[9, column] = value
         np.save(file, bad)
-        refused(path, told)
+        assert_refused(path, message)
     np.save(file, table[:, :10])
-    refused(path, "array: found shape (4001, 10), expected (N, 17)")
+    assert_refused(path, "array: found shape (4001, 10), expected (N, 17)")
     np.save(file, np.array(["a", "b"]))
-    refused(path, "array: found dtype <U1, expected numbers")
+    assert_refused(path, "array: found dtype <U1, expected numbers")
     np.save(file, table)
     file.write_bytes(file.read_bytes()[:3000])
-    refused(path, "imu0_resampled.npy: array: found ", "is the download complete?")
+    assert_refused(path, "imu0_resampled.npy: array: found ", "is the download complete?")
     np.save(file, table)
     description.write_text(text.replace("qxyzw_World_Device(4)", "quat(4)"))
-    refused(path, "description.json: columns_name(width): found no qxyzw_World_Device")
+    assert_refused(path, "description.json: columns_name(width): found no qxyzw_World_Device")
     description.write_text(text.replace("pos_World_Device(3)", "pos_World_Device"))
-    refused(path, "found 'pos_World_Device', expected a name with its width")
+    assert_refused(path, "found 'pos_World_Device', expected a name with its width")
     description.unlink()
-    refused(path, "imu0_resampled_description.json: file: found no such file")
+    assert_refused(path, "imu0_resampled_description.json: file: found no such file")
 
 
-def test_raw_samples_without_their_calibration(tmp_path, walks, formats) -> None:
+def test_raw_samples_without_a_valid_calibration_are_refused(tmp_path, walks, formats) -> None:
     path = formats.tlio_raw(tmp_path / "7", walks(1000.0)).path
     calibration = path.with_name("calibration.json")
     fields = json.loads(calibration.read_text())
     fields["Gyroscope"]["Model"]["RectificationMatrix"] = [[0.0] * 3] * 3
     calibration.write_text(json.dumps(fields))
-    refused(path, "Gyroscope.Model.RectificationMatrix: found a singular matrix")
+    assert_refused(path, "Gyroscope.Model.RectificationMatrix: found a singular matrix")
     calibration.unlink()
-    refused(path, "calibration.json: file: found no such file")
+    assert_refused(path, "calibration.json: file: found no such file")
 
 
-def test_a_bag_cut_short_or_with_bad_values(tmp_path, formats) -> None:
+def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path, formats) -> None:
     walk = formats.walk(100.0, 2.0)
     path = formats.bag(tmp_path / "b", walk)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    refused(path, "b.bag: file: found ", "expected an intact bag")
+    assert_refused(path, "b.bag: file: found ", "expected an intact bag")
     value = struct.pack("<d", walk.gyro[20, 1])
     path.write_bytes(whole.replace(value, struct.pack("<d", np.nan)))
-    refused(path, "row 20, /imu, values: found nan")
+    assert_refused(path, "row 20, /imu, values: found nan")
     quat = walk.truth.attitude_WB[20].as_quat()
     empty = formats.bag(tmp_path / "q", walk, imu_topics=("/imu",))
     content = empty.read_bytes().replace(struct.pack("<4d", *quat), struct.pack("<4d", 0, 0, 0, 0))
     empty.write_bytes(content)
-    refused(empty, "row 20, /odom, quaternion: found norm 0")
+    assert_refused(empty, "row 20, /odom, quaternion: found norm 0")
     folder = formats.bag(tmp_path / "two", walk, "sqlite3")
     database = next(folder.glob("*.db3"))
     database.write_bytes(database.read_bytes()[:5000])
-    refused(folder, "two: file: found ", "expected an intact bag")
+    assert_refused(folder, "two: file: found ", "expected an intact bag")
 
 
-def test_a_loggers_files_that_do_not_fit(tmp_path, walks, formats) -> None:
+def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks, formats) -> None:
     path = formats.android(tmp_path / "log", walks(200.0)).path
     gyro = path / "Gyroscope.csv"
     lines = gyro.read_text().splitlines()
     gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0], *lines[51:]]))
-    refused(path, "Gyroscope.csv: line 51: found 3 values, expected 5")
+    assert_refused(path, "Gyroscope.csv: line 51: found 3 values, expected 5")
     gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0]]))
-    assert len(read_recording(path)) == 49 - 15  # the app was killed; the other began later
+    assert len(read_recording(path)) == 49 - 15  # the app was killed; the accelerometer began later
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",nan", *lines[31:]]))
-    refused(path, "Gyroscope.csv: row 31, x, y, z: found nan")
+    assert_refused(path, "Gyroscope.csv: row 31, x, y, z: found nan")
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",1e15", *lines[31:]]))
-    refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected a plausible value in rad/s")
+    assert_refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected a plausible value in rad/s")
     gyro.write_text("\n".join(lines).replace(",x", ",x [rpm]", 1))
-    refused(path, "Gyroscope.csv: header: found unit 'rpm', expected rad/s, deg/s")
+    assert_refused(path, "Gyroscope.csv: header: found unit 'rpm', expected rad/s, deg/s")
     gyro.unlink()
-    refused(path, "sensors: found only accel and mag, expected a gyroscope")
+    assert_refused(path, "sensors: found only accel and mag, expected a gyroscope")
     with pytest.raises(ReadError, match=r"files: found Accelerometer\.csv, .*, expected a gyrosc"):
         read_recording(path, format="phone")
 
 
 @pytest.mark.parametrize("name", list(FORMATS))
-def test_every_reader_refuses_what_is_nothing_of_its_own(tmp_path, name) -> None:
+def test_every_reader_refuses_what_is_not_its_own_format(tmp_path, name) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "text.csv").write_text("hello\n")
     (tmp_path / "bytes.bin").write_bytes(bytes(range(256)) * 10)

@@ -19,7 +19,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 
 START_NS = 1520531124153717567
-"""A start that float64 cannot hold: it is off by up to 128 ns there."""
+"""A start time that float64 cannot represent: its rounding error is up to 128 ns."""
 
 EUROC_IMU = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -67,7 +67,7 @@ def stamps(time: FloatArray) -> list[str]:
 def write_euroc(
     folder: Path, imu: ImuSequence, velocity: bool, keep: BoolArray | None = None
 ) -> None:
-    """EuRoC's files (with velocity) or TUM-VI's, truth at 100 Hz from 2 s on to 3 s before end."""
+    """Write EuRoC (with velocity) or TUM-VI; truth at 100 Hz without the first 2 s and last 3 s."""
     rows = text_rows(stamps(imu.time), np.hstack([imu.gyro, imu.accel]))
     write_rows(folder / "mav0/imu0/data.csv", EUROC_IMU, rows)
     truth = true_track(imu)
@@ -86,7 +86,7 @@ def write_euroc(
 def write_oxiod(
     folder: Path, imu: ImuSequence, lag_rows: int = 3, flip_row: int | None = None
 ) -> Path:
-    """OxIOD's files: Apple's signs, a mounted and lagging tracked body, a world off level."""
+    """Write OxIOD files: Apple's signs, a mounted and lagging tracked body, a tilted world."""
     truth = true_track(imu)
     force = imu.accel / -9.81
     gravity = truth.attitude_WB.apply([0.0, 0.0, -1.0], inverse=True)
@@ -109,7 +109,7 @@ def write_oxiod(
 
 
 @pytest.mark.parametrize("velocity", [True, False], ids=["euroc", "tumvi"])
-def test_euroc_and_tumvi_come_back(tmp_path: Path, walk: ImuSequence, velocity: bool) -> None:
+def test_euroc_and_tumvi_are_read_back(tmp_path: Path, walk: ImuSequence, velocity: bool) -> None:
     write_euroc(tmp_path / "room", walk, velocity)
     read = read_recording(tmp_path / "room")
     truth, given = true_track(read), true_track(walk)
@@ -126,7 +126,7 @@ def test_euroc_and_tumvi_come_back(tmp_path: Path, walk: ImuSequence, velocity: 
         assert np.abs(truth.velocity_W - given.velocity_W[400:-600:2]).max() < 1e-6
 
 
-def test_euroc_is_found_by_folder_mav_and_file(tmp_path: Path, walk: ImuSequence) -> None:
+def test_euroc_is_found_by_folder_mav0_and_file(tmp_path: Path, walk: ImuSequence) -> None:
     write_euroc(tmp_path / "room", walk, velocity=False)
     for inner in ("", "mav0", "mav0/imu0/data.csv"):
         read = read_recording(tmp_path / "room" / inner)
@@ -134,7 +134,7 @@ def test_euroc_is_found_by_folder_mav_and_file(tmp_path: Path, walk: ImuSequence
         assert read.truth is not None
 
 
-def test_a_gap_of_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_gap_in_the_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> None:
     keep = np.ones(len(walk.time[400:-600:2]), dtype=np.bool_)
     keep[1000:1500] = False
     write_euroc(tmp_path, walk, velocity=False, keep=keep)
@@ -146,13 +146,13 @@ def test_a_gap_of_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> None:
     assert pose.valid[~lost & (walk.time > 2.001) & (walk.time < walk.time[-604])].all()
 
 
-def test_truth_that_is_not_the_imus_pose_is_left_alone(tmp_path: Path, walk: ImuSequence) -> None:
+def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path: Path, walk: ImuSequence) -> None:
     write_euroc(tmp_path, walk, velocity=False)
     (tmp_path / "mav0/mocap0").rename(tmp_path / "mav0/vicon0")
     assert read_euroc(tmp_path).truth is None
 
 
-def test_a_sample_that_is_no_number_is_kept_for_the_health_report(
+def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(
     tmp_path: Path, walk: ImuSequence
 ) -> None:
     write_euroc(tmp_path, walk, velocity=False)
@@ -177,41 +177,39 @@ def test_oxiod_returns_the_imus_pose_in_a_level_world(
     assert np.abs(read.gyro - phone_walk.gyro).max() < 1e-9
     assert np.abs(read.accel - phone_walk.accel).max() < 1e-8
     assert truth.time[0] - read.time[0] == pytest.approx(0.03, abs=0.002)
-    held_against(truth, phone_walk)
+    assert_matches(truth, phone_walk)
     assert not truth.valid[700:705].any()
     assert not truth.valid[900:904].any()
     assert truth.valid.mean() > 0.97
 
 
-def held_against(truth: Trajectory, walk: ImuSequence) -> None:
-    """What is read is the walk, but for a yaw of the world that levelling leaves open."""
+def assert_matches(truth: Trajectory, walk: ImuSequence) -> None:
+    """Assert that the truth is the walk's, except for a yaw of the world that levelling allows."""
     given, pose = true_track(walk), truth.at(walk.time)
-    off = (given.attitude_WB * pose.attitude_WB.inv())[pose.valid]
-    world = off.mean()
+    error = (given.attitude_WB * pose.attitude_WB.inv())[pose.valid]
+    world = error.mean()
     assert np.hypot(*world.as_rotvec()[:2]) < np.radians(0.5)
     assert abs(world.as_rotvec()[2]) < np.radians(0.5)
-    assert np.degrees((world.inv() * off).magnitude()).max() < 2.0
+    assert np.degrees((world.inv() * error).magnitude()).max() < 2.0
     distance = np.linalg.norm(world.apply(pose.position_W) - given.position_W, axis=1)
     assert distance[pose.valid].max() < 0.1
 
 
-def test_oxiod_a_flip_of_the_tracked_body_is_undone(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path: Path, phone_walk: ImuSequence) -> None:
     truth = true_track(read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)))
     assert truth.valid[3100:-20].mean() > 0.95
-    held_against(truth, phone_walk)
+    assert_matches(truth, phone_walk)
 
 
-def test_oxiod_without_truth(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_without_a_capture_file_has_no_truth(tmp_path: Path, phone_walk: ImuSequence) -> None:
     imu = write_oxiod(tmp_path, phone_walk)
     (tmp_path / "syn/vi1.csv").unlink()
     assert read_recording(imu).truth is None
     renamed = imu.rename(tmp_path / "phone.csv")
-    assert read_recording(renamed).truth is None  # no file is taken for its own truth
+    assert read_recording(renamed).truth is None  # a file is not taken as its own truth
 
 
-def test_oxiod_holes_in_the_imu_do_not_reach_the_truth(
+def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
     tmp_path: Path, phone_walk: ImuSequence
 ) -> None:
     imu = write_oxiod(tmp_path, phone_walk)
@@ -220,11 +218,11 @@ def test_oxiod_holes_in_the_imu_do_not_reach_the_truth(
     imu.write_text("\n".join(lines))
     read = read_oxiod(imu)
     assert np.isnan(read.gyro[2000]).all()
-    held_against(true_track(read), phone_walk)
+    assert_matches(true_track(read), phone_walk)
 
 
 @pytest.mark.parametrize("rows", [1, 20, 500])
-def test_oxiod_too_short_for_its_mount_has_no_truth(
+def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
     tmp_path: Path, phone_walk: ImuSequence, rows: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     imu = write_oxiod(tmp_path, phone_walk)
@@ -237,7 +235,9 @@ def test_oxiod_too_short_for_its_mount_has_no_truth(
     assert "to find the mount" in caplog.text
 
 
-def test_oxiod_needs_as_many_rows_of_truth(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_requires_as_many_truth_rows_as_imu_rows(
+    tmp_path: Path, phone_walk: ImuSequence
+) -> None:
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     vicon.write_text("\n".join(vicon.read_text().splitlines()[:-100]))
@@ -246,7 +246,7 @@ def test_oxiod_needs_as_many_rows_of_truth(tmp_path: Path, phone_walk: ImuSequen
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("corrupt", "message"),
     [
         (lambda lines: [*lines[:50], lines[50][:40]], "line 51: found 3 values, expected 7"),
         (lambda lines: [row.rsplit(",", 1)[0] for row in lines], "line 2: found 6 values"),
@@ -261,20 +261,20 @@ def test_oxiod_needs_as_many_rows_of_truth(tmp_path: Path, phone_walk: ImuSequen
 def test_malformed_files_are_named_in_one_line(
     tmp_path: Path,
     walk: ImuSequence,
-    spoil: Callable[[list[str]], list[str]],
-    told: str,
+    corrupt: Callable[[list[str]], list[str]],
+    message: str,
 ) -> None:
     write_euroc(tmp_path, walk, velocity=False)
     imu = tmp_path / "mav0/imu0/data.csv"
-    imu.write_text("\n".join(spoil(imu.read_text().splitlines())))
+    imu.write_text("\n".join(corrupt(imu.read_text().splitlines())))
     with pytest.raises(ReadError) as caught:
         read_recording(tmp_path)
     assert "imu0/data.csv" in str(caught.value)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_recognition_is_by_content(
+def test_formats_are_recognised_by_content(
     tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
 ) -> None:
     write_csv(tmp_path / "imu7.csv", walk.without_truth())  # named like OxIOD's
@@ -285,7 +285,7 @@ def test_recognition_is_by_content(
         read_recording(oxiod, format="csv")
 
 
-def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
+def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None:
     path = tmp_path / "imu.csv"
     for text, seen in (
         ("0.0,1,2,3,4,5,6\n", "0.0,1,2,3,4,5,6"),
@@ -308,7 +308,7 @@ def test_what_is_unknown_is_shown_beside_what_is_known(tmp_path: Path) -> None:
         read_recording(path, format="bags")
 
 
-def test_find_walks_through_folders_in_order(
+def test_find_recordings_searches_folders_in_order(
     tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
 ) -> None:
     imu = write_oxiod(tmp_path / "b/data1", phone_walk)
@@ -331,7 +331,7 @@ def test_find_walks_through_folders_in_order(
 
 
 RECORDED = [
-    ("tumvi/dataset-room3_512_16", 0.95, 1.0),  # an accelerometer's bias turns up as tilt here
+    ("tumvi/dataset-room3_512_16", 0.95, 1.0),  # an accelerometer bias appears as tilt here
     ("euroc/V1_02_medium", 0.95, 1.0),
 ]
 
@@ -339,7 +339,7 @@ RECORDED = [
 @needs_data
 @pytest.mark.parametrize(("name", "least", "tilt_deg"), RECORDED)
 def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_deg: float) -> None:
-    """The gyroscope is the derivative of the attitude, and force averages to gravity, up."""
+    """The gyroscope is the derivative of the attitude; the mean force is gravity, pointing up."""
     sequence = read_recording(DATA / name)
     truth = true_track(sequence)
     inside = (sequence.time >= truth.time[0]) & (sequence.time <= truth.time[-1])
@@ -364,8 +364,8 @@ def test_every_recording_is_found() -> None:
     assert len(find_recordings(DATA / "archives")) == 1149
 
 
-def test_a_text_file_with_rows_of_numbers_is_no_list(tmp_path: Path) -> None:
-    """Whatever its header and separator are: each row would be a recording that is not there."""
+def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
+    """Whatever its header and separator: each row would name a recording that does not exist."""
     path = tmp_path / "samples.txt"
     for mark in ",;\t ":
         rows = [mark.join(["0.0", "1", "2"]), mark.join(["0.1", "1", "2"])]

@@ -1,4 +1,4 @@
-"""What a format leaves open: sources of attitude, orders of quaternions, frames, topics, clocks."""
+"""What a format leaves open: attitude sources, quaternion orders, frames, topics, clocks."""
 
 import dataclasses
 import json
@@ -14,12 +14,12 @@ from stario.sequences.readers.bag import read_bag
 from stario.sequences.units import with_units
 
 
-def angle(a: Rotation, b: Rotation) -> float:
+def max_angle(a: Rotation, b: Rotation) -> float:
     return float((a.inv() * b).magnitude().max())
 
 
-def shape(attitude: Rotation) -> Rotation:
-    """An attitude but for what its first sample is."""
+def relative_to_first(attitude: Rotation) -> Rotation:
+    """Attitude relative to its first sample."""
     return attitude[0].inv() * attitude
 
 
@@ -32,7 +32,7 @@ def shape(attitude: Rotation) -> Rotation:
         ({"grv_ori_error": 25.0, "ekf_ori_error": 30.0, "gyro_integration_error": 10.0}, "gyro"),
     ],
 )
-def test_ronin_takes_the_attitude_that_its_authors_take(
+def test_ronin_uses_the_attitude_source_that_its_authors_use(
     tmp_path, walks, formats, errors, source
 ) -> None:
     walk = walks(200.0)
@@ -43,59 +43,59 @@ def test_ronin_takes_the_attitude_that_its_authors_take(
         drift = Rotation.from_rotvec(np.outer(walk.time, [0.0, 0.0, 0.01]))
         true = drift * true
     limit = 2e-3 if source == "gyro" else 1e-6
-    assert angle(attitude, true[100:]) < limit
+    assert max_angle(attitude, true[100:]) < limit
     if source == "gyro":
-        assert angle(shape(attitude), shape(true[100:])) > 1e-9
+        assert max_angle(relative_to_first(attitude), relative_to_first(true[100:])) > 1e-9
 
 
-def test_ronin_without_an_ekf_does_with_the_others(tmp_path, walks, formats) -> None:
+def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks, formats) -> None:
     h5py = pytest.importorskip("h5py")
     recording = formats.ronin(tmp_path / "a", walks(200.0), grv_ori_error=30.0)
     with h5py.File(recording.path / "data.hdf5", "a") as data:
         del data["pose/ekf_ori"]
     read = read_recording(recording.path / "data.hdf5")
-    assert angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
+    assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
 
 
-def test_rnin_without_motion_capture_takes_the_odometry(tmp_path, walks, formats) -> None:
+def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks, formats) -> None:
     recording = formats.rnin(tmp_path, walks(200.0), captured=False)
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
     assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
-    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+    assert max_angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
     csv = recording.path / "SenseINS.csv"
     csv.write_text(csv.read_text().replace("times,", "time,", 1))
     assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
 
 
-def test_tlio_trusts_the_name_of_the_quaternion(tmp_path, walks, formats) -> None:
+def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks, formats) -> None:
     recording = formats.tlio(tmp_path / "7", walks(200.0), order="wxyz")
     read = read_recording(recording.path)
-    assert angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 1e-6
+    assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 1e-6
     assert np.abs(read.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_tlio_raw_is_posed_in_the_imus_axes(tmp_path, walks, formats) -> None:
-    """Where the pose is a device's, the calibration turns it; where it is the IMU's it does not."""
+def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks, formats) -> None:
+    """The calibration rotates a pose of the device, but not a pose of the IMU."""
     R_DI = Rotation.from_euler("zyx", [90.0, 10.0, -170.0], degrees=True)
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0), R_DI)
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
     assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
-    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+    assert max_angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
     (recording.path.parent / "imu0_resampled.npy").unlink()
     alone = read_recording(recording.path.parent)
     assert alone.truth is None
     assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_raw_poses_of_a_world_with_z_up_stay(tmp_path, walks, formats) -> None:
-    """RIDI's raw folders have IMUNet's files, from a Tango."""
+def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks, formats) -> None:
+    """RIDI's raw folders contain IMUNet's files, from a Tango."""
     recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
     assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
-    assert angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
+    assert max_angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
 
 
-def test_a_processed_recording_is_preferred_to_the_raw_files_beside_it(
+def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(
     tmp_path, walks, formats
 ) -> None:
     walk = walks(200.0)
@@ -116,16 +116,16 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_beside_it(
         "nav_msgs/msg/Odometry",
     ],
 )
-def test_each_kind_of_pose_is_truth(tmp_path, formats, version, kind) -> None:
+def test_each_type_of_pose_message_is_read_as_truth(tmp_path, formats, version, kind) -> None:
     walk = formats.walk(100.0, 3.0)
     path = formats.bag(tmp_path / "b", walk, version, pose_topics=(("/pose", kind),))
     read = read_recording(path)
     assert np.abs(read.truth.position_W - walk.truth.position_W).max() < 1e-9
-    assert angle(read.truth.attitude_WB, walk.truth.attitude_WB) < 1e-9
+    assert max_angle(read.truth.attitude_WB, walk.truth.attitude_WB) < 1e-9
     assert np.abs(read.truth.time - walk.time).max() < 2e-9
 
 
-def test_several_topics_are_named_with_the_option_that_chooses(tmp_path, formats) -> None:
+def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path, formats) -> None:
     walk = formats.walk(100.0, 3.0)
     kind = "geometry_msgs/msg/PoseStamped"
     path = formats.bag(
@@ -147,7 +147,7 @@ def test_several_topics_are_named_with_the_option_that_chooses(tmp_path, formats
         read_recording(tmp_path / "a.csv", imu_topic="/imu")
 
 
-def test_a_bag_without_an_imu_shows_what_it_has(tmp_path, formats) -> None:
+def test_a_bag_without_an_imu_is_refused_with_its_topics(tmp_path, formats) -> None:
     path = formats.bag(tmp_path / "b", formats.walk(100.0, 1.0), imu_topics=())
     with pytest.raises(
         ReadError, match=r"found /odom \(Odometry\), /mag .*, expected one topic with sens"
@@ -155,27 +155,27 @@ def test_a_bag_without_an_imu_shows_what_it_has(tmp_path, formats) -> None:
         read_recording(path)
 
 
-def phone_files(folder, accel: str, gyro: str, names=("accel.csv", "gyro.csv")) -> None:
+def write_phone_files(folder, accel: str, gyro: str, names=("accel.csv", "gyro.csv")) -> None:
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, (accel, gyro), strict=True):
         (folder / name).write_text(text)
 
 
-def rows(time, values, joint=",", last=False) -> str:
+def rows(time, values, sep=",", last=False) -> str:
     return "\n".join(
-        joint.join(map(repr, [*v, t] if last else [t, *v]))
+        sep.join(map(repr, [*v, t] if last else [t, *v]))
         for t, v in zip(time.tolist(), values.tolist(), strict=True)
     )
 
 
-def test_loggers_of_several_habits(tmp_path, formats) -> None:
-    """Seconds with units in a header; milliseconds without any; the time behind the values."""
+def test_loggers_with_different_conventions_are_read(tmp_path, formats) -> None:
+    """Seconds with units in a header; milliseconds without any; the time after the values."""
     walk = formats.walk(200.0, 5.0)
     t, gyro, accel = walk.time, walk.gyro, walk.accel
     header = '"Time (s)","Gyroscope x (deg/s)","Gyroscope y (deg/s)","Gyroscope z (deg/s)"\n'
     g_header = "timestamp [s];ax [g];ay [g];az [g]\n"
     blanks = "# a logger\n"
-    habits = {
+    conventions = {
         "phyphox": (
             g_header + rows(t, accel / 9.80665, ";"), header + rows(t, np.degrees(gyro)),
         ),
@@ -183,17 +183,17 @@ def test_loggers_of_several_habits(tmp_path, formats) -> None:
         "behind": (rows(t, accel, last=True), rows(t, gyro, last=True)),
         "blanks": (blanks + rows(1e6 * t, accel, " "), blanks + rows(1e6 * t, gyro, " ")),
     }  # fmt: skip
-    for name, (accel_text, gyro_text) in habits.items():
-        phone_files(tmp_path / name, accel_text, gyro_text)
+    for name, (accel_text, gyro_text) in conventions.items():
+        write_phone_files(tmp_path / name, accel_text, gyro_text)
         read = read_recording(tmp_path / name)
         assert np.abs(read.gyro - gyro).max() < 1e-9, name
         assert np.abs(read.accel - accel).max() < 1e-6, name
         assert np.abs(read.time - t).max() < 1e-7, name
-    assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(habits)]
+    assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(conventions)]
 
 
-def sessions(folder, formats, *names: str) -> None:
-    """Files of samples; an accelerometer's where the name says so."""
+def write_sensor_files(folder, formats, *names: str) -> None:
+    """Write files of gyroscope samples, or of the accelerometer's if the name contains "acc"."""
     walk = formats.walk(100.0, 3.0)
     folder.mkdir()
     for name in names:
@@ -202,7 +202,7 @@ def sessions(folder, formats, *names: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "message"),
     [
         (
             ("walk1_acc.csv", "walk1_gyr.csv", "walk2_acc.csv", "walk2_gyr.csv"),
@@ -211,14 +211,16 @@ def sessions(folder, formats, *names: str) -> None:
         (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"a folder with acc_1\.csv, acc_2\.csv, gyr_3"),
     ],
 )
-def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names, told) -> None:
-    sessions(tmp_path / "s", formats, *names)
-    with pytest.raises(ReadError, match=told):
+def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names, message) -> None:
+    write_sensor_files(tmp_path / "s", formats, *names)
+    with pytest.raises(ReadError, match=message):
         read_recording(tmp_path / "s")
 
 
-def test_prefixed_files_of_two_recordings_are_two(tmp_path, formats) -> None:
-    sessions(tmp_path / "s", formats, "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv")
+def test_files_with_two_prefixes_are_two_recordings(tmp_path, formats) -> None:
+    write_sensor_files(
+        tmp_path / "s", formats, "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv"
+    )
     (tmp_path / "s/Two_gyr.csv").write_text(rows(np.arange(99) / 100.0, np.ones((99, 3))))
     found = find_recordings(tmp_path)
     assert found == [tmp_path / "s/Two_gyr.csv", tmp_path / "s/one_gyr.csv"]
@@ -229,29 +231,29 @@ def test_prefixed_files_of_two_recordings_are_two(tmp_path, formats) -> None:
 
 
 def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path, formats) -> None:
-    sessions(tmp_path / "s", formats, "watch_acc.csv", "watch_gyr.csv")
+    write_sensor_files(tmp_path / "s", formats, "watch_acc.csv", "watch_gyr.csv")
     expected = read_recording(tmp_path / "s")
     (tmp_path / "s/phone_acc.csv").write_text(rows(expected.time, 2.0 * expected.accel))
     assert np.array_equal(read_recording(tmp_path / "s").accel, expected.accel)
 
 
-def test_one_recordings_variants_are_no_other_recordings(tmp_path, formats) -> None:
-    """What loggers write beside the raw sensors; and names that differ by more than the sensor."""
+def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path, formats) -> None:
+    """Files written alongside the raw sensors; names that differ by more than the sensor."""
     names = ("Accelerometer.csv", "Gyroscope.csv")
-    beside = ("AccelerometerUncalibrated.csv", "GyroscopeUncalibrated.csv", "Gravity.csv")
-    sessions(tmp_path / "s", formats, *names, *beside)
-    sessions(tmp_path / "t", formats, "acc_12-00-01.csv", "gyr_12-00-02.csv")
-    assert alike(read_recording(tmp_path / "s"), read_recording(tmp_path / "t"))
+    variants = ("AccelerometerUncalibrated.csv", "GyroscopeUncalibrated.csv", "Gravity.csv")
+    write_sensor_files(tmp_path / "s", formats, *names, *variants)
+    write_sensor_files(tmp_path / "t", formats, "acc_12-00-01.csv", "gyr_12-00-02.csv")
+    assert same_samples(read_recording(tmp_path / "s"), read_recording(tmp_path / "t"))
     uncalibrated = tmp_path / "s/AccelerometerUncalibrated.csv"
     uncalibrated.write_text(rows(np.arange(9) / 100.0, np.ones((9, 3))))
     assert len(read_recording(tmp_path / "s")) == len(read_recording(tmp_path / "t"))
 
 
 @pytest.mark.parametrize("above", ["", "\n", "Device: Pixel\n\n", "# a\n\n# b\n"])
-def test_whatever_stands_above_a_loggers_header(tmp_path, formats, above) -> None:
+def test_any_text_above_a_loggers_header_is_skipped(tmp_path, formats, above) -> None:
     walk = formats.walk(100.0, 3.0)
     head = f"{above}time,x,y,z\n"
-    phone_files(
+    write_phone_files(
         tmp_path / "s", head + rows(walk.time, walk.accel), head + rows(walk.time, walk.gyro)
     )
     assert np.array_equal(read_recording(tmp_path / "s").gyro, walk.gyro)
@@ -259,14 +261,14 @@ def test_whatever_stands_above_a_loggers_header(tmp_path, formats, above) -> Non
 
 @pytest.mark.parametrize("rate", [50.0, 1000.0, 1125.0])
 @pytest.mark.parametrize("start", [0.0, 12345.678])
-def test_every_accepted_rate_tells_its_unit(tmp_path, formats, rate, start) -> None:
+def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, formats, rate, start) -> None:
     walk = formats.walk(rate, 2.0)
     t = np.round(start + walk.time, 6)
-    phone_files(tmp_path / "s", rows(t, walk.accel), rows(t, walk.gyro))
+    write_phone_files(tmp_path / "s", rows(t, walk.accel), rows(t, walk.gyro))
     assert read_recording(tmp_path / "s").rate == pytest.approx(rate, rel=1e-3)
 
 
-def test_units_that_a_logger_names_are_believed_or_refused(tmp_path, formats) -> None:
+def test_units_named_by_a_logger_are_used_or_refused(tmp_path, formats) -> None:
     walk = formats.walk(100.0, 3.0)
 
     def read(time: str, gyro: str):
@@ -274,7 +276,7 @@ def test_units_that_a_logger_names_are_believed_or_refused(tmp_path, formats) ->
             f"time [{time}],x [{unit}],y,z\n" + rows(1e3 * walk.time, values)
             for unit, values in (("m/s^2", walk.accel), (gyro, np.degrees(walk.gyro)))
         ]
-        phone_files(tmp_path / "s", *texts)
+        write_phone_files(tmp_path / "s", *texts)
         return read_recording(tmp_path / "s")
 
     named = read("milliseconds", "deg/s")
@@ -286,39 +288,41 @@ def test_units_that_a_logger_names_are_believed_or_refused(tmp_path, formats) ->
         read("ticks", "deg/s")
 
 
-def test_files_that_hold_both_sensors_are_no_loggers(tmp_path, walks) -> None:
+def test_files_with_both_sensors_are_separate_recordings(tmp_path, walks) -> None:
     write_csv(tmp_path / "accel_gyro_1.csv", walks(200.0))
     write_csv(tmp_path / "accel_gyro_2.csv", walks(200.0))
     assert len(find_recordings(tmp_path)) == 2
 
 
-def test_a_loggers_gravity_is_added_where_it_was_removed(tmp_path, formats) -> None:
+def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path, formats) -> None:
     walk = formats.walk(100.0, 5.0)
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
-    phone_files(tmp_path / "s", rows(walk.time, walk.accel - gravity), rows(walk.time, walk.gyro))
+    write_phone_files(
+        tmp_path / "s", rows(walk.time, walk.accel - gravity), rows(walk.time, walk.gyro)
+    )
     assert np.abs(read_recording(tmp_path / "s").accel).mean() < 3.0
     (tmp_path / "s/Gravity.csv").write_text(rows(walk.time, gravity))
     assert np.abs(read_recording(tmp_path / "s").accel - walk.accel).max() < 1e-9
 
 
-def test_clocks_of_other_phase_are_interpolated_but_not_across_a_gap(tmp_path, formats) -> None:
+def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(tmp_path, formats) -> None:
     walk = formats.walk(200.0, 10.0)
     t = walk.time
     accel_time = np.delete(t[:-1] + 0.0017, np.arange(800, 1000))
     force = np.stack([np.interp(accel_time, t, walk.accel[:, k]) for k in range(3)], axis=1)
-    phone_files(tmp_path / "s", rows(accel_time, force), rows(t, walk.gyro))
+    write_phone_files(tmp_path / "s", rows(accel_time, force), rows(t, walk.gyro))
     read = read_recording(tmp_path / "s")
     assert len(read) == len(t) - 2 - 201
     assert np.diff(read.time).max() == pytest.approx(1.01, abs=1e-6)
     kept = np.searchsorted(t, read.time + t[1] - 1e-6)
     assert np.array_equal(read.gyro, walk.gyro[kept])
     assert np.abs(read.accel - walk.accel[kept]).max() < 0.3
-    phone_files(tmp_path / "late", rows(t + 100.0, walk.accel), rows(t, walk.gyro))
+    write_phone_files(tmp_path / "late", rows(t + 100.0, walk.accel), rows(t, walk.gyro))
     with pytest.raises(ReadError, match=r"gyroscope from 0.000 to 10.000 s, accelerometer from 1"):
         read_recording(tmp_path / "late")
 
 
-def alike(a, b) -> bool:
+def same_samples(a, b) -> bool:
     arrays = [(x.time, x.gyro, x.accel) for x in (a, b)]
     if (a.truth is None) != (b.truth is None):
         return False
@@ -327,7 +331,7 @@ def alike(a, b) -> bool:
     return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
 
 
-def test_large_files_are_read_alike_with_and_without_pandas(
+def test_large_files_are_read_equally_with_and_without_pandas(
     tmp_path, walks, formats, monkeypatch
 ) -> None:
     pytest.importorskip("pandas")
@@ -345,14 +349,12 @@ def test_large_files_are_read_alike_with_and_without_pandas(
         careful = read_recording(path)
         with monkeypatch.context() as small:
             small.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
-            assert alike(read_recording(path), careful), path
+            assert same_samples(read_recording(path), careful), path
             small.setitem(sys.modules, "pandas", None)
-            assert alike(read_recording(path), careful), path
+            assert same_samples(read_recording(path), careful), path
 
 
-def test_what_is_odd_in_a_large_file_is_named_all_the_same(
-    tmp_path, walks, formats, monkeypatch
-) -> None:
+def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, formats, monkeypatch) -> None:
     monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     csv = path / "processed/data.csv"
@@ -372,7 +374,7 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, formats, mon
         read_recording(recording.path)
 
 
-def test_calibration_is_as_the_authors_filter_applies_it(tmp_path, walks, formats) -> None:
+def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks, formats) -> None:
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0))
     calibration = recording.path.with_name("calibration.json")
     fields = json.loads(calibration.read_text())

@@ -33,7 +33,7 @@ def standing(duration: float, rate: float = 1.0) -> Trajectory:
 
 
 def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
-    """Pose at every fourth sample from the first truth and the samples alone, by Simpson's rule."""
+    """Pose at every fourth sample from the first true pose and the samples, by Simpson's rule."""
     truth = imu.truth
     assert truth is not None
     assert truth.velocity_W is not None
@@ -136,7 +136,7 @@ def test_turn_on_bias_scale_and_misalignment_have_their_deviations() -> None:
     assert np.allclose(np.linalg.norm(rows, axis=1), STANDARD_GRAVITY)
 
 
-def test_saturation_clips() -> None:
+def test_saturation_clips_the_samples() -> None:
     free = simulate_imu(waving(), errors=PERFECT_IMU)
     errors = ImuErrors(noise=PERFECT_IMU.noise, gyro_range=1.0, accel_range=9.0)
     clipped = simulate_imu(waving(), errors=errors)
@@ -152,7 +152,7 @@ def test_a_seed_reproduces_and_another_differs() -> None:
     assert not np.array_equal(first.gyro, other.gyro)
 
 
-def test_presets_are_ordered() -> None:
+def test_presets_are_ordered_by_their_errors() -> None:
     true = simulate_imu(waving(), errors=PERFECT_IMU)
     off = [np.abs(simulate_imu(waving(), errors=e).gyro - true.gyro).mean() for e in (
         GOOD_IMU, PHONE_IMU)]  # fmt: skip
@@ -160,14 +160,14 @@ def test_presets_are_ordered() -> None:
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 333.0])
-def test_samples_cover_the_track_at_the_rate(rate: float) -> None:
+def test_samples_cover_the_track_at_the_given_rate(rate: float) -> None:
     imu = simulate_imu(waving(duration=7.0), rate=rate)
     assert imu.rate == pytest.approx(rate)
     assert imu.time[0] == 0.0
     assert 7.0 - 1.0 / rate < imu.time[-1] <= 7.0
 
 
-def test_gaps_short_ones_are_bridged_long_ones_refused() -> None:
+def test_short_gaps_are_bridged_and_long_ones_refused() -> None:
     track = waving()
     valid = np.ones(len(track), dtype=bool)
     valid[500:505] = False
@@ -181,16 +181,16 @@ def test_gaps_short_ones_are_bridged_long_ones_refused() -> None:
         simulate_imu(Trajectory(track.time, bad, track.attitude_WB, valid=valid))
 
 
-def test_poses_that_are_missing_are_a_gap_like_those_marked() -> None:
-    """What a spline makes of 5 s without poses is neither a walk nor a truth."""
+def test_missing_poses_are_a_gap_like_invalid_ones() -> None:
+    """A spline across 5 s without poses is neither a walk nor ground truth."""
     track = waving()
     kept = (track.time < 10.0) | (track.time > 15.0)
-    holed = Trajectory(track.time[kept], track.position_W[kept], track.attitude_WB[kept])
+    gappy = Trajectory(track.time[kept], track.position_W[kept], track.attitude_WB[kept])
     with pytest.raises(InputError, match=r"no valid pose for 5\.020 s after 9\.990 s"):
-        simulate_imu(holed)
+        simulate_imu(gappy)
 
 
-def test_what_cannot_be_simulated_is_refused() -> None:
+def test_tracks_and_parameters_that_cannot_be_simulated_are_refused() -> None:
     with pytest.raises(InputError, match="at least 6"):
         simulate_imu(standing(4.0))
     with pytest.raises(InputError, match="rate"):

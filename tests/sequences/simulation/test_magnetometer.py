@@ -1,4 +1,4 @@
-"""A simulated magnetometer obeys what a real one does."""
+"""The simulated magnetometer behaves like a real one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def in_world(walk: ImuSequence, magnetic_field: MagneticField) -> FloatArray:
     return np.asarray(at.attitude_WB.apply(seen.field))
 
 
-def test_the_earths_field_stands_still_in_the_world(walk: ImuSequence) -> None:
+def test_the_earths_field_is_constant_in_the_world(walk: ImuSequence) -> None:
     field_W = in_world(walk, replace(QUIET, azimuth=0.7))
     np.testing.assert_allclose(np.linalg.norm(field_W, axis=1), 48.0)
     np.testing.assert_allclose(np.ptp(field_W, axis=0), 0.0, atol=1e-9)
@@ -40,7 +40,7 @@ def test_the_earths_field_stands_still_in_the_world(walk: ImuSequence) -> None:
     assert field_W[0, 2] == pytest.approx(-48.0 * math.sin(QUIET.dip))
 
 
-def test_a_buildings_field_has_its_size_and_is_found_again_at_its_place(walk: ImuSequence) -> None:
+def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk: ImuSequence) -> None:
     building = replace(QUIET, strength=0.0, disturbance=8.0, length=2.0, rate=100.0)
     time = np.arange(0.0, 400.0, 0.01)
     path = np.stack([0.9 * time, 30.0 * np.sin(0.01 * time), 0.0 * time], axis=1)
@@ -55,7 +55,7 @@ def test_a_buildings_field_has_its_size_and_is_found_again_at_its_place(walk: Im
     )
 
 
-def test_a_magnet_moves_with_the_device_and_the_iron_stays(walk: ImuSequence) -> None:
+def test_magnets_act_while_near_and_hard_iron_always(walk: ImuSequence) -> None:
     iron = (3.0, -2.0, 4.0)
     disturbed = replace(QUIET, hard_iron=iron, magnets=((10.0, 20.0, 150.0),), lag=0.03)
     plain = simulate_magnetometer(pose(walk), QUIET)
@@ -79,6 +79,6 @@ def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk: ImuSequence) 
 @pytest.mark.parametrize(
     "change", [{"rate": 0.0}, {"length": -1.0}, {"noise": -1.0}, {"hard_iron": (math.nan, 0, 0)}]
 )
-def test_what_no_field_is_is_refused(change: dict[str, float]) -> None:
+def test_invalid_field_parameters_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(change))):
         replace(QUIET, **change)

@@ -13,7 +13,7 @@ from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generat
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_every_way_to_carry_is_plausible(carry: str) -> None:
+def test_every_carrying_mode_is_plausible(carry: str) -> None:
     for seed in range(3):
         style = replace(WalkStyle.random(np.random.default_rng(seed)), carry=carry, next_carry="")
         imu = simulate_imu(generate_walk(seed, 30.0, style=style), errors=PERFECT_IMU)
@@ -56,7 +56,7 @@ def test_step_rate_and_step_length_grow_together_with_speed() -> None:
 
 @pytest.mark.parametrize("speed", [0.7, 1.1, 1.5])
 def test_the_device_bounces_at_the_step_rate_of_its_speed(speed: float) -> None:
-    """Over many walks the strongest vertical line lies where the walked speed puts it."""
+    """Over several walks the strongest vertical spectral line lies at the step rate."""
     style = WalkStyle(carry="bag", preferred_speed=speed, vigor=0.5)
     found, expected = [], []
     for seed in range(6):
@@ -89,7 +89,7 @@ def _bounce_rates(walk: Trajectory) -> np.ndarray:
     return np.array(rates)
 
 
-def test_routes_stop_turn_climb_and_keep_to_a_persons_speeds() -> None:
+def test_routes_stop_turn_climb_and_keep_to_pedestrian_speeds() -> None:
     routes = [random_route(np.random.default_rng(seed), 6000, 100.0, 1.1) for seed in range(20)]
     speed = np.concatenate([route.speed for route in routes])
     turning = np.concatenate([np.abs(route.turn_rate) for route in routes])
@@ -109,7 +109,7 @@ def _forward_speed_is_negative(position: np.ndarray, heading: np.ndarray) -> boo
     return bool((velocity[:, 0] < -0.2).any())
 
 
-def test_wheels_neither_climb_nor_bounce() -> None:
+def test_a_trolley_neither_climbs_nor_bounces() -> None:
     style = WalkStyle(carry="trolley")
     rolling = generate_walk(4, 60.0, style=style)
     walking = generate_walk(4, 60.0, style=replace(style, carry="handheld"))
@@ -123,7 +123,7 @@ def _low_band(walk: Trajectory) -> float:
     return float(power[(f > 1.0) & (f < 3.0)].sum())
 
 
-def test_a_rig_is_turned_fast() -> None:
+def test_a_rig_turns_fast() -> None:
     peaks = []
     for seed in range(6):
         walk = generate_walk(seed, 60.0, style=WalkStyle(carry="rig"))
@@ -133,7 +133,7 @@ def test_a_rig_is_turned_fast() -> None:
 
 
 def test_walks_are_smooth_enough_for_the_spline() -> None:
-    """The same walk drawn from every second pose gives nearly the same accelerations."""
+    """The same walk interpolated from every second pose gives nearly the same samples."""
     for carry in CARRYING_MODES:
         fine = generate_walk(9, 20.0, rate=200.0, style=WalkStyle(carry=carry))
         coarse = Trajectory(fine.time[::2], fine.position_W[::2], fine.attitude_WB[::2])
@@ -144,7 +144,7 @@ def test_walks_are_smooth_enough_for_the_spline() -> None:
         assert (a.gyro - b.gyro)[inner].std() < 0.1 * a.gyro[inner].std()
 
 
-def test_noise_helpers_have_unit_deviation_and_their_band() -> None:
+def test_noise_helpers_have_unit_deviation_in_their_band() -> None:
     rng = np.random.default_rng(0)
     assert drift(rng, 200_000, 100.0, 0.5).std() == pytest.approx(1.0, rel=0.05)
     noise = band_noise(rng, 100_000, 100.0, 5.0, 10.0, 2)

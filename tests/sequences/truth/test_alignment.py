@@ -1,4 +1,4 @@
-"""Lag, clocks and mount between a tracked body and the IMU in it, on simulated walks."""
+"""Lag, clock offset and mount between a tracked body and its IMU, on simulated walks."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def recorded(carry: str, seconds: float = 120.0) -> tuple[ImuSequence, Trajector
 
 
 def captured(truth: Trajectory, noise_rad: float, seed: int = 0) -> tuple[np.ndarray, Rotation]:
-    """Position of a point off the IMU and a noisy attitude of the tracked body around it."""
+    """Position of a point away from the IMU and noisy attitude of the tracked body."""
     rng = np.random.default_rng(seed)
     shaken = Rotation.from_rotvec(noise_rad * rng.standard_normal((len(truth), 3)))
     position = truth.position_W - truth.attitude_WB.apply(LEVER_B)
@@ -32,31 +32,31 @@ def captured(truth: Trajectory, noise_rad: float, seed: int = 0) -> tuple[np.nda
     return position, truth.attitude_WB * MOUNT_VB.inv() * shaken
 
 
-def test_products_of_many_rotations_are_those_one_by_one() -> None:
+def test_cumulative_rotations_equal_products_taken_one_by_one() -> None:
     steps = Rotation.random(200, rng=np.random.default_rng(1))
-    process_each = [Rotation.identity()]
+    one_by_one = [Rotation.identity()]
     for step in steps:
-        process_each.append(process_each[-1] * step)
+        one_by_one.append(one_by_one[-1] * step)
     products = Rotation.from_quat(cumulative_rotations(steps))
     assert len(products) == 201
-    assert (products.inv() * Rotation.concatenate(process_each)).magnitude().max() < 1e-12
+    assert (products.inv() * Rotation.concatenate(one_by_one)).magnitude().max() < 1e-12
     assert len(cumulative_rotations(Rotation.identity(1)[:0])) == 1
 
 
-@pytest.mark.parametrize("apart", [0.4, -1.65, 3000.0])
-def test_clocks_are_brought_together(apart: float) -> None:
-    """Few seconds off, or of another origin; the capture starts later and ends earlier."""
+@pytest.mark.parametrize("ahead", [0.4, -1.65, 3000.0])
+def test_the_clock_offset_is_found(ahead: float) -> None:
+    """Clocks seconds apart or of another origin; the capture starts later and ends earlier."""
     imu, truth = recorded("handheld", 60.0)
     _, attitude_WV = captured(truth, 0.003)
     part = slice(800, 5000)
     valid = np.ones(4200, dtype=np.bool_)
     valid[1000:1100] = False
-    offset = clock_offset(imu.time, imu.gyro, truth.time[part] + apart, attitude_WV[part], valid)
-    assert offset == pytest.approx(-apart, abs=0.05)
+    offset = clock_offset(imu.time, imu.gyro, truth.time[part] + ahead, attitude_WV[part], valid)
+    assert offset == pytest.approx(-ahead, abs=0.05)
 
 
 def mount_errors(carry: str, noise_rad: float) -> list[float]:
-    """Angle [deg] from the true mount to the gyroscope's and to that of both sensors."""
+    """Errors [deg] of the mount estimated from the gyroscope alone and from both sensors."""
     imu, truth = recorded(carry)
     position, attitude_WV = captured(truth, noise_rad)
     valid = np.ones(len(truth), dtype=np.bool_)
@@ -65,15 +65,15 @@ def mount_errors(carry: str, noise_rad: float) -> list[float]:
     return [float(np.degrees((MOUNT_VB.inv() * x.mounts[0][2]).magnitude())) for x in found]
 
 
-def test_on_a_trolley_the_accelerometer_finds_the_mounts_heading() -> None:
-    """The gyroscope alone says little of a turn about the only axis that the body turns about."""
+def test_on_a_trolley_the_accelerometer_determines_the_mounts_heading() -> None:
+    """The gyroscope alone hardly determines a rotation about the only axis the body turns about."""
     gyro_alone, both = mount_errors("trolley", 0.008)
     assert gyro_alone > 3.0
     assert both < 1.0  # the sensors' axes are 0.6 degrees apart themselves
 
 
 @pytest.mark.parametrize("late", [-0.031, 0.0, 0.052])
-def test_the_lag_is_found_within_a_millisecond_even_where_little_is_turned(late: float) -> None:
+def test_the_lag_is_found_within_a_millisecond_even_with_little_rotation(late: float) -> None:
     imu, truth = recorded("trolley")
     position, attitude_WV = captured(truth, 0.004)
     valid = np.ones(len(truth), dtype=np.bool_)
@@ -84,14 +84,14 @@ def test_the_lag_is_found_within_a_millisecond_even_where_little_is_turned(late:
     assert aligned.correlation > 0.9
 
 
-def test_where_the_gyroscope_knows_the_mount_it_stays() -> None:
+def test_a_mount_determined_by_the_gyroscope_is_kept() -> None:
     gyro_alone, both = mount_errors("handheld", 0.004)
     assert gyro_alone < 0.7
     assert both < 0.7
 
 
 @pytest.mark.parametrize("error_deg", [-6.0, 4.0])
-def test_a_turn_of_the_mount_is_seen_beside_lever_and_bias(error_deg: float) -> None:
+def test_a_turned_mount_is_detected_despite_lever_arm_and_bias(error_deg: float) -> None:
     imu, truth = recorded("trolley")
     position, _ = captured(truth, 0.0)
     up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True).mean(axis=0)
@@ -104,15 +104,15 @@ def test_a_turn_of_the_mount_is_seen_beside_lever_and_bias(error_deg: float) -> 
     assert np.degrees((wrong * turn).magnitude()) < 1.0
 
 
-def test_too_little_to_tell_leaves_the_mount_alone() -> None:
+def test_too_little_data_leaves_the_mount_unchanged() -> None:
     imu, truth = recorded("trolley", 10.0)
     valid = np.zeros(len(truth), dtype=np.bool_)
-    valid[::2] = True  # no stretch is whole
+    valid[::2] = True  # no stretch is unbroken
     turn = heading_turn(truth.time, imu.gyro, imu.accel, truth.position_W, truth.attitude_WB, valid)
     assert turn.magnitude() == 0.0
 
 
-def test_single_frames_turned_about_any_axis_are_masked() -> None:
+def test_single_frames_rotated_about_any_axis_are_masked() -> None:
     imu, truth = recorded("handheld")
     _, attitude_WV = captured(truth, 0.004)
     rng = np.random.default_rng(2)
@@ -129,12 +129,10 @@ def test_single_frames_turned_about_any_axis_are_masked() -> None:
     assert aligned.valid.mean() > 0.99
 
 
-@pytest.mark.parametrize("silent", [(50.0, 53.0), (50.0, 61.0), (113.0, 115.0)])
+@pytest.mark.parametrize("gap", [(50.0, 53.0), (50.0, 61.0), (113.0, 115.0)])
 @pytest.mark.parametrize("flips", [False, True])
-def test_what_turns_while_the_imu_is_silent_is_no_flip(
-    silent: tuple[float, float], flips: bool
-) -> None:
-    """Behind it the mount is the one before; one that flips where the IMU sees it is another."""
+def test_rotation_during_an_imu_gap_is_not_a_flip(gap: tuple[float, float], flips: bool) -> None:
+    """The gap leaves the mount unchanged; a flip that the IMU observes changes it."""
     imu, truth = recorded("handheld")
     _, attitude_WV = captured(truth, 0.004)
     late = truth.time > 30.0
@@ -142,13 +140,13 @@ def test_what_turns_while_the_imu_is_silent_is_no_flip(
         quat = attitude_WV.as_quat()
         quat[late] = (attitude_WV[late] * Rotation.from_rotvec([0.0, 0.0, np.pi])).as_quat()
         attitude_WV = Rotation.from_quat(quat)
-    kept = (imu.time < silent[0]) | (imu.time > silent[1])
-    seen = (truth.time < silent[0]) | (truth.time > silent[1])
+    kept = (imu.time < gap[0]) | (imu.time > gap[1])
+    seen = (truth.time < gap[0]) | (truth.time > gap[1])
     aligned = align_tracked_body(
         imu.time[kept], imu.gyro[kept], imu.accel[kept], truth.time, attitude_WV, seen
     )
     assert len(aligned.mounts) == 2 + flips
     error = (truth.attitude_WB.inv() * aligned.attitude_WB)[seen].magnitude()
-    assert np.degrees(np.median(error[truth.time[seen] > silent[1]])) < 1.5
-    assert np.degrees(np.median(error[truth.time[seen] < silent[0]])) < 1.5
+    assert np.degrees(np.median(error[truth.time[seen] > gap[1]])) < 1.5
+    assert np.degrees(np.median(error[truth.time[seen] < gap[0]])) < 1.5
     assert aligned.correlation > 0.95

@@ -25,7 +25,7 @@ def truth_of(sequence: ImuSequence) -> Trajectory:
     return sequence.truth
 
 
-def test_a_truth_that_fits_needs_nothing(walk: ImuSequence) -> None:
+def test_a_truth_that_fits_needs_no_correction(walk: ImuSequence) -> None:
     fit = fit_truth(walk)
     assert abs(fit.time_offset) < 0.002
     assert fit.misalignment < np.radians(1.0)
@@ -37,7 +37,7 @@ def test_a_truth_that_fits_needs_nothing(walk: ImuSequence) -> None:
 
 
 @pytest.mark.parametrize("offset", [-3.21, -0.05, 0.4, 2.503])
-def test_the_clocks_offset_is_found(walk: ImuSequence, offset: float) -> None:
+def test_the_clock_offset_is_found(walk: ImuSequence, offset: float) -> None:
     truth = truth_of(walk)
     late = replace(walk, truth=replace(truth, time=truth.time - offset))
     assert fit_truth(late).time_offset == pytest.approx(offset, abs=0.003)
@@ -49,26 +49,28 @@ def test_the_rotation_between_the_axes_is_found(walk: ImuSequence) -> None:
     turned = replace(walk, truth=replace(truth, attitude_WB=truth.attitude_WB * R_TB.inv()))
     fit = fit_truth(turned)
     assert (fit.R_TB.inv() * R_TB).magnitude() < np.radians(1.0)
-    assert fit.axes() is None  # no permutation comes near
+    assert fit.axes() is None  # no permutation is close
 
 
 @pytest.mark.parametrize(
-    ("turned", "mended"), [("y,-x,z", "-y,x,z"), ("z,x,y", "y,z,x"), ("-x,-y,z", "-x,-y,z")]
+    ("turned", "corrected"), [("y,-x,z", "-y,x,z"), ("z,x,y", "y,z,x"), ("-x,-y,z", "-x,-y,z")]
 )
-def test_axes_are_named_whatever_the_clock(walk: ImuSequence, turned: str, mended: str) -> None:
+def test_axes_are_named_despite_a_clock_offset(
+    walk: ImuSequence, turned: str, corrected: str
+) -> None:
     truth = truth_of(walk)
     late = replace(walk, truth=replace(truth, time=truth.time + 1.0))
-    assert fit_truth(with_axes(late, turned)).axes() == mended
+    assert fit_truth(with_axes(late, turned)).axes() == corrected
 
 
-def test_a_world_off_level_is_told(walk: ImuSequence) -> None:
+def test_a_tilted_world_is_detected(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     lean = Rotation.from_rotvec([np.radians(5.0), 0.0, 0.0])
     leaning = replace(walk, truth=replace(truth, attitude_WB=lean * truth.attitude_WB))
     assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
 
 
-def test_a_truth_that_flips_jumps(walk: ImuSequence) -> None:
+def test_a_flip_of_the_truth_is_counted_as_a_jump(walk: ImuSequence) -> None:
     truth = truth_of(walk)
     quat_xyzw = truth.quat_xyzw
     late = truth.time > 20.0
@@ -78,7 +80,7 @@ def test_a_truth_that_flips_jumps(walk: ImuSequence) -> None:
     assert fit_truth(flipped).jumps == 1
 
 
-def test_a_gap_of_the_imu_is_no_jump_of_the_truth(walk: ImuSequence) -> None:
+def test_a_gap_in_the_imu_is_not_a_jump_of_the_truth(walk: ImuSequence) -> None:
     kept = (walk.time < 15.0) | (walk.time > 18.0)
     gappy = replace(walk, time=walk.time[kept], gyro=walk.gyro[kept], accel=walk.accel[kept])
     fit = fit_truth(gappy)
@@ -94,7 +96,7 @@ def test_another_recordings_truth_does_not_agree(walk: ImuSequence) -> None:
     assert fit.axes() is None
 
 
-def test_too_little_to_compare_is_refused(walk: ImuSequence) -> None:
+def test_a_truth_with_too_little_overlap_is_refused(walk: ImuSequence) -> None:
     with pytest.raises(InputError, match="truth"):
         fit_truth(walk.without_truth())
     with pytest.raises(InputError, match="10 s"):
@@ -107,10 +109,10 @@ def test_too_little_to_compare_is_refused(walk: ImuSequence) -> None:
 @pytest.mark.parametrize(
     "found", [{"time_offset": 4.97}, {"correlation": 0.87}, {"correlation": 0.94, "agreeing": 0.6}]
 )
-def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
+def test_a_truth_that_may_be_of_another_walk_gives_neither_offset_nor_axes(
     walk: ImuSequence, found: dict[str, float]
 ) -> None:
-    """An even gait is like itself some steps later, and a search ends somewhere."""
+    """A steady gait resembles itself some steps later, so a search always finds some offset."""
     fit = fit_truth(with_axes(replace(walk, name="w"), "y,-x,z"))
     assert fit.axes() == "-y,x,z"
     other = replace(fit, **{"time_offset": -2.0} | found)
@@ -120,7 +122,7 @@ def test_what_may_be_another_walk_tells_neither_offset_nor_axes(
 
 
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
-def test_a_gyroscope_with_wrong_signs_is_not_the_truths_fault(
+def test_wrong_gyroscope_signs_are_not_blamed_on_the_truth(
     signs: tuple[float, float, float],
 ) -> None:
     style = WalkStyle(carry="pocket")
@@ -132,7 +134,7 @@ def test_a_gyroscope_with_wrong_signs_is_not_the_truths_fault(
         assert "sign" not in " ".join(fit_problems("w", fit_truth(right), None, ""))
 
 
-def test_the_accelerometer_says_whether_gyroscope_or_truth_is_turned(walk: ImuSequence) -> None:
+def test_the_accelerometer_decides_whether_gyroscope_or_truth_is_turned(walk: ImuSequence) -> None:
     fit = fit_truth(replace(walk, gyro=walk.gyro @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix().T))
     (problem,) = fit_problems("w", fit, None, "")
     assert "gyroscope: its axes or signs are not those of the accelerometer" in problem

@@ -1,4 +1,4 @@
-"""What turns the gyroscope's yaw is what was done to it."""
+"""The scale and bias applied to the gyroscope are recovered from its yaw drift."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def walk() -> ImuSequence:
 
 @pytest.mark.parametrize("scale", [0.0, 0.023, -0.015])
 @pytest.mark.parametrize("bias", [0.0, 0.004])
-def test_scale_and_bias_come_back(walk: ImuSequence, scale: float, bias: float) -> None:
+def test_scale_and_bias_are_recovered(walk: ImuSequence, scale: float, bias: float) -> None:
     truth = walk.truth
     assert truth is not None
     up_B = truth.at(walk.time).attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
@@ -35,16 +35,16 @@ def test_scale_and_bias_come_back(walk: ImuSequence, scale: float, bias: float) 
     assert found.residual_rms < np.radians(1.0)
 
 
-def test_a_person_reads_how_far_it_turns(walk: ImuSequence) -> None:
-    far, little = (
+def test_the_report_states_the_scale_error(walk: ImuSequence) -> None:
+    too_high, too_low = (
         "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).lines())
         for scale in (1.03, 0.97)
     )
-    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too high", far)
-    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too low", little)
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too high", too_high)
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too low", too_low)
 
 
-def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
+def test_without_rotation_no_yaw_drift_is_estimated(walk: ImuSequence) -> None:
     truth = walk.truth
     assert truth is not None
     until = walk.time < walk.time[0] + 12.0
@@ -60,9 +60,7 @@ def test_where_nothing_turned_nothing_is_told(walk: ImuSequence) -> None:
     ("scale", "words"),
     [(1.3, r"(29|30)\.\d % too high"), (1 / 57.3, r"98\.\d % too low"), (1.04, "")],
 )
-def test_a_scale_that_no_sensor_has_is_a_problem(
-    walk: ImuSequence, scale: float, words: str
-) -> None:
-    told = "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).problems)
-    assert ("gyroscope: reads" in told) is bool(words)
-    assert re.search(words, told)
+def test_an_implausible_scale_is_a_problem(walk: ImuSequence, scale: float, words: str) -> None:
+    reported = "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).problems)
+    assert ("gyroscope: reads" in reported) is bool(words)
+    assert re.search(words, reported)

@@ -1,4 +1,4 @@
-"""The same apps with other settings, systems and exports: what is read must be the same walk."""
+"""The same apps with other settings, systems and exports: each must be read as the same walk."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def ns(walk: ImuSequence) -> list[int]:
     return [1_718_030_736_872_695_300 + round(t * 1e9) for t in walk.time.tolist()]
 
 
-def save(path: Path, header: str, *columns: object, joint: str = ",") -> None:
+def save(path: Path, header: str, *columns: object, sep: str = ",") -> None:
     parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
-    rows = [joint.join(str(x) for part in row for x in part) for row in zip(*parts, strict=True)]
+    rows = [sep.join(str(x) for part in row for x in part) for row in zip(*parts, strict=True)]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
 
@@ -83,7 +83,7 @@ def with_byte_order_mark(folder: Path, walk: ImuSequence) -> None:
 
 
 def every_cell_quoted(folder: Path, walk: ImuSequence) -> None:
-    """As a spreadsheet saves it on Windows."""
+    """As saved by a spreadsheet on Windows."""
     android(folder, walk)
     for file in folder.iterdir():
         lines = ['"' + line.replace(",", '","') + '"' for line in file.read_text().splitlines()]
@@ -99,7 +99,7 @@ def readable_times(folder: Path, walk: ImuSequence) -> None:
 
 
 def extra_sensors(folder: Path, walk: ImuSequence) -> None:
-    """And a watch's motion, other sensors, and what a Mac leaves in folders."""
+    """With a watch's motion, other sensors and the files that macOS adds to folders."""
     android(folder, walk)
     few = ns(walk)[:9], walk.time[:9]
     save(folder / "Barometer.csv", "time,seconds_elapsed,relativeAltitude,pressure", *few,
@@ -115,7 +115,7 @@ def extra_sensors(folder: Path, walk: ImuSequence) -> None:
 
 
 def watch(folder: Path, walk: ImuSequence) -> None:
-    """An Apple watch alone: everything in one file, in g and with Apple's sign."""
+    """An Apple Watch only: everything in one file, in g and with Apple's sign."""
     header = "time,seconds_elapsed," + ",".join(
         f"{name}{axis}" for name in ("rotationRate", "gravity", "acceleration") for axis in "XYZ"
     )
@@ -138,7 +138,7 @@ def iphone_standardised(folder: Path, walk: ImuSequence) -> None:
 
 
 def iphone_uncalibrated(folder: Path, walk: ImuSequence) -> None:
-    """Gravity was not logged, but the raw accelerometer in g."""
+    """Gravity was not logged, but the raw accelerometer was, in g."""
     linear = walk.accel - gravity(walk)
     raw = -walk.accel / STANDARD_GRAVITY
     zyx(folder, walk, Accelerometer=-linear, AccelerometerUncalibrated=raw, Gyroscope=walk.gyro)
@@ -181,7 +181,7 @@ def phyphox_with_and_without_g(folder: Path, walk: ImuSequence) -> None:
 
 
 def phyphox_one_table(folder: Path, walk: ImuSequence) -> None:
-    """Each sensor with a clock of its own; of the shorter one the last rows are blank."""
+    """Each sensor has its own clock; the last rows of the shorter one are blank."""
     header = '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)"'
     header += ',"Acceleration z (m/s^2)","Gyroscope time (s)","Gyroscope x (rad/s)"'
     header += ',"Gyroscope y (rad/s)","Gyroscope z (rad/s)"'
@@ -201,21 +201,21 @@ def androsensor_other_units(folder: Path, walk: ImuSequence) -> None:
 
 
 def androsensor_garbled(folder: Path, walk: ImuSequence) -> None:
-    """Its signs read in another encoding and saved again."""
+    """Unit symbols decoded with another encoding and saved again."""
     header = ",".join(ANDROSENSOR).replace("²", "Â²").replace("μ", "Î¼")
     millis = np.round(1e3 * walk.time).astype(int)
     columns = walk.accel, walk.gyro, field(walk), millis
     save(folder / "a.csv", header + ",Time since start in ms", *columns)
 
 
-def androsensor_lost_signs(folder: Path, walk: ImuSequence) -> None:
+def androsensor_lost_symbols(folder: Path, walk: ImuSequence) -> None:
     androsensor_garbled(folder, walk)
     text = (folder / "a.csv").read_text()
     (folder / "a.csv").write_text(text.replace("Â²", "\ufffd").replace("Î¼", "\ufffd"))
 
 
 def senslogs_first_version(folder: Path, walk: ImuSequence) -> None:
-    """A text above the rows, two clocks, and the bias in columns of its own."""
+    """Text above the rows, two clocks, and the bias in separate columns."""
     drift = np.tile([0.01, 0.02, -0.01], (len(walk), 1))
     off = ["estimated-drift-x", "estimated-drift-y", "estimated-drift-z"]
     for name, titles, values in (
@@ -226,25 +226,25 @@ def senslogs_first_version(folder: Path, walk: ImuSequence) -> None:
         words = ["elapsed-time-system", "elapsed-time-sensor", "x", "y", "z", *titles]
         above = f"{name}.txt\n\nAll values are in SI units.\nhttp://example.org\n\n"
         save(folder / f"{name}.txt", above + " ".join(words), walk.time + 0.003, walk.time, values,
-             joint=" ")  # fmt: skip
+             sep=" ")  # fmt: skip
 
 
 def two_clocks_and_no_header(folder: Path, walk: ImuSequence) -> None:
     for name, values in (("accelerometer", walk.accel), ("gyroscope", walk.gyro),
                          ("magnetometer", field(walk))):  # fmt: skip
-        save(folder / f"{name}.txt", "", walk.time + 0.003, walk.time, values, joint=" ")
+        save(folder / f"{name}.txt", "", walk.time + 0.003, walk.time, values, sep=" ")
 
 
 def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
-    """Without its attitude: what it writes beside says on which system it ran."""
+    """Without its attitude; the description file indicates the operating system."""
     t = 55_687.0 + walk.time
-    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, joint=" ")
-    save(folder / "gyroscope.txt", "", t, walk.gyro, joint=" ")
+    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, sep=" ")
+    save(folder / "gyroscope.txt", "", t, walk.gyro, sep=" ")
     (folder / "description.txt").write_text("[Time]\nBootTime = 55687.0793")
 
 
 def ios_logger(folder: Path, walk: ImuSequence) -> None:
-    """In g, Apple's sign; `Motion.txt` is the attitude, w first, `MotMagnFull` calibrated."""
+    """In g, Apple's sign; `Motion.txt` is the attitude, w first; `MotMagnFull` is calibrated."""
     t = 1.6e9 + walk.time
     save(folder / "Accel.txt", "", t, -walk.accel / STANDARD_GRAVITY)
     save(folder / "Gyro.txt", "", t, walk.gyro)
@@ -270,14 +270,16 @@ VARIANTS: dict[str, Callable[[Path, ImuSequence], None]] = {
         with_byte_order_mark, every_cell_quoted, readable_times, extra_sensors, watch, iphone,
         iphone_standardised, iphone_uncalibrated, json_export, zip_in_a_zip,
         phyphox_with_and_without_g, phyphox_one_table, androsensor_other_units,
-        androsensor_garbled, androsensor_lost_signs, senslogs_first_version,
+        androsensor_garbled, androsensor_lost_symbols, senslogs_first_version,
         two_clocks_and_no_header, senslogs_ios, ios_logger, ios_logger_with_poses,
     )
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_variant_is_the_same_walk(variant: str, walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_variant_is_read_as_the_same_walk(
+    variant: str, walk: ImuSequence, tmp_path: Path
+) -> None:
     VARIANTS[variant](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     read = read_recording(found)
@@ -286,7 +288,7 @@ def test_a_variant_is_the_same_walk(variant: str, walk: ImuSequence, tmp_path: P
         np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
 
 
-def test_a_recording_says_in_a_line_what_it_is(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_recording_has_a_one_line_summary(walk: ImuSequence, tmp_path: Path) -> None:
     android(tmp_path / "a", walk)
     ios_logger(tmp_path / "b", walk)
     tail = "15.0 s at 100.0 Hz, magnetometer at 100 Hz"
@@ -296,7 +298,9 @@ def test_a_recording_says_in_a_line_what_it_is(walk: ImuSequence, tmp_path: Path
     )
 
 
-def test_sensors_of_different_rates_keep_the_gyroscopes(walk: ImuSequence, tmp_path: Path) -> None:
+def test_sensors_of_different_rates_are_read_at_the_gyroscopes_rate(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
     save(tmp_path / "s/Gyroscope.csv", ZYX, ns(walk), walk.time, walk.gyro[:, ::-1])
     rows = slice(None, None, 2)
     force = walk.accel[rows, ::-1]
@@ -308,7 +312,7 @@ def test_sensors_of_different_rates_keep_the_gyroscopes(walk: ImuSequence, tmp_p
     np.testing.assert_allclose(read.accel[1::2], halfway, atol=1e-6)
 
 
-def test_where_no_one_tells_the_sign_it_is_asked_for(
+def test_an_undetermined_accelerometer_sign_gives_a_warning(
     walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     iphone(tmp_path / "s", walk)
@@ -324,10 +328,10 @@ def test_where_no_one_tells_the_sign_it_is_asked_for(
 
 
 @pytest.mark.parametrize("code", ["TYPE", "AHRS"])
-def test_a_tracess_rotation_vector_is_the_devices_attitude(
+def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(
     code: str, walk: ImuSequence, tmp_path: Path
 ) -> None:
-    """It holds x, y and z of a quaternion whose w is not negative."""
+    """It contains x, y and z of a quaternion whose w is not negative."""
     assert walk.truth is not None
     vector = quaternion(walk)[:, :3] * np.sign(quaternion(walk)[:, 3:])
     lines = []
@@ -345,24 +349,24 @@ def test_a_tracess_rotation_vector_is_the_devices_attitude(
     (tmp_path / "trace.txt").write_text("\n".join(lines) + "\n")
     attitude = read_recording(tmp_path / "trace.txt").device_attitude
     assert attitude is not None
-    away = attitude.attitude_WB * walk.truth.attitude_WB.inv()
-    assert away.magnitude().max() < 1e-6
+    difference = attitude.attitude_WB * walk.truth.attitude_WB.inv()
+    assert difference.magnitude().max() < 1e-6
     cut = (tmp_path / "trace.txt").read_text().replace(";1;2;3;", ";1;2;").replace("\t3\n", "\n")
     (tmp_path / "trace.txt").write_text(cut)
     assert (read_recording(tmp_path / "trace.txt").device_attitude is None) == (code == "AHRS")
 
 
 @pytest.mark.parametrize(
-    ("start", "told"),
+    ("start", "message"),
     [
         (b"SQLite format 3\0" + bytes(40), "an SQLite database"),
         (b"PK\x03\x04xl/workbook.xml", "a zip without text files"),
         (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
     ],
 )
-def test_what_is_not_unpacked_is_named(start: bytes, told: str, tmp_path: Path) -> None:
+def test_an_unsupported_container_is_named(start: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "export.data").write_bytes(start)
-    with pytest.raises(ReadError, match=rf"found [\w ,]*{told}.*; export as CSV"):
+    with pytest.raises(ReadError, match=rf"found [\w ,]*{message}.*; export as CSV"):
         read_recording(tmp_path / "export.data")
 
 
@@ -378,7 +382,7 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('[{"sensor": "Gyroscope", "time"', r"x\.json: file: found .*, expected JSON"),
         ('[{"sensor": "../up", "time": "1"}]', r"x\.json: sensor: found no name"),
@@ -386,9 +390,11 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
         ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
     ],
 )
-def test_a_malformed_json_export_is_one_line(text: str, told: str, tmp_path: Path) -> None:
+def test_a_malformed_json_export_is_refused_in_one_line(
+    text: str, message: str, tmp_path: Path
+) -> None:
     (tmp_path / "x.json").write_text(text)
-    with pytest.raises(ReadError, match=told) as error:
+    with pytest.raises(ReadError, match=message) as error:
         read_recording(tmp_path / "x.json")
     assert "\n" not in str(error.value)
     assert "stario-" not in str(error.value)

@@ -1,7 +1,7 @@
-"""Files as apps export them, in their own spelling: what is read must be the walk that was written.
+"""Files as apps export them, with their own spelling: each must be read as the walk written.
 
-Each writer imitates an app's file names, headers, units and habits; the walk behind them is
-simulated, so that values, signs and axes are known.
+Each writer imitates an app's file names, headers, units and conventions; the walk is simulated,
+so that values, signs and axes are known.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def ns(walk: ImuSequence) -> list[int]:
     return [START_NS + round(t * 1e9) for t in walk.time.tolist()]
 
 
-def save(path: Path, header: str, *columns: object, joint: str = ",", decimal: str = ".") -> None:
+def save(path: Path, header: str, *columns: object, sep: str = ",", decimal: str = ".") -> None:
     parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
     rows = [
-        joint.join(str(x).replace(".", decimal) for part in row for x in part)
+        sep.join(str(x).replace(".", decimal) for part in row for x in part)
         for row in zip(*parts, strict=True)
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def save(path: Path, header: str, *columns: object, joint: str = ",", decimal: s
 
 
 def sensor_logger(folder: Path, walk: ImuSequence) -> None:
-    """Columns z, y, x; a linear acceleration that must not be taken for the total one."""
+    """Columns z, y, x; a linear acceleration that must not be mistaken for the total one."""
     for name, values in (
         ("TotalAcceleration", walk.accel), ("Gyroscope", walk.gyro),
         ("Accelerometer", walk.accel - gravity(walk)), ("Magnetometer", field(walk)),
@@ -106,7 +106,7 @@ def sensor_logger_ios(folder: Path, walk: ImuSequence) -> None:
 
 
 def sensor_logger_attitude(folder: Path, walk: ImuSequence) -> None:
-    """The same without metadata: the phone's own attitude tells the sign."""
+    """The same without metadata: the phone's own attitude determines the sign."""
     sensor_logger_ios(folder, walk)
     (folder / "Metadata.csv").unlink()
     header = "time,seconds_elapsed,qz,qy,qx,qw,roll,pitch,yaw"
@@ -129,31 +129,31 @@ def phyphox(folder: Path, walk: ImuSequence) -> None:
         ("Linear Accelerometer", "m/s^2", walk.accel - gravity(walk)),
     ):  # fmt: skip
         header = f'"Time (s)";"X ({unit})";"Y ({unit})";"Z ({unit})"'
-        save(folder / f"{name}.csv", header, walk.time, values, joint=";", decimal=",")
+        save(folder / f"{name}.csv", header, walk.time, values, sep=";", decimal=",")
     save(folder / "meta/time.csv", '"event","experiment time"', [["START", 0.0]])
 
 
 def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
-    """No header, g and Apple's sign without a word, attitude w first."""
+    """No header; g and Apple's sign without any mention; attitude with w first."""
     t = 55687.0 + walk.time
-    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, joint=" ")
-    save(folder / "gyroscope.txt", "", t, walk.gyro, joint=" ")
-    save(folder / "magnetometer.txt", "", t, field(walk) + 200.0, joint=" ")
+    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, sep=" ")
+    save(folder / "gyroscope.txt", "", t, walk.gyro, sep=" ")
+    save(folder / "magnetometer.txt", "", t, field(walk) + 200.0, sep=" ")
     accuracy = np.full(len(walk), 2)
-    save(folder / "magnetometer-calibrated.txt", "", t, field(walk), accuracy, joint=" ")
-    save(folder / "attitude.txt", "", t, pose(walk).quat_xyzw[:, [3, 0, 1, 2]], joint=" ")
+    save(folder / "magnetometer-calibrated.txt", "", t, field(walk), accuracy, sep=" ")
+    save(folder / "attitude.txt", "", t, pose(walk).quat_xyzw[:, [3, 0, 1, 2]], sep=" ")
 
 
 def senslogs_android(folder: Path, walk: ImuSequence) -> None:
-    """Only uncalibrated rows, with the bias that the phone estimates behind them."""
+    """Only uncalibrated rows, each followed by the bias that the phone estimates."""
     for name, values, bias in (("gyroscope", walk.gyro, 0.02), ("magnetometer", field(walk), 60.0)):
         biases = np.tile([bias, -bias, 2.0 * bias], (len(walk), 1))
-        save(folder / f"{name}.txt", "", walk.time, values + biases, biases, joint=" ")
-    save(folder / "accelerometer.txt", "", walk.time, walk.accel, joint=" ")
+        save(folder / f"{name}.txt", "", walk.time, values + biases, biases, sep=" ")
+    save(folder / "accelerometer.txt", "", walk.time, walk.accel, sep=" ")
 
 
 def two_clocks(folder: Path, walk: ImuSequence) -> None:
-    """The app's milliseconds beside the sensor's nanoseconds."""
+    """The app's milliseconds next to the sensor's nanoseconds."""
     millis = (1_539_940_408_606 + np.round(1e3 * walk.time)).astype(np.int64)
     for name, values in (("Accelerometer", walk.accel), ("Gyroscope", walk.gyro),
                          ("MagneticField", field(walk))):  # fmt: skip
@@ -161,7 +161,7 @@ def two_clocks(folder: Path, walk: ImuSequence) -> None:
 
 
 def prefixed(folder: Path, walk: ImuSequence) -> None:
-    """Scientific milliseconds, no header."""
+    """Milliseconds in scientific notation, no header."""
     for name, values in (("acc", walk.accel), ("gyr", walk.gyro), ("mag", field(walk))):
         rows = np.column_stack([1.606391908305e12 + 1e3 * walk.time, values])
         folder.mkdir(exist_ok=True)
@@ -189,19 +189,19 @@ def androsensor(folder: Path, walk: ImuSequence) -> None:
         np.zeros(len(walk)),
         millis,
         clock,
-        joint=";",
+        sep=";",
     )
 
 
 def physics_toolbox(folder: Path, walk: ImuSequence) -> None:
-    """`ax` is the linear acceleration, the force is `gFx` in g."""
+    """`ax` is the linear acceleration; the specific force is `gFx` in g."""
     header = "time,gFx,gFy,gFz,ax,ay,az,wx,wy,wz,Bx,By,Bz"
     columns = [walk.accel / STANDARD_GRAVITY, walk.accel - gravity(walk), walk.gyro, field(walk)]
     save(folder / "toolbox.csv", header, walk.time, *columns)
 
 
 def sensor_log(folder: Path, walk: ImuSequence) -> None:
-    """An iPhone app's wide file: g, Apple's sign, texts among the columns."""
+    """An iPhone app's wide file: g, Apple's sign, text among the columns."""
     header = (
         "loggingTime(txt),loggingSample(N),identifierForVendor(txt),"
         "accelerometerTimestamp_sinceReboot(s),accelerometerAccelerationX(G),"
@@ -233,7 +233,7 @@ def raw_g_iphone(folder: Path, walk: ImuSequence) -> None:
 
 
 def trace(folder: Path, walk: ImuSequence) -> None:
-    """Lines by type, two of them without a break between, with taps."""
+    """Lines by type, with waypoints; one line break is missing."""
     lines = ["#\tstartTime:1560828400000"]
     for k, t in enumerate(walk.time.tolist()):
         stamp = 1_560_828_400_000 + round(1e3 * t)
@@ -269,7 +269,7 @@ APPS: dict[str, Callable[[Path, ImuSequence], None]] = {
 
 
 @pytest.mark.parametrize("app", APPS)
-def test_an_apps_export_is_the_walk(app: str, walk: ImuSequence, tmp_path: Path) -> None:
+def test_an_apps_export_is_read_as_the_walk(app: str, walk: ImuSequence, tmp_path: Path) -> None:
     APPS[app](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     read = read_recording(found)
@@ -279,9 +279,7 @@ def test_an_apps_export_is_the_walk(app: str, walk: ImuSequence, tmp_path: Path)
     np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
 
 
-def test_old_apps_unit_signs_and_other_languages_are_read(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_old_unit_symbols_and_other_languages_are_read(walk: ImuSequence, tmp_path: Path) -> None:
     androsensor(tmp_path / "s", walk)
     (path,) = (tmp_path / "s").iterdir()
     path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
@@ -294,10 +292,10 @@ def test_old_apps_unit_signs_and_other_languages_are_read(
     np.testing.assert_allclose(read_recording(tmp_path / "t").accel, walk.accel)
 
 
-def test_a_linear_acceleration_of_about_one_is_not_gravity_in_g(
+def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
-    """Its size is that of g; the file of gravity beside says what it is."""
+    """Its norm is about 1, as in g; the gravity file next to it shows what it is."""
     sensor_logger_ios(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
     steady = np.tile([0.6, -0.6, 0.5], (len(walk), 1))
@@ -308,18 +306,18 @@ def test_a_linear_acceleration_of_about_one_is_not_gravity_in_g(
 
 
 @pytest.mark.parametrize("app", [sensor_logger_attitude, senslogs_ios])
-def test_the_phones_own_attitude_comes_along(
+def test_the_phones_own_attitude_is_read_too(
     app: Callable[[Path, ImuSequence], None], walk: ImuSequence, tmp_path: Path
 ) -> None:
-    """In either order of the quaternion and written either way, by the gyroscope."""
+    """With quaternions in either order and direction, as determined by the gyroscope."""
     app(tmp_path / "s", walk)
     read = read_recording(tmp_path / "s")
     assert read.device_attitude is not None
     np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
-    away = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
-    assert away.max() < 1e-6
-    back = replace(read, accel=read.accel - gravity(walk))
-    np.testing.assert_allclose(with_gravity(back).accel, walk.accel, atol=0.02)
+    error = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
+    assert error.max() < 1e-6
+    bare = replace(read, accel=read.accel - gravity(walk))
+    np.testing.assert_allclose(with_gravity(bare).accel, walk.accel, atol=0.02)
     turned = with_axes(read, "y,-x,z").device_attitude
     assert turned is not None
     up = turned.attitude_WB.apply(with_axes(read, "y,-x,z").accel)
@@ -328,7 +326,9 @@ def test_the_phones_own_attitude_comes_along(
 
 @pytest.mark.parametrize("inner", ["", "walk/"])
 @pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
-def test_a_zip_is_the_folder_in_it(app: str, inner: str, walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_zip_is_read_like_the_folder_in_it(
+    app: str, inner: str, walk: ImuSequence, tmp_path: Path
+) -> None:
     folder = tmp_path / "s"
     APPS[app](folder, walk)
     (tmp_path / "zips").mkdir()
@@ -346,9 +346,7 @@ def test_a_zip_is_the_folder_in_it(app: str, inner: str, walk: ImuSequence, tmp_
         read_recording(path)
 
 
-def test_what_is_wrong_in_a_zip_names_the_zip_and_the_file(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_path: Path) -> None:
     sensor_logger(tmp_path / "s", walk)
     path = tmp_path / "export.zip"
     with zipfile.ZipFile(path, "w") as file:
@@ -363,10 +361,10 @@ def test_what_is_wrong_in_a_zip_names_the_zip_and_the_file(
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("turn", ["x,y,z", "camera"])
-def test_poses_beside_the_imu_are_truth_in_its_axes(
+def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
     order: str, turn: str, walk: ImuSequence, tmp_path: Path
 ) -> None:
-    """30 Hz, y up, of the camera or of the sensor, in either order, whatever the header says."""
+    """30 Hz, y up, of the camera or the sensor, in either quaternion order despite the header."""
     truth, every = pose(walk), slice(None, None, 3)
     mount = Rotation.from_euler("z", 90.0 if turn == "camera" else 0.0, degrees=True)
     attitude = (Y_UP * truth.attitude_WB * mount.inv())[every].as_quat()
@@ -381,14 +379,14 @@ def test_poses_beside_the_imu_are_truth_in_its_axes(
     assert read.truth is not None
     assert read.truth.valid.mean() > 0.9
     np.testing.assert_allclose(read.truth.time, truth.time[every], atol=0.01)
-    away = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
-    assert np.degrees(np.abs(away)).max() < 3.0
+    error = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
+    assert np.degrees(np.abs(error)).max() < 3.0
     np.testing.assert_allclose(read.truth.position_W, truth.position_W[every], atol=0.1)
 
 
-def test_poses_alone_are_told_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
     rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
-    save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, joint=" ")
+    save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
     for read in (read_recording, find_recordings):
         with pytest.raises(ReadError, match=r"only poses, ARCore_sensor_pose\.txt, expected a gyr"):
             read(tmp_path / "s")
@@ -397,18 +395,18 @@ def test_poses_alone_are_told_as_such(walk: ImuSequence, tmp_path: Path) -> None
 def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
     save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
     save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
-    told = "only accel and mag, expected a gyroscope and an accelerometer"
+    message = "only accel and mag, expected a gyroscope and an accelerometer"
     for read in (read_recording, find_recordings):
-        with pytest.raises(ReadError, match=told):
+        with pytest.raises(ReadError, match=message):
             read(tmp_path / "s")
     header = ";".join(f"ACCELEROMETER {axis} (m/s²)" for axis in "XYZ")
     header += ";Time since start in ms "
-    save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), joint=";")
+    save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), sep=";")
     with pytest.raises(ReadError, match="only accel"):
         read_recording(tmp_path / "a.csv")
 
 
-def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_put_right(
+def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
@@ -418,29 +416,31 @@ def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_put_right(
     )
     wrong = -walk.accel[:, [1, 0, 2]]
     for name, values in (("acce", wrong), ("gyro", walk.gyro), ("ARKit_pose", poses)):
-        save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, joint=" ")
+        save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, sep=" ")
     read = read_recording(tmp_path / "s")
     assert "its -y,-x,-z is used as x,y,z" in caplog.text
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
 
 
-def test_a_clock_among_the_values_is_named_with_its_file_and_column(
+def test_timestamps_among_the_values_are_named_with_their_file_and_columns(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
     for name in ("accel", "gyro"):
         values = np.column_stack([ns(walk), walk.gyro[:, :2]])
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
-    told = r"gyro\.csv: x, y, z: found 1\.72e\+18, expected a plausible value in rad/s"
-    with pytest.raises(ReadError, match=told):
+    message = r"gyro\.csv: x, y, z: found 1\.72e\+18, expected a plausible value in rad/s"
+    with pytest.raises(ReadError, match=message):
         read_recording(tmp_path / "s")
 
 
-def test_waypoints_and_reference_points_are_positions(walk: ImuSequence, tmp_path: Path) -> None:
+def test_waypoints_and_reference_points_are_read_as_positions(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
     trace(tmp_path / "t", walk)
-    taps = read_recording(tmp_path / "t/5d07.txt").positions
-    assert taps is not None
-    np.testing.assert_allclose(taps.time, [2.0, 7.0], atol=1e-3)
-    np.testing.assert_allclose(taps.position_W, [[200.5, 7.25], [700.5, 7.25]])
+    waypoints = read_recording(tmp_path / "t/5d07.txt").positions
+    assert waypoints is not None
+    np.testing.assert_allclose(waypoints.time, [2.0, 7.0], atol=1e-3)
+    np.testing.assert_allclose(waypoints.position_W, [[200.5, 7.25], [700.5, 7.25]])
     get_sensor_data(tmp_path / "g", walk)
     points = read_recording(tmp_path / "g/log.txt").positions
     assert points is not None
@@ -448,9 +448,9 @@ def test_waypoints_and_reference_points_are_positions(walk: ImuSequence, tmp_pat
     np.testing.assert_allclose(points.position_W, [[0.0, 0.0], [0.0, 11.12]], atol=0.01)
     prefixed(tmp_path / "p", walk)
     (tmp_path / "p/Eight_ref.csv").write_text("1606391910305 566578.7 5932830.4 19.6\n" * 2)
-    beside = read_recording(tmp_path / "p").positions
-    assert beside is not None
-    np.testing.assert_allclose(beside.time, [2.0])
+    references = read_recording(tmp_path / "p").positions
+    assert references is not None
+    np.testing.assert_allclose(references.time, [2.0])
 
 
 KINDS = {
@@ -464,7 +464,7 @@ KINDS = {
 
 @pytest.mark.skipif(not RAW.is_dir(), reason="the apps' own files are not here")
 @pytest.mark.parametrize("name", KINDS)
-def test_the_apps_own_files_hold_gravity_and_what_is_known_of_truth(name: str) -> None:
+def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name: str) -> None:
     read = read_recording(RAW / name)
     assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
     assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0

@@ -1,4 +1,4 @@
-"""Every published format: what the writers of `conftest.py` write comes back as it was."""
+"""Every published format: recordings written by `conftest.py` are read back unchanged."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from stario.sequences.readers import FORMATS, find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 
-def test_what_was_written_comes_back(written) -> None:
+def test_a_recording_is_read_back_as_written(written) -> None:
     _, recording = written
     expected = recording.expected
     read = read_recording(recording.path)
@@ -23,11 +23,11 @@ def test_what_was_written_comes_back(written) -> None:
     assert read.truth.valid.all()
     assert np.abs(read.truth.time - expected.truth.time).max() < 1e-8
     assert np.abs(read.truth.position_W - expected.truth.position_W).max() < 1e-6
-    off = (read.truth.attitude_WB.inv() * expected.truth.attitude_WB).magnitude()
-    assert off.max() < 1e-6
+    error = (read.truth.attitude_WB.inv() * expected.truth.attitude_WB).magnitude()
+    assert error.max() < 1e-6
 
 
-def test_the_magnetometer_comes_along(written) -> None:
+def test_the_magnetometer_is_read_back_too(written) -> None:
     _, recording = written
     expected, read = recording.expected.magnetometer, read_recording(recording.path).magnetometer
     assert (read is None) == (expected is None)
@@ -36,7 +36,7 @@ def test_the_magnetometer_comes_along(written) -> None:
         np.testing.assert_allclose(read.field, expected.field, atol=1e-9)
 
 
-def test_each_is_recognised_by_its_content_alone(written) -> None:
+def test_each_format_is_recognised_by_its_content_alone(written) -> None:
     name, recording = written
     assert next(n for n, known in FORMATS.items() if known.recognises(recording.path)) == name
     assert find_recordings(recording.path) == [recording.path]
@@ -44,15 +44,15 @@ def test_each_is_recognised_by_its_content_alone(written) -> None:
     assert np.array_equal(read.gyro, read_recording(recording.path).gyro)
 
 
-def test_each_is_found_below_a_folder(written) -> None:
+def test_each_format_is_found_below_a_folder(written) -> None:
     _, recording = written
     whole = recording.path.parent if recording.path.suffix == ".csv" else recording.path
     folder = next(p for p in recording.path.parents if p.name.startswith("set"))
     assert find_recordings(folder) == [whole]
 
 
-def test_force_is_gravity_on_average_and_rate_the_attitudes_derivative(written) -> None:
-    """Physics, not the writer: a wrong order, sign or frame would not pass."""
+def test_mean_force_is_gravity_and_rate_is_the_attitudes_derivative(written) -> None:
+    """A check by physics, not by the writer: a wrong order, sign or frame would fail."""
     _, recording = written
     read = read_recording(recording.path)
     if read.truth is None:

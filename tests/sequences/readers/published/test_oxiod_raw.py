@@ -1,4 +1,4 @@
-"""OxIOD's unsynchronised files: clocks of their own, other captures, the Android phone's rows."""
+"""OxIOD's unsynchronised files: separate clocks, other captures, the Android phone's rows."""
 
 import logging
 from pathlib import Path
@@ -35,20 +35,20 @@ def capture_rows(
     every: int,
     start: int,
     unit_ns: int,
-    apart: float,
+    ahead: float,
     frame: bool = True,
 ) -> list[str]:
-    """Every so many rows of the truth, by a clock that shows `apart` seconds more."""
+    """Every `every`-th row of the truth, stamped by a clock `ahead` seconds ahead."""
     rows = slice(300, -200, every)
     truth = walk.truth
-    time = truth.time[rows] + apart
+    time = truth.time[rows] + ahead
     stamps = [(start + round(t * 1e9)) // unit_ns for t in time.tolist()]
     pose = np.hstack([truth.position_W[rows], (truth.attitude_WB[rows] * MOUNT_VB.inv()).as_quat()])
     frames = [list(range(len(pose)))] if frame else []
     return formats.text(stamps, *frames, pose)
 
 
-def held_against(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) -> None:
+def assert_matches(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) -> None:
     read = read_recording(path)
     assert read.truth is not None
     assert np.abs(read.time - walk.time).max() < 1e-6
@@ -58,30 +58,30 @@ def held_against(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) -> N
     pose = read.truth.at(walk.time[inside])
     assert pose.valid.mean() > 0.95
     given = walk.truth.attitude_WB[inside]
-    off = (given * pose.attitude_WB.inv())[pose.valid]
-    assert np.degrees((off.mean().inv() * off).magnitude()).max() < tolerance_deg
-    assert np.hypot(*off.mean().as_rotvec()[:2]) < np.radians(0.5)
-    there = off.mean().apply(pose.position_W) - walk.truth.position_W[inside]
-    assert np.linalg.norm(there[pose.valid], axis=1).max() < 0.05
+    error = (given * pose.attitude_WB.inv())[pose.valid]
+    assert np.degrees((error.mean().inv() * error).magnitude()).max() < tolerance_deg
+    assert np.hypot(*error.mean().as_rotvec()[:2]) < np.radians(0.5)
+    difference = error.mean().apply(pose.position_W) - walk.truth.position_W[inside]
+    assert np.linalg.norm(difference[pose.valid], axis=1).max() < 0.05
 
 
-@pytest.mark.parametrize("apart", [0.02, -1.65, 5000.0])
+@pytest.mark.parametrize("ahead", [0.02, -1.65, 5000.0])
 @pytest.mark.parametrize(("name", "unit_ns"), [("vi1", 1), ("hand1", 1000), ("tango1", 10**6)])
-def test_the_capture_is_brought_onto_the_phones_clock(
-    tmp_path, walk, formats, apart, name, unit_ns
+def test_the_capture_is_synchronised_to_the_phones_clock(
+    tmp_path, walk, formats, ahead, name, unit_ns
 ) -> None:
-    """Nanoseconds, microseconds or milliseconds, seconds apart or of another day."""
+    """Nanoseconds, microseconds or milliseconds; seconds apart or of another origin."""
     raw = tmp_path / "pocket/data1/raw"
     formats.save(raw / "imu1.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time)))
     every = 3 if name == "tango1" else 1
     start = formats.stamps_ns(np.zeros(1))[0]
-    rows = capture_rows(formats, walk, every, start, unit_ns, apart, frame=name != "tango1")
+    rows = capture_rows(formats, walk, every, start, unit_ns, ahead, frame=name != "tango1")
     formats.save(raw / f"{name}.csv", "", rows)
-    held_against(raw / "imu1.csv", walk, 3.0 if name == "tango1" else 1.0)
+    assert_matches(raw / "imu1.csv", walk, 3.0 if name == "tango1" else 1.0)
     assert read_recording(raw / "imu1.csv").name == "pocket-data1-raw-imu1"
 
 
-def test_poses_written_while_nothing_was_seen_are_masked(tmp_path, walk, formats) -> None:
+def test_poses_written_while_tracking_was_lost_are_masked(tmp_path, walk, formats) -> None:
     stamps = formats.stamps_ns(walk.time)
     formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, stamps))
     rows = capture_rows(formats, walk, 1, stamps[0], 1, 0.0)
@@ -94,7 +94,7 @@ def test_poses_written_while_nothing_was_seen_are_masked(tmp_path, walk, formats
     assert truth.valid[1310:].mean() > 0.95
 
 
-def test_neighbours_that_were_swapped_are_put_in_order(tmp_path, walk, formats) -> None:
+def test_swapped_neighbouring_rows_are_put_in_order(tmp_path, walk, formats) -> None:
     rows = apple_rows(formats, walk, formats.stamps_ns(walk.time))
     for k in range(100, 5000, 500):
         rows[k], rows[k + 1] = rows[k + 1], rows[k]
@@ -104,13 +104,15 @@ def test_neighbours_that_were_swapped_are_put_in_order(tmp_path, walk, formats) 
     assert read.truth is None
 
 
-def test_large_scale_has_its_truth_in_a_folder_beside(tmp_path, walk, formats) -> None:
+def test_large_scale_recordings_have_their_truth_in_a_neighbouring_folder(
+    tmp_path, walk, formats
+) -> None:
     floor, start = tmp_path / "large scale/floor4", formats.stamps_ns(np.zeros(1))[0]
     formats.save(
         floor / "imu/imu2.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time))
     )
     formats.save(floor / "tango/tango2.csv", "", capture_rows(formats, walk, 3, start, 10**6, 0.3))
-    held_against(floor / "imu/imu2.csv", walk, 3.0)
+    assert_matches(floor / "imu/imu2.csv", walk, 3.0)
     assert find_recordings(tmp_path) == [floor / "imu/imu2.csv"]
 
 
@@ -126,10 +128,10 @@ def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk, formats) -
     ]
     formats.save(raw / "imu1.csv", "", rows)
     formats.save(raw / "vi1.csv", "", capture_rows(formats, walk, 1, EPOCH_NS, 1, 0.25))
-    held_against(raw / "imu1.csv", walk)
+    assert_matches(raw / "imu1.csv", walk)
 
 
-def test_a_capture_of_something_else_is_left_out(tmp_path, walk, formats, caplog) -> None:
+def test_a_capture_of_another_motion_is_rejected(tmp_path, walk, formats, caplog) -> None:
     formats.save(
         tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time))
     )
@@ -143,7 +145,7 @@ def test_a_capture_of_something_else_is_left_out(tmp_path, walk, formats, caplog
     assert "ground truth rejected" in caplog.text
 
 
-def test_times_that_were_rounded_to_uselessness_are_refused(tmp_path, walk, formats) -> None:
+def test_times_rounded_too_coarsely_are_refused(tmp_path, walk, formats) -> None:
     stamps = formats.stamps_ns(walk.time)
     formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, stamps))
     rows = capture_rows(formats, walk, 1, stamps[0], 1, 0.0)

@@ -1,4 +1,4 @@
-"""The recorded part of OxIOD: mount and lag are found, glitches masked, the world is level."""
+"""Recordings of OxIOD: mount and lag are found, glitches masked and the world is level."""
 
 from pathlib import Path
 
@@ -12,18 +12,18 @@ from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 OXIOD = DATA / "oxiod"
 needs_data = pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
 
-SOME = (
+SELECTED = (
     "handheld/data1/syn/imu2.csv",  # flips at 149 s
     "multi users/user2/syn/imu6.csv",  # flips at 252 s
-    "trolley/data2/syn/imu1.csv",  # turns about the vertical alone
+    "trolley/data2/syn/imu1.csv",  # turns about the vertical only
 )
 ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
 
 
-def seen_and_measured(
+def true_and_measured_rotations(
     sequence: ImuSequence, truth: Trajectory, seconds: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors [rad] of the attitude and of the gyroscope over an interval, in B."""
+    """Rotation vectors [rad] of the attitude and of the gyroscope over `seconds`, in B."""
     stride = round(seconds * 100.0)
     steps = 0.5 * np.diff(sequence.time)[:, None] * (sequence.gyro[1:] + sequence.gyro[:-1])
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
@@ -31,19 +31,19 @@ def seen_and_measured(
     inside = (truth.time > sequence.time[0]) & (truth.time < sequence.time[-1]) & truth.valid
     good = inside[:-stride] & inside[stride:]
     attitude = truth.attitude_WB
-    seen = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
-    return seen[good], (at[stride:] - at[:-stride])[good]
+    true = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    return true[good], (at[stride:] - at[:-stride])[good]
 
 
-def holds(path: Path) -> None:
+def assert_consistent(path: Path) -> None:
     sequence = read_recording(path)
     truth = sequence.truth
     assert truth is not None
-    seen, measured = seen_and_measured(sequence, truth, 0.1)
-    assert np.corrcoef(seen.ravel(), measured.ravel())[0, 1] > 0.95
-    # No flip and no glitch is left: over 0.1 s both see the same rotation to a few degrees.
-    apart = np.degrees(np.linalg.norm(seen - measured, axis=1))
-    assert np.percentile(apart, 99.9) < 15.0
+    true, measured = true_and_measured_rotations(sequence, truth, 0.1)
+    assert np.corrcoef(true.ravel(), measured.ravel())[0, 1] > 0.95
+    # No flip or glitch remains: over 0.1 s the two rotations agree to a few degrees.
+    difference = np.degrees(np.linalg.norm(true - measured, axis=1))
+    assert np.percentile(difference, 99.9) < 15.0
     assert truth.valid.mean() > 0.97
     steps = np.linalg.norm(np.diff(truth.position_W, axis=0), axis=1)
     assert steps[truth.valid[:-1] & truth.valid[1:]].max() < 0.05  # 5 m/s
@@ -61,13 +61,13 @@ def holds(path: Path) -> None:
 
 
 @needs_data
-@pytest.mark.parametrize("name", SOME)
-def test_some_recordings_agree_with_themselves(name: str) -> None:
-    holds(OXIOD / name)
+@pytest.mark.parametrize("name", SELECTED)
+def test_selected_recordings_are_self_consistent(name: str) -> None:
+    assert_consistent(OXIOD / name)
 
 
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ALL, ids=str)
-def test_every_recording_agrees_with_itself(path: Path) -> None:
-    holds(path)
+def test_every_recording_is_self_consistent(path: Path) -> None:
+    assert_consistent(path)
