@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import CONFIG, GRAPH, streamed_off
+from support import CONFIG, GRAPH, stream_deviation
 
 from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.backends import BackendName
@@ -188,7 +188,7 @@ def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Mak
     assert blind.health.bearings == {}
 
     states = pushed(Stream(oracle, CONFIG), biased_walk)
-    assert streamed_off(states, track) < 1e-6
+    assert stream_deviation(states, track) < 1e-6
     assert last_yaw_error(states, biased_walk) < math.radians(20.0)
 
 
