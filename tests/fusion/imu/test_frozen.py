@@ -16,9 +16,7 @@ Make = Callable[..., Any]
 
 
 @pytest.mark.parametrize("held", ["last", "zeros"])
-def test_a_sensor_that_stops_makes_a_gap(
-    walk: ImuSequence, make_oracle: Make, held: str
-) -> None:
+def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, held: str) -> None:
     gyro, accel, time = walk.gyro.copy(), walk.accel.copy(), walk.time
     dead = (time > time[0] + 8.0) & (time < time[0] + 11.0)
     last = np.argmax(dead) - 1
@@ -43,9 +41,7 @@ def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
 
 
 @pytest.mark.parametrize("accel", [0.0, 1.0])
-def test_a_stream_that_never_changes_is_refused_for_its_force(
-    still_model: Any, accel: float
-) -> None:
+def test_an_unchanging_stream_is_refused_for_its_force(still_model: Any, accel: float) -> None:
     n = 300
     silent = ImuSequence(
         "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
