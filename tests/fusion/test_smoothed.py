@@ -70,9 +70,7 @@ def test_smoothed_poses_are_more_accurate_than_the_filters_and_consistent(
     assert 1.4 < np.median(np.concatenate(nees)) < 3.4  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_stream_gives_the_same_smoothed_poses_as_a_batch(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_a_stream_gives_the_same_poses_as_a_batch(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(1, 15.0, 100.0, ERRORS)
     model = make_oracle(walk, walk.truth, CONFIG)
     position = walk.truth.at(np.array([3.0, 11.0])).position_W
