@@ -153,7 +153,7 @@ def test_the_sigma_of_the_fitted_turn_is_consistent(count: int) -> None:
     assert 0.8 < np.mean(np.square(errors)) < 1.3
 
 
-def test_neither_no_position_nor_a_single_place_gives_a_direction() -> None:
+def test_fewer_than_two_places_give_no_direction() -> None:
     assert PlanarAlignment().turn[1] == np.inf
     here = PlanarAlignment()
     for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
