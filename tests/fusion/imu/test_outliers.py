@@ -16,7 +16,7 @@ def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     """Number of samples flagged in a stream that is checked interval by interval."""
     detector, rows = OutlierDetector(), table(gyro_x)
     found = [
-        detector.detect(rows[k : k + size].copy()).count_saturated
+        detector.detect(rows[k : k + size].copy()).saturated
         for k in range(0, len(rows) - 1, size - 1)
     ]
     return sum(found)
