@@ -1,4 +1,4 @@
-"""Whether what was read is what was written."""
+"""Comparison of a recording as read with the one that was written."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Where the real recordings are; tests on them skip where there are none."""
+"""Folder of the real recordings; tests that need one are skipped if it is missing."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Every example runs and returns what it says."""
+"""Every example runs and returns the documented result."""
 
 import importlib.util
 import json
@@ -65,17 +65,17 @@ def test_streaming_yields_states_ten_times_a_second():
     np.testing.assert_allclose(np.diff(times), np.diff(times)[0], atol=1e-6)
 
 
-def test_train_own_leaves_weights_that_predict(tmp_path):
+def test_train_own_produces_a_model_that_predicts(tmp_path):
     model = load("train_own").main(tmp_path, epochs=1)
     mean, covariance = model.predict(np.zeros((2, 6, 200)))
     assert mean.shape == (2, 3)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-def test_live_latency_hears_of_each_position_within_a_second(monkeypatch):
+def test_live_latency_receives_positions_within_a_second(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     measured = load("live_latency").main(phones=2, seconds=3.0)
-    assert len(measured.latencies) >= 8  # two seconds of events behind the first window
+    assert len(measured.latencies) >= 8  # two seconds of events after the first window
     assert 0.0 < min(measured.latencies) < 1.0
     assert measured.memory_mb > 50.0
 
@@ -87,33 +87,33 @@ def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
     assert np.isfinite(mean).all()
 
 
-def test_cluster_shares_recordings_between_its_workers_and_goes_on_past_a_broken_one(tmp_path):
+def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(tmp_path):
     scores, skipped, workers = load("cluster").main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
     for recording in scores:
         assert recording.metrics["ekf"]["ate_m"] > 0.0
-    assert [one.item for one in skipped] == [str(tmp_path / "walk-2.csv")]
+    assert [entry.item for entry in skipped] == [str(tmp_path / "walk-2.csv")]
     assert "line 2" in skipped[0].reason
     assert len(workers) == 2
 
 
-def test_replay_live_ends_where_a_run_on_the_recording_it_left_does():
+def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
     from stario.fusion import Navigator
     from stario.sequences import read_recording
 
-    taken, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
+    sample_count, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
     recording = read_recording(path)
-    assert taken == len(recording) == 1200
+    assert sample_count == len(recording) == 1200
     track = Navigator(load_model("default")).run(recording)
     np.testing.assert_allclose(track.trajectory.position_W[-1], end, atol=1e-4)
 
 
-def test_streaming_onnx_never_imports_torch_and_gives_torchs_track(tmp_path, monkeypatch):
+def test_streaming_onnx_gives_the_torch_track_without_importing_torch(tmp_path, monkeypatch):
     pytest.importorskip("onnxscript", reason="pip install 'stario[onnx]'")
     pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
     from stario.network.runtime.export import export_onnx
 
-    # Tracing takes a second for every block: one of each kind here; `.ci/run` exports all of them.
+    # Tracing takes a second per block: one block of each kind here, all of them in `.ci/run`.
     monkeypatch.setattr("stario.network.stario.BLOCKS", (1, 0, 0, 1))
     torch.manual_seed(0)
     network = DisplacementNetwork(build_network("StarIO"))
@@ -122,17 +122,17 @@ def test_streaming_onnx_never_imports_torch_and_gives_torchs_track(tmp_path, mon
     code = f"import json, runpy; m = runpy.run_path({str(FOLDER / 'streaming_onnx.py')!r})\n"
     code += f"from pathlib import Path; print(json.dumps(m['main'](Path({str(path)!r}), 10.0)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    told = json.loads(done.stdout)
-    assert not told["torch_imported"]
+    printed = json.loads(done.stdout)
+    assert not printed["torch_imported"]
     navigator, walk = Navigator(model), demonstration()
     rows = zip(walk.time, walk.gyro, walk.accel, strict=True)
     states = [s for row in rows if row[0] <= 10.0 and (s := navigator.push(*row)) is not None]
-    assert told["states"] == len(states)
-    np.testing.assert_allclose(told["p_W"], states[-1].p_W, atol=1e-3)
+    assert printed["states"] == len(states)
+    np.testing.assert_allclose(printed["p_W"], states[-1].p_W, atol=1e-3)
 
 
 def check_odometry(outputs, largest_step=0.3):
-    """REP 105: odom is continuous and stamped in order; covariances are some."""
+    """REP 105: odom is continuous, its stamps increase and its covariances are valid."""
     position = np.array([o.odom_base.p for o in outputs])
     stamps = np.array([o.stamp_ns for o in outputs])
     assert (np.diff(stamps) > 0).all()
@@ -145,15 +145,15 @@ def check_odometry(outputs, largest_step=0.3):
 
 
 def fix_at(stamp_ns, xyz, sigma):
-    at = SimpleNamespace(x=xyz[0], y=xyz[1], z=xyz[2])
+    position = SimpleNamespace(x=xyz[0], y=xyz[1], z=xyz[2])
     pose = SimpleNamespace(
-        pose=SimpleNamespace(position=at), covariance=(sigma**2 * np.eye(6)).ravel().tolist()
+        pose=SimpleNamespace(position=position), covariance=(sigma**2 * np.eye(6)).ravel().tolist()
     )
     stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return SimpleNamespace(header=SimpleNamespace(stamp=stamp), pose=pose)
 
 
-def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
+def test_ros2_node_keeps_odom_continuous_and_corrects_map_to_odom_by_fixes():
     from stario.fusion import Navigator
 
     example = load("ros2_node")
@@ -161,15 +161,15 @@ def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
     bridge = example.OdometryBridge(Navigator(load_model("default")))
     outputs = []
     for message in example.demonstration_messages(8.0):
-        found = bridge.imu(message)
-        if found is None:
+        output = bridge.imu(message)
+        if output is None:
             continue
-        outputs.append(found)
+        outputs.append(output)
         if len(outputs) in (20, 60):
-            seen = np.array([100.0, 50.0, 0.0]) + 2.0 * found.odom_base.p[[1, 0, 2]]
-            bridge.fix(fix_at(found.stamp_ns, seen, 0.05))
-    # Although the map was moved by a hundred metres, then turned; the second fix contradicts the
-    # walk, so that the velocity that carries odom changes as well.
+            measured = np.array([100.0, 50.0, 0.0]) + 2.0 * output.odom_base.p[[1, 0, 2]]
+            bridge.fix(fix_at(output.stamp_ns, measured, 0.05))
+    # Although the map was moved by a hundred metres and then turned. The second fix contradicts the
+    # walk, so the velocity that propagates odom changes as well.
     check_odometry(outputs, largest_step=0.5)
     assert np.linalg.norm(outputs[-1].map_odom.p) > 50.0
     state = bridge._navigator.state
@@ -181,19 +181,19 @@ def test_ros2_node_keeps_odom_continuous_and_puts_fixes_into_map_to_odom():
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 30_000_000])
-def test_ros2_node_follows_a_map_that_is_moved_by_a_fix_of_now(ahead_ns):
-    """It waits for the sample of its time, and is taken in between two odometries."""
+def test_ros2_node_follows_a_map_moved_by_a_fix_at_the_current_time(ahead_ns):
+    """The fix waits for the sample of its time and is applied between two odometry outputs."""
     from stario.fusion import Navigator
 
     example = load("ros2_node")
     bridge = example.OdometryBridge(Navigator(load_model("default")))
     outputs = []
     for message in example.demonstration_messages(8.0):
-        found = bridge.imu(message)
-        outputs += [] if found is None else [found]
-        if found is not None and len(outputs) in (20, 60):
-            seen = np.array([1e5, 5e6, 0.0]) + 2.0 * found.odom_base.p[[1, 0, 2]]
-            bridge.fix(fix_at(found.stamp_ns + ahead_ns, seen, 0.05))
+        output = bridge.imu(message)
+        outputs += [] if output is None else [output]
+        if output is not None and len(outputs) in (20, 60):
+            measured = np.array([1e5, 5e6, 0.0]) + 2.0 * output.odom_base.p[[1, 0, 2]]
+            bridge.fix(fix_at(output.stamp_ns + ahead_ns, measured, 0.05))
     assert np.linalg.norm(outputs[-1].map_odom.p) > 4e6
     check_odometry(outputs, largest_step=0.5)
 
@@ -207,5 +207,5 @@ def test_ros2_node_runs_on_recorded_bags(bag):
     pytest.importorskip("rosbags", reason="pip install 'stario[bags]'")
     outputs = load("ros2_node").main(bag)
     assert len(outputs) > 20
-    # The razor's accelerometer is saturated by shaking: no track can be told from it.
+    # Shaking saturates the razor's accelerometer: no track can be computed from it.
     check_odometry(outputs, np.inf if "razor" in bag.stem else 0.3)

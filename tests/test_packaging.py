@@ -1,4 +1,4 @@
-"""What is installed is what is in the tree."""
+"""The installed package matches the source tree."""
 
 import ast
 import importlib
@@ -16,7 +16,7 @@ FOLDERS = ("fusion", "network", "sequences")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
-def test_every_package_of_the_tree_is_listed():
+def test_every_package_in_the_tree_is_listed_in_pyproject():
     found = {
         "stario." + ".".join(p.parent.relative_to(ROOT).parts)
         for folder in FOLDERS
@@ -26,7 +26,7 @@ def test_every_package_of_the_tree_is_listed():
 
 
 @pytest.mark.parametrize("package", FOLDERS)
-def test_its_readme_names_every_public_name_and_each_can_be_imported(package):
+def test_readme_names_every_public_name_and_each_can_be_imported(package):
     module = importlib.import_module(f"stario.{package}")
     text = (ROOT / package / "README.md").read_text()
     for name in module.__all__:
@@ -34,7 +34,7 @@ def test_its_readme_names_every_public_name_and_each_can_be_imported(package):
         assert re.search(rf"`{name}\b", text), name
 
 
-def test_examples_use_public_names_alone():
+def test_examples_import_only_from_public_packages():
     for path in (ROOT / "examples").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stario"):
@@ -47,7 +47,7 @@ def test_every_folder_with_modules_is_a_package():
             assert (path.parent / "__init__.py").exists(), path
 
 
-def test_constraints_pin_what_the_project_depends_on():
+def test_constraints_pin_every_dependency():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert pinned["torch"] == "2.13.0"
@@ -64,7 +64,7 @@ def test_sequences_import_neither_network_nor_fusion_and_network_not_fusion():
 
 
 def _modules_imported(path: Path) -> set[str]:
-    """Modules of stario that a file imports when it runs, also inside functions."""
+    """Modules of stario that a file imports at run time, including imports inside functions."""
     tree, found = ast.parse(path.read_text()), set()
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
@@ -75,7 +75,7 @@ def _modules_imported(path: Path) -> set[str]:
     return found
 
 
-def test_no_modules_import_each_other_in_a_circle():
+def test_modules_have_no_circular_imports():
     files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
     names = {
         ".".join(("stario", *path.relative_to(ROOT).with_suffix("").parts)): path for path in files
@@ -104,7 +104,7 @@ def test_wheel_installs_and_runs_outside_the_tree(tmp_path):
     call(sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT))
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
-    assert sdist.stat().st_size > 1_000_000  # the weights travel in it
+    assert sdist.stat().st_size > 1_000_000  # it contains the weights
     call(sys.executable, "-m", "venv", "fresh")
     call("fresh/bin/pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel))
     out = call("fresh/bin/stario", "compare", "--out", "demo")

@@ -1,4 +1,4 @@
-"""Simulated walks and a predictor that knows the truth, for every test of the navigator."""
+"""Simulated walks and a predictor that returns the ground truth, for tests of the navigator."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from stario.sequences.windows import WINDOW_SECONDS, rotated_windows
 
 
 class Oracle:
-    """Tells the true displacement of every window of one recording, with white noise if asked.
+    """Predicts the true displacement of every window of one recording, optionally with white noise.
 
-    It knows a window by its content, so that it answers alike in streams and in batches. Like a
-    network it answers in the frame that it is shown, which heads as the device does by the attitude
-    that the window was prepared with.
+    A window is identified by its content, so that predictions are the same in streams and batches.
+    Like a network's, they are in the window's frame, whose heading is that of the device according
+    to the attitude with which the window was prepared.
     """
 
     def __init__(
@@ -38,29 +38,29 @@ class Oracle:
     ) -> None:
         rng = np.random.default_rng(seed)
         intervals, _ = cut_recording(sequence, config)
-        known = [e for e in intervals if e.window is not None]
-        stop = np.array([e.stop for e in known])
+        complete = [e for e in intervals if e.window is not None]
+        stop = np.array([e.stop for e in complete])
         first, last = truth.at(stop - WINDOW_SECONDS), truth.at(stop)
-        R_NB = Rotation.from_matrix(np.stack([e.R_NB_window for e in known]))
+        R_NB = Rotation.from_matrix(np.stack([e.R_NB_window for e in complete]))
         turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
         displacement = turn.apply(last.position_W - first.position_W)
         displacement += noise * rng.standard_normal(displacement.shape)
-        heading = np.array([e.heading for e in known])
+        heading = np.array([e.heading for e in complete])
         displacement = about_z(-heading).apply(displacement)
-        seen = rotated_windows(np.stack([e.window for e in known]), -heading)
-        keys = [window.tobytes() for window in seen]
-        self._known = dict(zip(keys, displacement, strict=True))
+        windows = rotated_windows(np.stack([e.window for e in complete]), -heading)
+        keys = [window.tobytes() for window in windows]
+        self._displacements = dict(zip(keys, displacement, strict=True))
         self._covariance = sigma**2 * np.eye(3)
         self.calls = 0
 
     def predict(self, windows):
         self.calls += 1
-        mean = np.array([self._known[w.tobytes()] for w in np.asarray(windows)])
+        mean = np.array([self._displacements[w.tobytes()] for w in np.asarray(windows)])
         return mean, np.tile(self._covariance, (len(mean), 1, 1))
 
 
 class Still:
-    """Says of every window that nothing moved, without any certainty."""
+    """Predicts zero displacement for every window, with a sigma of 1 m per axis."""
 
     def predict(self, windows):
         n = len(windows)
@@ -96,13 +96,13 @@ def still_model() -> Still:
 
 @pytest.fixture(scope="session")
 def walk() -> ImuSequence:
-    """Twenty seconds in the hand, 100 Hz, an IMU with noise and biases."""
+    """Twenty seconds hand-held at 100 Hz, by an IMU with noise and biases."""
     return simulated_walk()
 
 
 @pytest.fixture(scope="session")
 def without() -> Callable[[ImuSequence, np.ndarray], ImuSequence]:
-    """A recording without the samples marked; its truth stays whole."""
+    """Function that removes the marked samples of a recording; its ground truth is kept whole."""
 
     def drop(sequence: ImuSequence, gone: np.ndarray) -> ImuSequence:
         keep = ~gone

@@ -1,4 +1,4 @@
-"""What tests of the navigator share: settings, errors of a track, a network that answers badly."""
+"""Settings, error metrics and a faulty network, shared by tests of the navigator."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from stario.fusion import Navigator, NavState, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.sequences.accuracy.metrics import Alignment, align, evaluate_track, pose_errors
+from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 
-# Settings that fit the oracle and the simulated phone; the defaults fit networks and real ones.
+# Settings for the oracle and the simulated phone; the defaults are for networks and real phones.
 FILTER = FilterConfig(
     update_rate=10,
     covariance_scale=1.0,
@@ -31,8 +31,8 @@ def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
     return [state for state in states if state is not None]
 
 
-def streamed_off(states: list[NavState], track: Track) -> float:
-    """Largest distance [m] between a stream's states and the track, at the stream's times."""
+def stream_deviation(states: list[NavState], track: Track) -> float:
+    """Maximum distance [m] between a stream's states and the track, at the stream's times."""
     rows = np.searchsorted(track.time, [s.time for s in states])
     np.testing.assert_array_equal(track.time[rows], [s.time for s in states])
     position = np.array([s.p_W for s in states])
@@ -43,13 +43,8 @@ def ate(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> 
     return evaluate_track(track.trajectory, sequence.truth, alignment=alignment).ate_m
 
 
-def final_error(track: Track, sequence: ImuSequence) -> float:
-    error = pose_errors(align(track.trajectory, sequence.truth, "first"), sequence.truth)
-    return float(np.linalg.norm(error.position_W[-1]))
-
-
 class Broken:
-    """Answers with what no estimator can use, one window in three."""
+    """Adds an error in x to every third prediction and replaces its variance."""
 
     def __init__(self, inner: Any, mean: float, variance: float) -> None:
         self.inner, self.mean, self.variance, self.count = inner, mean, variance, 0

@@ -1,4 +1,4 @@
-"""What the navigator does with input that is wrong, on simulated walks."""
+"""The navigator's handling of bad input, on simulated walks."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, FILTER, NOISE, Broken, ate, stream, streamed_off
+from support import CONFIG, FILTER, NOISE, Broken, ate, stream, stream_deviation
 
 from stario.fusion import Navigator, Track
 from stario.fusion.config import NavigatorConfig
@@ -18,7 +18,7 @@ from stario.sequences.simulation.walks import CARRYING_MODES
 
 Make = Callable[..., Any]
 
-both = pytest.mark.parametrize("backend", ["ekf", "graph"])
+both_backends = pytest.mark.parametrize("backend", ["ekf", "graph"])
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def track(walk: ImuSequence, make_oracle: Make) -> Track:
     return Navigator(make_oracle(walk, walk.truth, CONFIG)).run(walk)
 
 
-def test_health_counts_what_was_put_in(walk: ImuSequence, make_oracle: Make) -> None:
+def test_health_counts_bad_samples_gaps_and_updates(walk: ImuSequence, make_oracle: Make) -> None:
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
     gyro[200:230, 1], accel[700] = np.nan, np.inf
     time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
@@ -55,7 +55,7 @@ def test_health_counts_what_was_put_in(walk: ImuSequence, make_oracle: Make) -> 
     assert all("\n" not in line for line in health.lines())
 
 
-@both
+@both_backends
 def test_states_stay_finite_under_bursts_of_nan(
     walk: ImuSequence, make_oracle: Make, backend: Any
 ) -> None:
@@ -93,7 +93,7 @@ def test_a_stream_whose_times_are_not_in_seconds_is_refused(
         (0.0, -1.0, "covariance not positive definite"),
     ],
 )
-def test_measurements_without_meaning_are_refused_and_counted(
+def test_invalid_predictions_are_refused_and_counted(
     walk: ImuSequence, make_oracle: Make, mean: float, variance: float, reason: str
 ) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
@@ -115,7 +115,7 @@ def test_outliers_are_gated_and_do_little_harm(walk: ImuSequence, make_oracle: M
 def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
     make_walk: Make, make_oracle: Make, without: Make, length: float
 ) -> None:
-    covered, slow = [], []
+    covered, speed_errors = [], []
     for seed in range(4):
         walk = make_walk(seed, 20.0)
         holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
@@ -128,25 +128,25 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
         late = track.time > 8.0 + length + 4.0
         sigma = np.sqrt(np.trace(track.covariance[late, 6:9, 6:9], axis1=1, axis2=2))
         covered.append(np.linalg.norm(error[late], axis=1) / sigma)
-        # How far the walker turned meanwhile nobody saw: the speed comes back, not the direction.
+        # The turn within the gap is unobservable: the speed recovers, the direction does not.
         speed, true_speed = (
             np.linalg.norm(v[late, :2], axis=1) for v in (aligned.velocity_W, truth.velocity_W)
         )
-        slow.append(np.abs(speed - true_speed).mean())
+        speed_errors.append(np.abs(speed - true_speed).mean())
         before, after = (
             np.sqrt(np.trace(track.covariance[k, 6:9, 6:9]))
             for k in (np.searchsorted(track.time, 8.0) - 1, -1)
         )
         assert after > before
     assert np.max(np.mean(covered, axis=1)) < 2.0
-    assert np.max(slow) < 0.25
+    assert np.max(speed_errors) < 0.25
 
 
 @pytest.mark.parametrize(
     ("scale_gyro", "scale_accel", "option"),
     [(180 / np.pi, 1.0, "--gyro-unit deg/s"), (1.0, 1 / 9.80665, "--accel-unit g")],
 )
-def test_wrong_units_are_refused_with_the_option_that_mends_them(
+def test_wrong_units_are_refused_with_the_option_that_fixes_them(
     walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, option: str
 ) -> None:
     wrong = replace(walk, gyro=scale_gyro * walk.gyro, accel=scale_accel * walk.accel)
@@ -169,11 +169,11 @@ def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
     with pytest.raises(InputError, match="accel: found an average"):
         stream(navigator, replace(walk, accel=scale * walk.accel))
     assert navigator.state is None
-    assert streamed_off(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
+    assert stream_deviation(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
 
 
 def after_a_still_start(walk: ImuSequence) -> ImuSequence:
-    """The walk behind ten seconds at rest in its first attitude."""
+    """The walk, preceded by ten seconds at rest in its first attitude."""
     step = walk.time[1] - walk.time[0]
     rest = round(10.0 / step)
     noise = 0.01 * np.random.default_rng(0).standard_normal((rest, 6))
@@ -198,27 +198,27 @@ def test_a_stream_in_degrees_is_refused_once_the_device_turns(
     with pytest.raises(InputError, match=r"gyro: found rotations .*, expected rad/s; .*deg/s"):
         stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
     assert navigator.state is None
-    # The stream has begun anew, and in rad/s it is never refused.
+    # The stream has restarted; in rad/s it is never refused.
     states = stream(navigator, right)
     assert len(states) == len(stream(expected, right)) > 300
     np.testing.assert_array_equal(states[-1].p_W, expected.state.p_W)
 
 
-def test_a_device_that_tumbles_for_a_moment_is_not_taken_for_degrees(
+def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
     make_walk: Make, still_model: Any
 ) -> None:
     walk = make_walk(3, 26.0)
     gyro = walk.gyro.copy()
-    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anybody turns it
+    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anyone turns it
     assert stream(Navigator(still_model), replace(walk, gyro=gyro))
 
 
-def test_the_watch_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:
+def test_the_check_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:
     wrong = after_a_still_start(walk)
     wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
 
     def refused_at(stop: float) -> float:
-        """The time at which the stream is refused, continued elsewhere at a time."""
+        """Time at which the stream is refused if another navigator continues it at `stop`."""
         navigator = Navigator(still_model)
         for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):
             if time == stop:
@@ -235,7 +235,7 @@ def test_the_watch_for_degrees_survives_a_snapshot(walk: ImuSequence, still_mode
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.02, 0.9, 1.4])
-def test_a_recording_that_is_too_short_is_a_clear_error(
+def test_a_recording_that_is_too_short_raises_a_clear_error(
     walk: ImuSequence, still_model: Any, seconds: float
 ) -> None:
     with pytest.raises(InputError, match="at least") as caught:
@@ -243,7 +243,7 @@ def test_a_recording_that_is_too_short_is_a_clear_error(
     assert walk.name in str(caught.value)
 
 
-def test_a_recording_of_pieces_shorter_than_a_window_is_a_clear_error(
+def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
     walk: ImuSequence, still_model: Any, without: Make
 ) -> None:
     holed = without(walk, walk.time % 0.9 > 0.7)
@@ -252,7 +252,7 @@ def test_a_recording_of_pieces_shorter_than_a_window_is_a_clear_error(
 
 
 @pytest.mark.parametrize("vector", [(1.0, 2.0), 3.0, "abc", (1, 2, None), None])
-def test_a_sample_that_is_no_vector_is_refused_by_name(still_model: Any, vector: Any) -> None:
+def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model: Any, vector: Any) -> None:
     navigator = Navigator(still_model)
     with pytest.raises(InputError, match="gyro"):
         navigator.push(0.0, vector, (0.0, 0.0, 9.8))
@@ -261,12 +261,12 @@ def test_a_sample_that_is_no_vector_is_refused_by_name(still_model: Any, vector:
 
 
 @pytest.mark.parametrize("time", ["x", None, (1.0, 2.0)])
-def test_a_time_that_is_no_number_is_refused_by_name(still_model: Any, time: Any) -> None:
+def test_a_time_that_is_not_a_number_is_refused_by_name(still_model: Any, time: Any) -> None:
     with pytest.raises(InputError, match=r"time: found .*, expected a number"):
         Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
 
 
-def test_before_its_first_second_a_stream_has_no_state_but_a_report(
+def test_in_its_first_second_a_stream_has_a_health_report_but_no_state(
     walk: ImuSequence, still_model: Any
 ) -> None:
     navigator = Navigator(still_model)
@@ -281,12 +281,12 @@ def test_before_its_first_second_a_stream_has_no_state_but_a_report(
 
 @pytest.mark.parametrize("wild", [1e9, 300.0, 2.0])
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_wild_timestamp_does_not_starve_a_stream(
+def test_wild_timestamps_do_not_block_a_stream(
     walk: ImuSequence, make_oracle: Make, without: Make, wild: float, count: int
 ) -> None:
     time = walk.time.copy()
     jumped = np.zeros(len(walk), dtype=bool)
-    # Alone each, or (far ahead) several in a row.
+    # Single samples or, if far ahead, several in a row as well.
     jumped[1000 : 1000 + 50 * count : 50] = True
     if wild > 100.0:
         jumped[1300 : 1300 + count] = True
@@ -295,7 +295,7 @@ def test_a_wild_timestamp_does_not_starve_a_stream(
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
     states = stream(navigator, bad)
-    assert streamed_off(states, Navigator(oracle).run(expected)) < 1e-9
+    assert stream_deviation(states, Navigator(oracle).run(expected)) < 1e-9
     assert navigator.health.samples["future"] == jumped.sum()
     assert navigator.health.samples["out_of_order"] == 0
     assert navigator.health.gaps == []
@@ -313,15 +313,15 @@ def test_a_stream_may_start_with_a_wild_timestamp(
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
     states = stream(navigator, replace(walk, time=time))
-    assert streamed_off(states, Navigator(oracle).run(expected)) < 1e-9
+    assert stream_deviation(states, Navigator(oracle).run(expected)) < 1e-9
     assert navigator.health.samples["future"] == 2
 
 
 @pytest.mark.parametrize("seconds", [60.0, 1e6])
-def test_behind_a_long_gap_it_begins_anew_where_it_was(
+def test_after_a_long_gap_the_navigator_restarts_where_it_was(
     walk: ImuSequence, make_oracle: Make, seconds: float
 ) -> None:
-    """Meanwhile the device was turned over: its first second tells the tilt again."""
+    """The device is turned over in the gap: the first second after it determines the tilt again."""
     late = walk.time > 10.0
     turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
@@ -334,7 +334,7 @@ def test_behind_a_long_gap_it_begins_anew_where_it_was(
     broken = replace(walk, time=time, gyro=gyro, accel=accel, truth=truth)
     oracle = make_oracle(broken, truth, CONFIG)
     track, navigator = Navigator(oracle, CONFIG).run(broken), Navigator(oracle, CONFIG)
-    assert streamed_off(stream(navigator, broken), track) < 1e-9
+    assert stream_deviation(stream(navigator, broken), track) < 1e-9
     assert track.health.gaps == [(pytest.approx(10.0), pytest.approx(seconds + 0.01, rel=1e-6))]
     after = track.time > 10.0 + seconds + 4.0
     ours, theirs = track.trajectory, truth.at(track.time)
@@ -351,7 +351,7 @@ def test_behind_a_long_gap_it_begins_anew_where_it_was(
 # --- values ----------------------------------------------------------------------------------
 
 
-@both
+@both_backends
 def test_spikes_are_replaced_and_counted(
     walk: ImuSequence, make_oracle: Make, backend: Any
 ) -> None:
@@ -363,8 +363,8 @@ def test_spikes_are_replaced_and_counted(
     oracle = make_oracle(spiky, walk.truth, CONFIG)
     track = Navigator(oracle, CONFIG, backend=backend).run(spiky)
     navigator = Navigator(oracle, CONFIG, backend=backend)
-    off = streamed_off(stream(navigator, spiky), track)
-    assert off < (1e-9 if backend == "ekf" else 0.3)  # the whole track knows what came later
+    off = stream_deviation(stream(navigator, spiky), track)
+    assert off < (1e-9 if backend == "ekf" else 0.3)  # the batch graph also uses later data
     assert navigator.health.flagged == track.health.flagged
     assert track.health.flagged == {"spike": 3, "saturated": 0}
     assert track.health.samples["used"] == len(walk)
@@ -372,7 +372,7 @@ def test_spikes_are_replaced_and_counted(
     assert any("spike 3" in line for line in track.health.lines())
 
 
-@both
+@both_backends
 def test_a_clipped_sensor_is_flagged_and_trusted_less(
     walk: ImuSequence, make_oracle: Make, backend: Any
 ) -> None:
@@ -389,7 +389,7 @@ def test_a_clipped_sensor_is_flagged_and_trusted_less(
     assert ate(track, walk) < ate(whole, walk) + 0.2
 
 
-def test_a_network_that_claims_to_be_exact_is_not_believed(
+def test_a_network_that_claims_to_be_exact_is_not_trusted(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.01, sigma=1e-9)
@@ -399,20 +399,20 @@ def test_a_network_that_claims_to_be_exact_is_not_believed(
     assert ate(track, walk) < 0.3
 
 
-def test_a_tenth_of_a_second_without_samples_hardly_moves_the_end(
+def test_a_tenth_of_a_second_without_samples_hardly_changes_the_end(
     make_walk: Make, make_oracle: Make
 ) -> None:
-    """Anywhere: nothing that is given out may hang on a hair."""
+    """Wherever they are missing: no output may depend on a marginal decision."""
     walk = make_walk(4, 40.0, 100.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     whole = Navigator(oracle, CONFIG).run(walk).trajectory
     for start in (8.0, 15.0, 22.0, 29.0):
         keep = (walk.time < start) | (walk.time > start + 0.12)
         rows = (walk.time[keep], walk.gyro[keep], walk.accel[keep])
-        spoilt = replace(walk, time=rows[0], gyro=rows[1], accel=rows[2])
-        answering = make_oracle(spoilt, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-        ended = Navigator(answering, CONFIG).run(spoilt).trajectory
-        off = np.linalg.norm(ended.position_W[-1] - whole.position_W[-1])
+        holed = replace(walk, time=rows[0], gyro=rows[1], accel=rows[2])
+        holed_oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+        track = Navigator(holed_oracle, CONFIG).run(holed).trajectory
+        off = np.linalg.norm(track.position_W[-1] - whole.position_W[-1])
         assert off < 0.02 * walk.truth.path_length()
-        turned = ended.attitude_WB[-1] * whole.attitude_WB[-1].inv()
+        turned = track.attitude_WB[-1] * whole.attitude_WB[-1].inv()
         assert abs(np.degrees(turned.as_rotvec()[2])) < 3.0

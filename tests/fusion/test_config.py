@@ -1,4 +1,4 @@
-"""Configuration files: read, refused, saved and read back."""
+"""Configuration files are read, validated, saved and read back."""
 
 import json
 from dataclasses import asdict, replace
@@ -27,7 +27,7 @@ gyro_noise = 1e-3
 """
 
 
-def test_toml_sets_what_it_names_and_leaves_the_rest(tmp_path: Path) -> None:
+def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path: Path) -> None:
     path = tmp_path / "slow.toml"
     path.write_text(TOML)
     default, config = NavigatorConfig(), read_config(path)
@@ -39,14 +39,14 @@ def test_toml_sets_what_it_names_and_leaves_the_rest(tmp_path: Path) -> None:
     )
 
 
-def test_json_and_toml_mean_the_same(tmp_path: Path) -> None:
+def test_json_and_toml_give_the_same_configuration(tmp_path: Path) -> None:
     values = {"gravity": 9.8, "filter": {"gate": 0.99}}
     (tmp_path / "a.json").write_text(json.dumps(values))
     (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
     assert read_config(tmp_path / "a.json") == read_config(tmp_path / "a.toml")
 
 
-def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
+def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "empty.toml").write_text("")
     assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
 
@@ -83,7 +83,7 @@ def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
         ({"gravity": float("nan")}, "gravity"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
+def test_an_invalid_setting_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
     with pytest.raises(ConfigError) as caught:
         with_settings(NavigatorConfig(), values)
     assert caught.value.field == named
@@ -106,14 +106,14 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path: Path, name: str, conten
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_or_a_folder_is_a_known_error(tmp_path: Path) -> None:
+def test_a_missing_file_or_a_folder_raises_a_stario_error(tmp_path: Path) -> None:
     for path in (tmp_path / "none.toml", tmp_path):
         with pytest.raises(StarioError):
             read_config(path)
 
 
 @pytest.mark.parametrize("rate", UPDATE_RATES)
-def test_updates_fall_on_states_and_overlap_is_paid_for(rate: int) -> None:
+def test_updates_coincide_with_states_and_overlap_inflates_the_covariance(rate: int) -> None:
     config = FilterConfig(update_rate=rate, covariance_scale=1.0)
     assert config.intervals_per_update * rate == config.output_rate >= 10
     assert config.window_updates == rate

@@ -1,4 +1,4 @@
-"""The continuous position: it never steps, and it arrives."""
+"""The continuous position never steps, and converges to the corrected one."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,31 +13,31 @@ from stario.sequences.sequence import ImuSequence
 Make = Callable[..., Any]
 
 
-def at(time: float, x: float, map_frame: int = 0) -> NavState:
+def state_at(time: float, x: float, map_frame: int = 0) -> NavState:
     zero, v_W = np.zeros(3), np.array([1.0, 0.0, 0.0])
     p_W = np.array([time + x, 0.0, 0.0])
     return NavState(time, np.eye(3), v_W, p_W, zero, zero, np.eye(15), False, map_frame)
 
 
 def test_a_step_is_bled_in_a_centimetre_at_a_time() -> None:
-    pose = advanced(None, at(0.0, 0.0))
-    lacking = []
+    pose = advanced(None, state_at(0.0, 0.0))
+    remaining = []
     for k in range(1, 101):
-        before, pose = pose, advanced(pose, at(0.1 * k, 0.5))
+        before, pose = pose, advanced(pose, state_at(0.1 * k, 0.5))
         assert abs(pose.p_W[0] - before.p_W[0] - 0.1) < LARGEST_STEP + 1e-12
-        np.testing.assert_allclose(pose.p_W + pose.correction_W, at(0.1 * k, 0.5).p_W)
-        lacking.append(pose.correction_W[0])
-    assert (np.diff(lacking) < 0.0).all()
-    assert lacking[-1] < 0.01
+        np.testing.assert_allclose(pose.p_W + pose.correction_W, state_at(0.1 * k, 0.5).p_W)
+        remaining.append(pose.correction_W[0])
+    assert (np.diff(remaining) < 0.0).all()
+    assert remaining[-1] < 0.01
 
 
-def test_where_fixes_move_the_frame_it_begins_anew() -> None:
-    pose = advanced(advanced(None, at(0.0, 0.0)), at(0.1, 100.0, map_frame=1))
+def test_the_continuous_position_is_reset_where_fixes_move_the_frame() -> None:
+    pose = advanced(advanced(None, state_at(0.0, 0.0)), state_at(0.1, 100.0, map_frame=1))
     np.testing.assert_array_equal(pose.correction_W, np.zeros(3))
 
 
-def test_a_stream_that_is_corrected_does_not_step(walk: ImuSequence, make_oracle: Make) -> None:
-    """Noise of a quarter of a metre makes the corrected position step; this one moves evenly."""
+def test_corrections_cause_no_step_in_the_position(walk: ImuSequence, make_oracle: Make) -> None:
+    """Noise of a quarter of a metre makes the corrected position step, not the continuous one."""
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG, noise=0.25, sigma=0.25), CONFIG)
     poses: list[ContinuousPose] = []
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
@@ -53,7 +53,7 @@ def test_a_stream_that_is_corrected_does_not_step(walk: ImuSequence, make_oracle
     assert np.linalg.norm(poses[-1].correction_W) < 0.5
 
 
-def test_a_late_fix_that_moves_the_map_moves_it_at_once(
+def test_a_late_fix_that_moves_the_map_moves_the_continuous_position_at_once(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
@@ -66,16 +66,16 @@ def test_a_late_fix_that_moves_the_map_moves_it_at_once(
     np.testing.assert_allclose(navigator.continuous.p_W, navigator.state.p_W)
 
 
-def test_what_is_given_out_may_be_written_to(walk: ImuSequence, make_oracle: Make) -> None:
+def test_returned_arrays_may_be_overwritten(walk: ImuSequence, make_oracle: Make) -> None:
     ends = []
-    for spoilt in (False, True):
+    for overwrite in (False, True):
         navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
         for row in zip(walk.time[:800], walk.gyro[:800], walk.accel[:800], strict=True):
             state = navigator.push(*row)
-            if state is not None and spoilt:
+            if state is not None and overwrite:
                 assert navigator.continuous is not None
-                for given in (state, navigator.continuous, navigator.state):
-                    for value in vars(given).values():
+                for returned in (state, navigator.continuous, navigator.state):
+                    for value in vars(returned).values():
                         if isinstance(value, np.ndarray):
                             value *= 57.3
         assert navigator.state is not None

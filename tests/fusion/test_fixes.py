@@ -1,4 +1,4 @@
-"""Absolute fixes: in time, late or ahead, in stream and batch, and the world they tell."""
+"""Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -65,7 +65,7 @@ def fixes_of(walk: ImuSequence) -> list[Fix]:
     ]
 
 
-def give(navigator: Navigator, fix: Fix) -> None:
+def apply_fix(navigator: Navigator, fix: Fix) -> None:
     if fix.kind == "position":
         navigator.update_position(fix.time, fix.value, fix.covariance)
     elif fix.kind == "velocity":
@@ -75,11 +75,11 @@ def give(navigator: Navigator, fix: Fix) -> None:
 
 
 def streamed(navigator: Navigator, walk: ImuSequence, fixes: list[Fix], late: float) -> NavState:
-    """The last state of a stream that hears of each fix `late` seconds after its time."""
+    """Last state of a stream that receives each fix `late` seconds after its time."""
     waiting = sorted(fixes, key=lambda fix: fix.time)
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         while waiting and row[0] >= waiting[0].time + late:
-            give(navigator, waiting.pop(0))
+            apply_fix(navigator, waiting.pop(0))
         navigator.push(*row)
     return navigator.state
 
@@ -124,7 +124,7 @@ def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
     np.testing.assert_allclose(H, numeric, atol=1e-7 * max(1.0, np.abs(numeric).max()))
 
 
-def test_yaw_is_that_of_the_recordings_and_undefined_upside_down() -> None:
+def test_yaw_twist_agrees_with_yaw_of_and_is_undefined_upside_down() -> None:
     attitude = Rotation.random(50, rng=np.random.default_rng(0))
     ours = np.array([yaw_twist(R) for R in attitude.as_matrix()])
     known = np.isfinite(ours)
@@ -138,7 +138,7 @@ def test_yaw_is_that_of_the_recordings_and_undefined_upside_down() -> None:
 
 
 @pytest.mark.parametrize("late", [-3.0, 0.0, 0.3, 0.85])
-def test_a_fix_counts_at_its_own_time_however_late(
+def test_a_fix_is_applied_at_its_own_time_however_late(
     walk: ImuSequence, make_oracle: Make, late: float
 ) -> None:
     model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
@@ -153,7 +153,7 @@ def test_a_fix_counts_at_its_own_time_however_late(
     assert navigator.health.zero_velocity == track.health.zero_velocity
 
 
-def test_older_fixes_are_refused_and_counted(walk: ImuSequence, model: Any) -> None:
+def test_fixes_that_are_too_old_are_refused_and_counted(walk: ImuSequence, model: Any) -> None:
     untouched, navigator = Navigator(model, CONFIG), Navigator(model, CONFIG)
     streamed(untouched, walk, [], 0.0)
     streamed(navigator, walk, fixes_of(walk), 1.6)
@@ -164,18 +164,18 @@ def test_older_fixes_are_refused_and_counted(walk: ImuSequence, model: Any) -> N
     assert track.health.fixes == {"before the start": 1, "after the end": 1}
 
 
-def test_fixes_of_the_future_wait(walk: ImuSequence, model: Any) -> None:
+def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None:
     navigator = Navigator(model, CONFIG)
     for fix in reversed(fixes_of(walk)):
-        give(navigator, fix)
-    give(navigator, position_fix(walk.time[-1] + 60.0, np.zeros(3), EYE))
+        apply_fix(navigator, fix)
+    apply_fix(navigator, position_fix(walk.time[-1] + 60.0, np.zeros(3), EYE))
     assert navigator.health.fixes == {"waiting": 5}
     state = streamed(navigator, walk, [], 0.0)
     assert navigator.health.fixes == {"applied": 4, "waiting": 1}
     assert_same(state, Navigator(model, CONFIG).run(walk, fixes=fixes_of(walk)))
 
 
-def test_an_epoch_cut_in_two_says_the_same(walk: ImuSequence) -> None:
+def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk: ImuSequence) -> None:
     interval = next(e for e in cut_recording(walk, CONFIG)[0] if e.window is not None)
     for time in (interval.start + 0.033, float(interval.time[4]), interval.stop - 1e-4):
         first, second = split_at(interval, time)
@@ -188,14 +188,14 @@ def test_an_epoch_cut_in_two_says_the_same(walk: ImuSequence) -> None:
             np.testing.assert_allclose(sum(halves), whole, atol=1e-12)
 
 
-# --- the world -------------------------------------------------------------------------------
+# --- the map frame ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, np.pi, -2.5])
-def test_two_positions_tell_where_a_track_is_and_how_it_is_turned(
+def test_two_positions_determine_the_position_and_direction_of_a_track(
     walk: ImuSequence, model: Any, turn: float
 ) -> None:
-    """The fixes' world is turned and shifted against the walk's by any amount."""
+    """The map frame is turned and shifted relative to the walk's by any amount."""
     R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
     fixes = [
         position_fix(t, R @ truth_at(walk, t)[0] + shift, 1e-4 * EYE)
@@ -212,7 +212,7 @@ def test_two_positions_tell_where_a_track_is_and_how_it_is_turned(
     assert np.linalg.norm(np.diff(track.trajectory.position_W, axis=0), axis=1).max() < 0.4
 
 
-def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> None:
+def test_the_covariance_in_the_map_frame_is_consistent(make_walk: Make, make_oracle: Make) -> None:
     position, yaw = [], []
     for seed in range(12):
         walk = make_walk(seed, 30.0, 50.0, ERRORS)
@@ -225,7 +225,7 @@ def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> 
         ]
         track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
         if track.health.fixes != {"applied": 2}:
-            continue  # hardly moved
+            continue  # too little motion to determine the yaw
         truth = walk.truth.at(track.time[-1:].clip(0.0, walk.time[-1]))
         off = turn.apply(truth.position_W[0]) - track.trajectory.position_W[-1]
         turned = turn * truth.attitude_WB * track.trajectory.attitude_WB[-1:].inv()
@@ -238,7 +238,7 @@ def test_the_worlds_covariance_is_honest(make_walk: Make, make_oracle: Make) -> 
 
 
 @pytest.mark.parametrize("kind", ["yaw", "velocity"])
-def test_a_heading_or_a_velocity_tells_the_yaw_too(
+def test_a_heading_or_a_velocity_determines_the_yaw_too(
     walk: ImuSequence, model: Any, kind: str
 ) -> None:
     turn = about_z(2.0)
@@ -251,13 +251,15 @@ def test_a_heading_or_a_velocity_tells_the_yaw_too(
         else:
             fixes += [velocity_fix(t, turn.apply(v), 1e-4 * EYE)]
     track = Navigator(model, CONFIG).run(walk, fixes=fixes)
-    assert track.health.fixes["applied"] >= 3  # a velocity does not tell it at any speed
+    assert track.health.fixes["applied"] >= 3  # a slow velocity does not determine it
     truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
     off = turn.apply(truth.position_W) - track.trajectory.position_W
     assert np.linalg.norm(off, axis=1).max() < 1.0
 
 
-def test_a_known_start_is_corrected_and_not_moved(walk: ImuSequence, model: Any) -> None:
+def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(
+    walk: ImuSequence, model: Any
+) -> None:
     first = walk.truth.at(walk.time[:1])
     prior = PriorPose(first.attitude_WB[0].as_matrix(), first.velocity_W[0], first.position_W[0])
     p = truth_at(walk, 25.0)[0]
@@ -273,16 +275,20 @@ def test_a_known_start_is_corrected_and_not_moved(walk: ImuSequence, model: Any)
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
 
 
-def test_too_near_positions_do_not_turn_the_world(walk: ImuSequence, model: Any) -> None:
+def test_positions_too_close_together_do_not_turn_the_map_frame(
+    walk: ImuSequence, model: Any
+) -> None:
     fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
     track = Navigator(model, CONFIG).run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
 
 
-def test_states_of_a_stream_say_which_world_they_are_in(walk: ImuSequence, model: Any) -> None:
+def test_states_of_a_stream_carry_the_number_of_their_map_frame(
+    walk: ImuSequence, model: Any
+) -> None:
     navigator, map_frames = Navigator(model, CONFIG), []
     for fix in fixes_of(walk):
-        give(navigator, fix)
+        apply_fix(navigator, fix)
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         state = navigator.push(*row)
         if state is not None:
@@ -307,7 +313,7 @@ def test_states_of_a_stream_say_which_world_they_are_in(walk: ImuSequence, model
         ([0, 0, 0], np.triu(np.ones((3, 3))), "covariance not positive definite"),
     ],
 )
-def test_fixes_without_meaning_are_refused_and_counted(
+def test_invalid_fixes_are_refused_and_counted(
     walk: ImuSequence, model: Any, value: list[float], covariance: np.ndarray, reason: str
 ) -> None:
     bad = position_fix(5.0, value, covariance)
@@ -318,7 +324,9 @@ def test_fixes_without_meaning_are_refused_and_counted(
     assert np.isfinite(navigator.state.covariance).all()
 
 
-def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
+def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
+    walk: ImuSequence, model: Any
+) -> None:
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 3.0), [], 0.0)
     for time in (np.nan, np.inf):
@@ -337,7 +345,7 @@ def test_fixes_at_no_time_are_refused(walk: ImuSequence, model: Any) -> None:
         (-np.inf, "value that is not finite"),
     ],
 )
-def test_a_heading_whose_sigma_is_none_is_refused_and_counted(
+def test_a_heading_with_an_invalid_sigma_is_refused_and_counted(
     walk: ImuSequence, model: Any, sigma: float, reason: str
 ) -> None:
     bad = yaw_fix(5.0, 0.0, sigma)
@@ -348,7 +356,7 @@ def test_a_heading_whose_sigma_is_none_is_refused_and_counted(
     assert navigator.health.fixes == {reason: 1}
 
 
-def test_a_shape_that_does_not_fit_is_an_error_by_name(model: Any) -> None:
+def test_a_wrong_shape_raises_an_error_that_names_the_argument(model: Any) -> None:
     navigator = Navigator(model, CONFIG)
     with pytest.raises(InputError, match="position"):
         navigator.update_position(0.0, [1.0, 2.0], EYE)
@@ -358,7 +366,7 @@ def test_a_shape_that_does_not_fit_is_an_error_by_name(model: Any) -> None:
         navigator.update_yaw(0.0, "north", 0.1)  # type: ignore[arg-type]
 
 
-def test_a_fix_stated_as_exact_has_a_floor(walk: ImuSequence, model: Any) -> None:
+def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: Any) -> None:
     p = truth_at(walk, 10.0)[0]
     track = Navigator(model, CONFIG).run(walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)])
     assert track.health.fixes == {"applied": 1}
@@ -371,7 +379,7 @@ def test_a_fix_stated_as_exact_has_a_floor(walk: ImuSequence, model: Any) -> Non
 HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
 
-def test_a_file_of_fixes(tmp_path: Path) -> None:
+def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
     path = tmp_path / "fixes.csv"
     path.write_text(
         HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,yaw,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
@@ -404,7 +412,7 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         (HEADER + "1,position,1,2,3,1,1,1,1\n", "9 values"),
     ],
 )
-def test_a_file_that_does_not_fit_names_line_and_field(
+def test_an_invalid_file_raises_an_error_that_names_line_and_field(
     tmp_path: Path, text: str, match: str
 ) -> None:
     path = tmp_path / "fixes.csv"
@@ -415,7 +423,7 @@ def test_a_file_that_does_not_fit_names_line_and_field(
     assert "\n" not in str(caught.value)
 
 
-def test_columns_in_any_order_and_degrees_and_the_plane(tmp_path: Path) -> None:
+def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path: Path) -> None:
     path = tmp_path / "fixes.csv"
     path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw[deg];2;170;;;5\n")
     position, yaw = read_fixes(path)
@@ -426,6 +434,6 @@ def test_columns_in_any_order_and_degrees_and_the_plane(tmp_path: Path) -> None:
     np.testing.assert_allclose(yaw.covariance, [[np.radians(5.0) ** 2]])
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_file_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(ReadError, match="fixes"):
         read_fixes(tmp_path / "fixes.csv")

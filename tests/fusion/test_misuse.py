@@ -1,4 +1,4 @@
-"""What is no navigator's business is refused at once, by name."""
+"""Wrong arguments are refused at once, by name."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -55,24 +55,26 @@ def test_a_wrong_argument_is_named(still_model: Any, make: Any, named: str) -> N
         make(still_model)
 
 
-def test_a_fix_that_is_none_is_named(walk: ImuSequence, still_model: Any) -> None:
+def test_a_fix_of_the_wrong_type_is_refused_with_a_remedy(
+    walk: ImuSequence, still_model: Any
+) -> None:
     with pytest.raises(InputError, match="position_fix"):
         Navigator(still_model).run(walk, fixes=[(1.0, "position")])
 
 
-def test_a_fix_alone_is_no_list(walk: ImuSequence, still_model: Any) -> None:
+def test_a_single_fix_in_place_of_a_list_is_named(walk: ImuSequence, still_model: Any) -> None:
     with pytest.raises(InputError, match="fixes"):
         Navigator(still_model).run(walk, fixes=position_fix(1.0, np.zeros(3), np.eye(3)))
 
 
-def test_numbers_of_any_type_are_numbers() -> None:
+def test_numpy_numbers_are_accepted() -> None:
     config = FilterConfig(update_rate=np.float64(10.0), adaptive=np.True_)
     assert config.update_rate == 10
     assert isinstance(config.update_rate, int)
     assert PriorPose(*LEVEL, yaw_sigma=np.array(0.1)).yaw_sigma == 0.1
 
 
-def test_a_recording_prepared_for_another_rate_is_refused(
+def test_a_recording_preprocessed_for_another_update_rate_is_refused(
     walk: ImuSequence, still_model: Any
 ) -> None:
     fast = Navigator(still_model, NavigatorConfig(filter=FilterConfig(update_rate=10)))
@@ -85,12 +87,12 @@ def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
 ) -> None:
     times = np.linspace(1.0, walk.duration - 0.01, 10_500)
     fixes = [position_fix(t, np.zeros(3), 1e4 * np.eye(3)) for t in times]
-    told = Navigator(still_model).run(walk, fixes=fixes).health.fixes
-    assert sum(told.values()) == len(fixes)
-    assert "too many waiting" not in told
+    counts = Navigator(still_model).run(walk, fixes=fixes).health.fixes
+    assert sum(counts.values()) == len(fixes)
+    assert "too many waiting" not in counts
 
 
-def test_fixes_of_a_clock_ahead_keep_no_right_one_out(still_model: Any) -> None:
+def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model: Any) -> None:
     navigator = Navigator(still_model)
     for k in range(10_001):
         navigator.update_position(1e6 + k, np.zeros(3), np.eye(3))
@@ -98,7 +100,7 @@ def test_fixes_of_a_clock_ahead_keep_no_right_one_out(still_model: Any) -> None:
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
 
 
-def test_biases_that_do_not_walk_are_fine_for_the_graph(make_walk: Make, make_oracle: Make) -> None:
+def test_the_graph_accepts_biases_without_random_walk(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(3, 15.0)
     oracle = make_oracle(walk, walk.truth, GRAPH, noise=0.03, sigma=0.03)
     steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
@@ -106,7 +108,7 @@ def test_biases_that_do_not_walk_are_fine_for_the_graph(make_walk: Make, make_or
     assert not any("fell back" in note for note in track.health.notes)
 
 
-def test_a_snapshot_with_any_byte_changed_is_refused_or_read(
+def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(
     walk: ImuSequence, still_model: Any
 ) -> None:
     navigator = Navigator(still_model)
@@ -115,31 +117,29 @@ def test_a_snapshot_with_any_byte_changed_is_refused_or_read(
     data = navigator.snapshot()
     rng = np.random.default_rng(0)
     for place in rng.integers(0, len(data), 60).tolist():
-        spoiled = bytearray(data)
-        spoiled[place] ^= 0xFF
-        with suppress(InputError):  # what is no snapshot any more is refused by name alone
-            Navigator(still_model).restore(bytes(spoiled))
+        corrupted = bytearray(data)
+        corrupted[place] ^= 0xFF
+        with suppress(InputError):  # an invalid snapshot raises nothing else
+            Navigator(still_model).restore(bytes(corrupted))
 
 
 @pytest.mark.parametrize("rate", [20.0, 2000.0])
-def test_a_stream_too_slow_or_too_fast_is_refused_as_a_recording_is(
-    still_model: Any, rate: float
-) -> None:
-    navigator, told = Navigator(still_model), None
+def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model: Any, rate: float) -> None:
+    navigator, refused_at = Navigator(still_model), None
     for k in range(round(1.2 * rate)):
         with suppress(InputError):
             navigator.push(k / rate, np.zeros(3), [0.0, 0.0, 9.81])
             continue
-        told = k
+        refused_at = k
         break
-    assert told is not None
+    assert refused_at is not None
     assert navigator.state is None
     for k in range(300):
         navigator.push(100.0 + k / 100.0, np.zeros(3), [0.0, 0.0, 9.81])
     assert navigator.state is not None
 
 
-def test_arguments_in_each_others_place_are_named(still_model: Any, make_walk: Make) -> None:
+def test_misplaced_arguments_are_named(still_model: Any, make_walk: Make) -> None:
     walk = make_walk(1, 3.0)
     with pytest.raises(InputError, match=r"progress.*fixes="):
         Navigator(still_model).run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]

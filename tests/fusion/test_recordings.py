@@ -1,4 +1,4 @@
-"""The navigator on real recordings, where they are at hand."""
+"""The navigator on real recordings, where they are available."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def model() -> DisplacementModel:
 
 
 def stretch(name: str, seconds: float) -> ImuSequence:
-    """Some seconds from five seconds into a recording."""
+    """A stretch of a recording, beginning five seconds after its start."""
     if not (DATA / name).exists():
         pytest.skip(f"no {name} at {DATA}")
     recording = read_recording(DATA / name)
@@ -33,10 +33,10 @@ def stretch(name: str, seconds: float) -> ImuSequence:
     return recording.slice(start, start + seconds)
 
 
-# Measured 0.24, 0.82 and 20 m in 20 s; a platform in flight is not for a network of walks, but the
-# IMU alone is 300 m off there.
+# Measured 0.24, 0.82 and 20 m in 20 s. A network trained on walks does not suit a flying platform,
+# but the IMU alone is 300 m off there.
 @pytest.mark.parametrize(("name", "worst_m"), [(OXIOD, 0.5), (TUMVI, 1.5), (EUROC, 40.0)])
-def test_recordings_of_every_format_run_through(
+def test_recordings_of_every_format_run_with_a_bounded_error(
     model: DisplacementModel, name: str, worst_m: float
 ) -> None:
     recording = stretch(name, 20.0)
@@ -54,10 +54,10 @@ def test_recordings_of_every_format_run_through(
 
 
 @pytest.mark.parametrize("name", [OXIOD, TUMVI])
-def test_truth_removed_gives_the_identical_track(model: DisplacementModel, name: str) -> None:
+def test_the_track_is_identical_without_ground_truth(model: DisplacementModel, name: str) -> None:
     recording = stretch(name, 15.0)
-    seen, blind = (Navigator(model).run(r) for r in (recording, recording.without_truth()))
-    for key, values in seen.arrays().items():
+    full, blind = (Navigator(model).run(r) for r in (recording, recording.without_truth()))
+    for key, values in full.arrays().items():
         np.testing.assert_array_equal(blind.arrays()[key], values, err_msg=key)
 
 

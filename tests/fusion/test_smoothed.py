@@ -1,4 +1,4 @@
-"""The EKF's poses one window late: better than the filter's, and as sure as they say."""
+"""The EKF's poses one window late: more accurate than the filter's, and consistent."""
 
 from collections.abc import Callable
 from typing import Any
@@ -43,19 +43,19 @@ def tracks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Track]
     return made
 
 
-def test_it_is_one_window_late_and_surer_than_the_filter_was(
+def test_smoothed_poses_are_one_window_late_and_more_certain_than_the_filters(
     tracks: list[tuple[ImuSequence, Track]],
 ) -> None:
     for _, track in tracks:
         np.testing.assert_allclose(np.diff(track.smoothed.time), 1.0, atol=1e-9)
         assert track.smoothed.time[-1] == pytest.approx(track.time[-1] - 1.0)
         at = np.searchsorted(track.time, track.smoothed.time - 1e-6)
-        then = np.trace(track.covariance[at, 6:9, 6:9], axis1=1, axis2=2)
-        late = np.trace(track.smoothed.position_covariance_W, axis1=1, axis2=2)
-        assert (late[2:] <= then[2:] + 1e-9).all()
+        filtered = np.trace(track.covariance[at, 6:9, 6:9], axis1=1, axis2=2)
+        smoothed = np.trace(track.smoothed.position_covariance_W, axis1=1, axis2=2)
+        assert (smoothed[2:] <= filtered[2:] + 1e-9).all()
 
 
-def test_it_is_no_worse_than_the_filter_and_honest(
+def test_smoothed_poses_are_more_accurate_than_the_filters_and_consistent(
     tracks: list[tuple[ImuSequence, Track]],
 ) -> None:
     filtered, smoothed, nees = [], [], []
@@ -67,10 +67,10 @@ def test_it_is_no_worse_than_the_filter_and_honest(
         P = track.smoothed.position_covariance_W[1:]
         nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]))
     assert np.mean(smoothed) < np.mean(filtered)
-    assert 1.4 < np.median(np.concatenate(nees)) < 3.4  # of chi-square with 3: 2.4
+    assert 1.4 < np.median(np.concatenate(nees)) < 3.4  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_stream_gives_the_same_poses(make_walk: Make, make_oracle: Make) -> None:
+def test_a_stream_gives_the_same_poses_as_a_batch(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(1, 15.0, 100.0, ERRORS)
     model = make_oracle(walk, walk.truth, CONFIG)
     position = walk.truth.at(np.array([3.0, 11.0])).position_W

@@ -1,4 +1,4 @@
-"""A stream stopped and continued elsewhere gives the states it would have given."""
+"""A stream that is stopped and continued elsewhere gives the same states as without a stop."""
 
 import io
 import subprocess
@@ -37,10 +37,10 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
 
 
 @pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
-def test_a_stream_continues_to_the_bit(
+def test_a_restored_stream_continues_bit_for_bit(
     walk: ImuSequence, make_oracle: Make, without: Make, stop: float
 ) -> None:
-    """Before the first second, in between, beside a gap; fixes wait or come late."""
+    """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
     accel = holed.accel.copy()
     accel[300] += 400.0
@@ -69,7 +69,7 @@ def test_a_stream_continues_to_the_bit(
     assert second.health.fixes["value that is not finite"] == 1
 
 
-def test_the_prior_goes_with_it(walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_snapshot_includes_the_prior(walk: ImuSequence, make_oracle: Make) -> None:
     model = make_oracle(walk, walk.truth, CONFIG)
     prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
     whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)
@@ -106,7 +106,7 @@ else:
 """
 
 
-def test_another_process_continues_it(tmp_path: Path, still_model: Any) -> None:
+def test_another_process_can_continue_a_stream(tmp_path: Path, still_model: Any) -> None:
     from stario.sequences.simulation.imu import simulate_imu
     from stario.sequences.simulation.walks import generate_walk
 
@@ -124,7 +124,7 @@ def test_another_process_continues_it(tmp_path: Path, still_model: Any) -> None:
 # --- refused ---------------------------------------------------------------------------------
 
 
-class Carded:
+class ModelWithCard:
     def __init__(self, sha256: str) -> None:
         self.card = type("Card", (), {"sha256": sha256})()
 
@@ -132,22 +132,22 @@ class Carded:
         return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
 
 
-def test_another_configuration_or_model_is_refused_by_name(walk: ImuSequence) -> None:
-    navigator = Navigator(Carded("abc"), CONFIG)
+def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk: ImuSequence) -> None:
+    navigator = Navigator(ModelWithCard("abc"), CONFIG)
     push(navigator, walk, 0.0, 2.0)
     data = navigator.snapshot()
     coarser = replace(CONFIG, filter=replace(CONFIG.filter, yaw_sigma=0.5))
     with pytest.raises(InputError, match=r"config\.filter\.yaw_sigma: found 0\.001, expected 0\.5"):
-        Navigator(Carded("abc"), coarser).restore(data)
+        Navigator(ModelWithCard("abc"), coarser).restore(data)
     with pytest.raises(InputError, match="model: found 'abc'"):
-        Navigator(Carded("def"), CONFIG).restore(data)
-    other = Navigator(Carded("abc"), CONFIG, backend="graph")
+        Navigator(ModelWithCard("def"), CONFIG).restore(data)
+    other = Navigator(ModelWithCard("abc"), CONFIG, backend="graph")
     with pytest.raises(InputError, match="backend"):
         other.restore(data)
     assert other.state is None
 
 
-def test_bytes_that_are_no_snapshot_are_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_bytes_that_are_not_a_snapshot_are_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     push(navigator, walk, 0.0, 3.0)
     data, before = navigator.snapshot(), navigator.state.p_W
@@ -162,14 +162,14 @@ def test_bytes_that_are_no_snapshot_are_refused(walk: ImuSequence, still_model: 
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
-def test_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     data = pack(unpack(navigator.snapshot()) | {"version": 1})
     with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
         navigator.restore(data)
 
 
-def test_nothing_in_it_is_pickled(walk: ImuSequence, still_model: Any) -> None:
+def test_a_snapshot_contains_no_pickles(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     push(navigator, walk, 0.0, 3.0)
     with zipfile.ZipFile(io.BytesIO(navigator.snapshot())) as file:
@@ -180,7 +180,7 @@ def test_nothing_in_it_is_pickled(walk: ImuSequence, still_model: Any) -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_state_behind_a_gap_says_so_wherever_it_is_asked(
+def test_states_in_a_gap_are_marked_when_pushed_and_when_restored(
     walk: ImuSequence, still_model: Any, without: Any, backend: Any
 ) -> None:
     holed = without(walk, (walk.time > 5.0) & (walk.time < 5.6))

@@ -1,4 +1,4 @@
-"""What the accelerometer is worth: followed by the innovations, and not led by a few false ones."""
+"""The accelerometer's noise factor follows the innovations, but not a few false displacements."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from stario.fusion.filter.estimator import Estimator
 from stario.sequences.sequence import ImuSequence
 
 
-def factor_at_the_end(
+def final_factor(
     oracle: object, walk: ImuSequence, shake: float = 0.0, false: range = range(0)
 ) -> float:
-    """Of an accelerometer with errors of a tenth of a second [m/s^2], and false displacements."""
+    """Factor with accelerometer errors `shake` [m/s^2] of 0.1 s each and `false` displacements."""
     config, rng = NavigatorConfig(), np.random.default_rng(3)
     preprocessed = Navigator(oracle, config).observe(walk)
     start = preprocessed.front_end.start
@@ -32,28 +32,28 @@ def factor_at_the_end(
     return estimator.accel_noise.factor
 
 
-def test_a_bad_accelerometer_is_found_and_a_good_one_keeps_its_worth(
+def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(
     make_walk, make_oracle
 ) -> None:
     walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
-    assert factor_at_the_end(oracle, walk) < 1.5
-    assert factor_at_the_end(oracle, walk, shake=3.0) > 2.5
+    assert final_factor(oracle, walk) < 1.5
+    assert final_factor(oracle, walk, shake=3.0) > 2.5
 
 
-def test_five_seconds_of_false_displacements_are_not_its_fault(make_walk, make_oracle) -> None:
+def test_five_seconds_of_outliers_hardly_raise_the_factor(make_walk, make_oracle) -> None:
     walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
-    assert factor_at_the_end(oracle, walk, false=range(340, 390)) < 2.5
+    assert final_factor(oracle, walk, false=range(340, 390)) < 2.5
 
 
-@pytest.mark.parametrize(("nis", "moves"), [(1e9, 1), (0.0, -1)])
-def test_one_displacement_moves_it_by_little(nis: float, moves: int) -> None:
+@pytest.mark.parametrize(("nis", "sign"), [(1e9, 1), (0.0, -1)])
+def test_one_displacement_moves_the_log_factor_by_the_gain_at_most(nis: float, sign: int) -> None:
     before = AccelNoiseScale(log_factor=1.0, gain=0.05)
     after = before.updated(UpdateResult(nis, 3, True))
-    assert after.log_factor - before.log_factor == pytest.approx(moves * 0.05, abs=1e-6)
+    assert after.log_factor - before.log_factor == pytest.approx(sign * 0.05, abs=1e-6)
 
 
-def test_what_could_not_be_judged_tells_nothing() -> None:
+def test_an_update_without_innovation_leaves_the_factor_unchanged() -> None:
     before = AccelNoiseScale(log_factor=1.0)
     assert before.updated(UpdateResult(float("nan"), 3, False)) == before

@@ -1,4 +1,4 @@
-"""The filter without outliers, kept beside it: taken where displacements agree with it again."""
+"""The alternative hypothesis, a filter without outliers, adopted if later displacements fit it."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from stario.sequences.sequence import ImuSequence
 SECONDS = 120.0
 
 
-# Walks whose filter followed the last of the false displacements, and then took the right ones for
-# outliers: 2.4, 2.9 and 3.4 m without a second opinion.
+# Walks in which the filter followed the last false displacements and then gated the correct ones:
+# errors of 2.4, 2.9 and 3.4 m without the alternative.
 @pytest.mark.parametrize("seed", [5, 7, 10])
-def test_five_false_seconds_leave_no_wake(seed: int) -> None:
-    [block] = [one for one in faults(SECONDS) if one.name == "network off by 1 m for 5 s"]
+def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed: int) -> None:
+    [block] = [fault for fault in faults(SECONDS) if fault.name == "network off by 1 m for 5 s"]
     sequence, config = matched_walk(SECONDS, seed)
     [result] = run_faults(sequence, config, seed=seed, backends=("ekf",), only=[block])
     assert result.error_with < result.error_without + 0.3
 
 
-def test_a_known_gyroscope_keeps_its_prior_though_single_displacements_are_false() -> None:
-    """Its bias wanders as far as its prior is wide: taken for told by data, that cost 5.5 m."""
-    [single] = [one for one in faults(SECONDS) if one.name == "5 % of windows off by 2 m"]
+def test_single_false_displacements_do_not_widen_the_gyro_bias_prior() -> None:
+    """The bias varies as much as its prior allows: taken as evidence, that cost 5.5 m."""
+    [single] = [fault for fault in faults(SECONDS) if fault.name == "5 % of windows off by 2 m"]
     sequence, config = matched_walk(SECONDS, seed=9)
     for adaptive in (False, True):
         settings = replace(config, filter=replace(config.filter, adaptive=adaptive))
@@ -42,8 +42,8 @@ def test_a_known_gyroscope_keeps_its_prior_though_single_displacements_are_false
         assert result.error_with < result.error_without + 0.3
 
 
-class FalseFor:
-    """An oracle whose answers from one call to another are off by 1 m."""
+class OffByOneMetre:
+    """An oracle whose predictions number `first` to `stop` - 1 are off by 1 m."""
 
     def __init__(self, inner: Any, first: int, stop: int) -> None:
         self.inner, self.first, self.stop, self.count = inner, first, stop, 0
@@ -63,22 +63,22 @@ CONFIG = NavigatorConfig(
 )
 
 
-def test_it_travels_with_a_snapshot(
+def test_a_snapshot_includes_the_alternative(
     make_walk: Callable[..., ImuSequence], make_oracle: Callable[..., Any]
 ) -> None:
     walk = make_walk(1, 60.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02)
     parts = [walk.slice(0.0, 52.0 - 1e-9), walk.slice(52.0, 60.0)]
-    model = FalseFor(oracle, 98, 106)
+    model = OffByOneMetre(oracle, 98, 106)
     whole = Navigator(model, CONFIG)
     stream(whole, parts[0])
     # The false displacements have not ended yet.
     assert whole._estimator is not None
     state = whole._estimator.state
     assert isinstance(getattr(state, "alternative", None), AlternativeHypothesis)
-    again = FalseFor(oracle, 98, 106)
-    again.count = model.count
-    resumed = Navigator(again, CONFIG)
+    second_model = OffByOneMetre(oracle, 98, 106)
+    second_model.count = model.count
+    resumed = Navigator(second_model, CONFIG)
     resumed.restore(whole.snapshot())
     for ours, theirs in zip(stream(whole, parts[1]), stream(resumed, parts[1]), strict=True):
         np.testing.assert_array_equal(ours.p_W, theirs.p_W)
@@ -87,31 +87,31 @@ def test_it_travels_with_a_snapshot(
 def hypotheses() -> HypothesisPair:
     filter_ = StateCloningEkf(slots=0)
     filter_.state = replace(filter_.state, time=10.0)
-    asked = HypothesisPair(filter_)
-    asked.alternative = AlternativeHypothesis(replace(filter_.state, b_a=np.ones(3)), 10.0)
-    return asked
+    pair = HypothesisPair(filter_)
+    pair.alternative = AlternativeHypothesis(replace(filter_.state, b_a=np.ones(3)), 10.0)
+    return pair
 
 
-def test_two_displacements_that_fit_it_alone_convince() -> None:
-    asked = hypotheses()
-    asked.compare(lambda: False, fits_filter=False)
-    asked.compare(lambda: True, fits_filter=False)
-    assert asked.alternative is not None
-    assert asked.ekf.state.b_a[0] == 0.0
-    asked.compare(lambda: True, fits_filter=False)
-    assert asked.alternative is None
-    assert asked.ekf.state.b_a[0] == 1.0
+def test_two_displacements_that_fit_only_the_alternative_adopt_it() -> None:
+    pair = hypotheses()
+    pair.compare(lambda: False, fits_filter=False)
+    pair.compare(lambda: True, fits_filter=False)
+    assert pair.alternative is not None
+    assert pair.ekf.state.b_a[0] == 0.0
+    pair.compare(lambda: True, fits_filter=False)
+    assert pair.alternative is None
+    assert pair.ekf.state.b_a[0] == 1.0
 
 
-def test_it_is_given_up_where_both_agree_and_where_time_is_over() -> None:
-    asked = hypotheses()
+def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> None:
+    pair = hypotheses()
     for _ in range(4):
-        assert asked.alternative is not None
-        asked.compare(lambda: True, fits_filter=True)
-    assert asked.alternative is None
-    late = hypotheses()
-    assert late.alternative is not None
-    late.alternative = replace(late.alternative, ekf=replace(late.alternative.ekf, time=16.5))
-    late.compare(lambda: False, fits_filter=True)
-    assert late.alternative is None
-    assert late.ekf.state.b_a[0] == 0.0
+        assert pair.alternative is not None
+        pair.compare(lambda: True, fits_filter=True)
+    assert pair.alternative is None
+    aged = hypotheses()
+    assert aged.alternative is not None
+    aged.alternative = replace(aged.alternative, ekf=replace(aged.alternative.ekf, time=16.5))
+    aged.compare(lambda: False, fits_filter=True)
+    assert aged.alternative is None
+    assert aged.ekf.state.b_a[0] == 0.0

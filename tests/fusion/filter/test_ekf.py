@@ -47,7 +47,7 @@ def segments(count: int, seed: int = 0) -> list[Segment]:
 
 
 def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> list[float]:
-    """Propagate, clone, measure and release as a navigator does; returns every NIS."""
+    """Propagate, clone, measure and release as a navigator does; return every NIS."""
     rng = np.random.default_rng(seed)
     held, nis = [ekf.clone()], []
     for k, segment in enumerate(segments(count, seed)):
@@ -64,9 +64,9 @@ def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> l
     return nis
 
 
-def turned_by(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
-    """What turning the world does to the filter's error state."""
-    turn = np.eye(ekf.dim_x)  # the network's own turn, the last, stays what it is
+def turn_matrix(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
+    """Transformation of the filter's error state when the world is turned."""
+    turn = np.eye(ekf.dim_x)  # the network's turn, the last state, does not change
     turn[:-1, :-1] = np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
     return turn
 
@@ -89,7 +89,7 @@ def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None
     pose_j = 0 if slot_j is None else 2
 
     def measured(error: np.ndarray) -> np.ndarray:
-        """The displacement a network sees that is turned by the estimate's yaw error."""
+        """Displacement measured by a network that is turned by the estimate's yaw error."""
         ends = []
         for pose, p in ((1, p_i), (pose_j, p_j)):
             theta, rho = (error[c : c + 3] for c in columns[pose])
@@ -108,7 +108,7 @@ def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None
 
 
 def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
-    """The mean is the velocity now less what the force, and gravity, have added since."""
+    """The mean is the current velocity minus what specific force and gravity have added since."""
     v, force, step = np.array([1.0, -0.5, 0.2]), np.array([0.4, -0.3, 5.1]), 1e-6
     R_WB, seconds = exp_so3(np.array([0.5, -0.2, 1.0])), 0.8
     fall = 0.5 * seconds * STANDARD_GRAVITY * YAW
@@ -128,7 +128,7 @@ def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(H, numeric, atol=1e-6)
 
 
-def test_measurements_do_not_see_yaw(driven: StateCloningEkf) -> None:
+def test_measurements_do_not_observe_yaw(driven: StateCloningEkf) -> None:
     yaw = np.zeros(driven.dim_x)
     yaw[2] = 1.0
     yaw[15 + 2 :: 6] = 1.0
@@ -141,7 +141,7 @@ def test_measurements_do_not_see_yaw(driven: StateCloningEkf) -> None:
 
 
 def injected(dx: np.ndarray) -> StateCloningEkf:
-    """A filter that was told its error exactly: an identity measurement without noise."""
+    """A filter after an exact measurement of its error: an identity update without noise."""
     ekf = initialised(1)
     ekf.clone()
     ekf.P = np.eye(ekf.dim_x)
@@ -150,7 +150,7 @@ def injected(dx: np.ndarray) -> StateCloningEkf:
     return ekf
 
 
-def test_retraction_agrees_with_its_first_order_meaning() -> None:
+def test_retraction_agrees_with_its_first_order_expansion() -> None:
     before, step = injected(np.zeros(21)), 1e-5
     for k in range(21):
         d = step * np.eye(21)[k]
@@ -207,7 +207,7 @@ def test_large_corrections_follow_the_exponential_map() -> None:
 def test_structured_algebra_equals_filterpy() -> None:
     ekf, dense = initialised(6), initialised(6, DenseEkf)
     nis, nis_dense = drive(ekf, 200), drive(dense, 200)
-    assert max(nis) > 7.8 > min(nis), "the gate must act in a part of the updates"
+    assert max(nis) > 7.8 > min(nis), "the gate must act in some of the updates"
     np.testing.assert_allclose(nis, nis_dense, rtol=1e-9)
     for name in ("R_WB", "v_W", "p_W", "b_g", "b_a", "P"):
         ours, theirs = getattr(ekf.state, name), getattr(dense.state, name)
@@ -256,23 +256,25 @@ def test_covariance_stays_positive_over_half_an_hour() -> None:
     np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-10)
 
 
-def clone_position(ekf: StateCloningEkf, slot: int) -> np.ndarray:
+def clone_position_covariance(ekf: StateCloningEkf, slot: int) -> np.ndarray:
     """Covariance (3, 3) of a clone's position [m^2]."""
     return plain_covariances([ekf.state.clone_estimate(slot)])[0, 3:, 3:]
 
 
-def test_a_millimetre_is_taken_in_where_kilometres_were_unknown(driven: StateCloningEkf) -> None:
-    """The covariance keeps the digits of a measurement far better than what was known."""
+def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(
+    driven: StateCloningEkf,
+) -> None:
+    """The covariance stays accurate after a fix that is far more precise than the prior."""
     fresh = initialised(6)
     held = [fresh.clone()]
     fresh.propagate(segments(1)[0])
-    between = clone_position(fresh, held[0])
+    between = clone_position_covariance(fresh, held[0])
     fresh.state = fresh.state.with_position_inflated(1e5)
     fresh.update_position_W(fresh.state.p_W, 1e-8 * np.eye(3))
     sigma = np.sqrt(np.diag(fresh.state.plain_covariance))
     assert np.linalg.eigvalsh(fresh.state.plain_covariance / np.outer(sigma, sigma)).min() > -1e-6
     np.testing.assert_allclose(sigma[6:9], 1e-4, rtol=1e-3)
-    assert np.trace(clone_position(fresh, held[0])) < np.trace(between) + 1.0
+    assert np.trace(clone_position_covariance(fresh, held[0])) < np.trace(between) + 1.0
 
 
 def test_a_clone_is_the_current_pose(driven: StateCloningEkf) -> None:
@@ -286,7 +288,7 @@ def test_a_clone_is_the_current_pose(driven: StateCloningEkf) -> None:
     np.testing.assert_array_equal(driven.P[:, 15:21], driven.P[:, pose])
 
 
-def test_a_clone_in_place_of_another_is_as_one_in_its_slot_when_it_was_free(
+def test_replacing_a_clone_equals_releasing_it_and_cloning_again(
     driven: StateCloningEkf,
 ) -> None:
     before = driven.state
@@ -316,12 +318,12 @@ def test_a_released_slot_is_empty(driven: StateCloningEkf) -> None:
         driven.release(2)
 
 
-def test_no_free_slot_is_an_error(driven: StateCloningEkf) -> None:
+def test_cloning_without_a_free_slot_raises_an_error(driven: StateCloningEkf) -> None:
     with pytest.raises(InputError, match="release"):
         driven.clone()
 
 
-# --- invariance and meaning ----------------------------------------------------------------------
+# --- invariance and observability ----------------------------------------------------------------
 
 
 def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
@@ -351,7 +353,7 @@ def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
     np.testing.assert_allclose(turned.state.v_W, Z @ ekf.state.v_W, atol=1e-9)
     np.testing.assert_allclose(turned.state.p_W, Z @ ekf.state.p_W, atol=1e-8)
     np.testing.assert_allclose(turned.state.b_g, ekf.state.b_g, atol=1e-9)
-    T = turned_by(yaw, ekf)
+    T = turn_matrix(yaw, ekf)
     T[9:15, 9:15] = np.eye(6)
     np.testing.assert_allclose(turned.P, T @ ekf.P @ T.T, atol=1e-9 * ekf.P.max())
 
@@ -378,11 +380,11 @@ def test_displacements_carry_no_information_about_yaw_and_position(
     for slot in slots[1:]:
         driven.update_displacement(slots[0], slot, np.array([2.0, 1.0, 0.0]), 1e-3 * np.eye(3))
     driven.update_mean_velocity(driven.state.v_W, 1e-3 * np.eye(3))
-    assert np.trace(driven.P) < 0.9 * np.trace(P_before), "the measurements must weigh something"
+    assert np.trace(driven.P) < 0.9 * np.trace(P_before), "the measurements must have weight"
     np.testing.assert_allclose(information(), before, rtol=1e-3, atol=1e-3 * before.max())
 
 
-def test_covariance_is_given_and_read_plain_covariance() -> None:
+def test_the_plain_covariance_is_returned_as_it_was_set() -> None:
     ekf = initialised(0)
     A = np.random.default_rng(0).normal(size=(15, 15))
     covariance = A @ A.T
@@ -391,15 +393,17 @@ def test_covariance_is_given_and_read_plain_covariance() -> None:
     np.testing.assert_allclose(ekf.state.plain_covariance, covariance, rtol=1e-9, atol=1e-9)
 
 
-def test_a_sharp_displacement_sets_the_way_between_the_poses() -> None:
+def test_a_precise_displacement_sets_the_vector_between_the_poses() -> None:
     ekf = initialised(1)
     slot = ekf.clone()
     for segment in segments(20):
         ekf.propagate(segment)
     p_before = ekf.state.p_W
-    way = p_before - ekf.state.clone_pose(slot)[1] + np.array([0.0, 0.0, 1.0])
-    ekf.update_displacement(slot, None, way, 1e-6 * np.eye(3))
-    np.testing.assert_allclose(ekf.state.p_W - ekf.state.clone_pose(slot)[1], way, atol=0.05)
+    displacement = p_before - ekf.state.clone_pose(slot)[1] + np.array([0.0, 0.0, 1.0])
+    ekf.update_displacement(slot, None, displacement, 1e-6 * np.eye(3))
+    np.testing.assert_allclose(
+        ekf.state.p_W - ekf.state.clone_pose(slot)[1], displacement, atol=0.05
+    )
 
 
 # --- gate and refusals ---------------------------------------------------------------------------
@@ -415,7 +419,7 @@ def test_outliers_are_inflated_by_their_nis(driven: StateCloningEkf) -> None:
     assert np.linalg.norm(driven.state.p_W - before) < 3.0
 
 
-def test_outliers_can_be_dropped(driven: StateCloningEkf) -> None:
+def test_outliers_can_be_rejected(driven: StateCloningEkf) -> None:
     P, p = driven.P.copy(), driven.state.p_W
     result = driven.update_displacement(
         0, None, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, gate_mode="reject"
@@ -438,7 +442,7 @@ def test_outliers_can_be_dropped(driven: StateCloningEkf) -> None:
         ([0, 0, 0], np.ones((3, 3)), "positive definite"),
     ],
 )
-def test_values_that_cannot_be_used_are_refused(
+def test_invalid_measurements_are_refused(
     driven: StateCloningEkf, d: list[float], covariance: np.ndarray, reason: str
 ) -> None:
     P, p = driven.P.copy(), driven.state.p_W
@@ -449,7 +453,7 @@ def test_values_that_cannot_be_used_are_refused(
     np.testing.assert_array_equal(driven.state.p_W, p)
 
 
-def test_initial_values_that_do_not_fit_are_named() -> None:
+def test_invalid_initial_values_are_named() -> None:
     zero, eye = np.zeros(3), np.eye(3)
     ekf = StateCloningEkf(2)
     with pytest.raises(InputError, match="R_WB"):
@@ -462,10 +466,10 @@ def test_initial_values_that_do_not_fit_are_named() -> None:
         StateCloningEkf(-1)
 
 
-def test_what_is_kept_of_every_state_does_not_keep_the_filter_s_whole_covariance(
+def test_estimates_share_no_memory_with_the_filter(
     driven: StateCloningEkf,
 ) -> None:
-    # A view would: an hour at 20 updates a second then took twenty gigabytes.
+    # Views would keep every covariance: an hour at 20 updates a second then took twenty gigabytes.
     for estimate in (driven.state.estimate(), driven.state.clone_estimate(2)):
         assert not np.shares_memory(estimate.P, driven.P)
         assert not np.shares_memory(estimate.X, driven.state.X)

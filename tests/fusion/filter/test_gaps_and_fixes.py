@@ -1,4 +1,4 @@
-"""Fixes before, within and behind gaps in which a walker turns unseen."""
+"""Fixes before, within and after gaps in which the pedestrian turns unobserved."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BACKENDS = ("ekf", "graph")
 
 
 def yaw_error(track: Track, walk: ImuSequence, rows: Any) -> np.ndarray:
-    """In a world that is the truth's, wrapped [rad]."""
+    """Yaw error in the frame of the ground truth, wrapped [rad]."""
     truth = walk.truth.at(track.time[rows])
     found = yaw_of(track.trajectory.attitude_WB[rows])
     return np.angle(np.exp(1j * (found - yaw_of(truth.attitude_WB))))
@@ -38,10 +38,10 @@ def position_nees(track: Track, walk: ImuSequence, row: int) -> float:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (3, 15.0), (4, 3.0)])
-def test_a_position_before_a_gap_turns_nothing_behind_it(
+def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
     make_walk: Make, make_oracle: Make, without: Make, backend: Any, seed: int, gap: float
 ) -> None:
-    """Its direction was never told, so that the way to there is none of the track behind."""
+    """Its direction was never determined, so that position gives none to the track after it."""
     walk = make_walk(seed, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -53,15 +53,15 @@ def test_a_position_before_a_gap_turns_nothing_behind_it(
     early = int(np.searchsorted(track.time, 15.0))
     turn = float(yaw_error(track, walk, slice(early, early + 1))[0])
     assert abs(turn) < 3.0 * np.sqrt(track.covariance[early, 2, 2])
-    # A graph's marginals are of first order: across the arm alone.
+    # A graph's marginals are of first order: a turn's covariance lies across the arm only.
     assert backend == "graph" or position_nees(track, walk, early) < 20.0
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_short_gaps_behind_a_long_one_lose_no_place(
+def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     make_walk: Make, make_oracle: Make, without: Make, seed: int
 ) -> None:
-    """The yaw that was lost once is not lost again by a turn of a tenth of a radian."""
+    """A yaw that was lost once is not lost again because of a turn of a tenth of a radian."""
     walk = make_walk(seed, 60.0)
     gone = (walk.time > 12.0) & (walk.time < 16.0)
     gone |= (walk.time > 18.0) & (walk.time % 4.0 < 0.3)
@@ -74,7 +74,7 @@ def test_short_gaps_behind_a_long_one_lose_no_place(
     assert np.abs(yaw_error(track, walk, late)).max() < 0.5  # each short gap adds 0.15 rad
 
 
-def test_what_had_a_direction_but_no_place_goes_along(
+def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(
     make_walk: Make, make_oracle: Make, without: Make
 ) -> None:
     walk = make_walk(4, 60.0)
@@ -94,7 +94,7 @@ def test_what_had_a_direction_but_no_place_goes_along(
 
 
 @pytest.mark.parametrize("seed", [1, 2, 4])
-def test_what_was_before_a_gap_is_not_known_by_what_is_told_behind_it(
+def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     make_walk: Make, make_oracle: Make, without: Make, seed: int
 ) -> None:
     walk = make_walk(seed, 60.0)
@@ -109,7 +109,7 @@ def test_what_was_before_a_gap_is_not_known_by_what_is_told_behind_it(
 
 
 @pytest.mark.parametrize("gap", [1.5, 3.0, 7.0])
-def test_a_graph_knows_no_more_of_the_turn_in_a_gap_than_the_filter(
+def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     make_walk: Make, make_oracle: Make, without: Make, gap: float
 ) -> None:
     walk = make_walk(1, 40.0)
@@ -129,7 +129,7 @@ def test_a_graph_knows_no_more_of_the_turn_in_a_gap_than_the_filter(
 
 
 @pytest.mark.parametrize("kind", ["yaw", "position"])
-def test_a_fix_within_a_gap_says_little_of_what_was_before_it(
+def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
     make_walk: Make, make_oracle: Make, without: Make, kind: str
 ) -> None:
     nees = []
@@ -152,7 +152,7 @@ def test_a_fix_within_a_gap_says_little_of_what_was_before_it(
 def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
     make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
 ) -> None:
-    """A lift, or a positioning system that was anchored anew."""
+    """A lift, or a positioning system whose origin has moved."""
     walk = make_walk(2, 50.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     navigator = Navigator(oracle, CONFIG, true_start(walk), "graph")
@@ -165,11 +165,11 @@ def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
             assert np.linalg.norm(state.p_W - truth) < 1.5
 
 
-def test_the_moments_of_a_large_turn_are_those_of_turned_arms() -> None:
+def test_the_moments_of_a_large_turn_agree_with_sampled_turns() -> None:
     arm, sigma = np.array([3.0, -1.0, 0.5]), 1.2
-    zero, sure = np.zeros(3), np.zeros((15, 15))
+    zero, no_covariance = np.zeros(3), np.zeros((15, 15))
     turn = FrameTransform(1.0, np.eye(3), zero, zero, False, -np.inf, yaw_sigma=sigma)
-    state = NavState(0.0, np.eye(3), 0.5 * arm, arm, zero, zero, sure)
+    state = NavState(0.0, np.eye(3), 0.5 * arm, arm, zero, zero, no_covariance)
     angles = np.random.default_rng(0).normal(0.0, sigma, 200_000)
     off = about_z(angles).apply(arm) - arm
     errors = np.column_stack([angles, 0.5 * off, off])
@@ -180,14 +180,16 @@ def test_the_moments_of_a_large_turn_are_those_of_turned_arms() -> None:
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_a_yaw_that_is_no_angle_is_refused_and_told(make_walk: Make, make_oracle: Make) -> None:
+def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(
+    make_walk: Make, make_oracle: Make
+) -> None:
     walk = make_walk(3, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     track = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
     assert track.health.fixes == {"yaw not in radians": 1}
 
 
-def test_a_rotation_rounded_to_four_digits_is_taken(still_model: Any, make_walk: Make) -> None:
+def test_a_rotation_rounded_to_four_digits_is_accepted(still_model: Any, make_walk: Make) -> None:
     walk, zero = make_walk(3, 5.0), np.zeros(3)
     R_WB = np.round(about_z(0.7).as_matrix(), 4)
     states = stream(Navigator(still_model, prior=PriorPose(R_WB, zero, zero)), walk)

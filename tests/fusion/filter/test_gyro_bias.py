@@ -1,4 +1,4 @@
-"""The gyroscope bias's prior: exchanged exactly, and as wide as what is known of the bias asks."""
+"""The gyroscope bias's prior is replaced exactly and is as wide as the evidence requires."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from stario.fusion.filter.gyro_bias import GyroBiasPrior, gained_bias_informatio
 from stario.fusion.state import NavState
 
 
-def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
-    """With a prior of the bias, then told its sum with other states twice."""
+def ekf_with_measured_bias(sigma: float) -> StateCloningEkf:
+    """A filter with a prior of the bias, after two measurements of its sum with other states."""
     ekf = StateCloningEkf(slots=1)
     zero = np.zeros(3)
     variances = np.repeat([1e-2, 0.5, 1.0, sigma**2, 1e-2], 3)
@@ -24,22 +24,22 @@ def ekf_with_rates_measured(sigma: float) -> StateCloningEkf:
 
 
 @pytest.mark.parametrize("new", [1e-4, 2e-3, 1e-2])
-def test_an_exchanged_prior_is_as_if_it_had_been_there_from_the_start(new: float) -> None:
+def test_replacing_the_prior_equals_having_started_with_it(new: float) -> None:
     old = 1e-3
-    ekf = ekf_with_rates_measured(old)
+    ekf = ekf_with_measured_bias(old)
     ekf.replace_gyro_bias_prior(old**2, new**2)
-    expected = ekf_with_rates_measured(new).state
-    # The second residual took b_a as zero in both, so what is compared is linear.
+    expected = ekf_with_measured_bias(new).state
+    # Both compute the second residual with b_a as zero, so the comparison is linear.
     np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
 
 
-def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_covariance() -> None:
-    """No more information can be taken off than there is."""
-    ekf = ekf_with_rates_measured(1e-3)
+def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance() -> None:
+    """No more information can be removed than there is."""
+    ekf = ekf_with_measured_bias(1e-3)
     P = ekf.P.copy()
     P[9:12, 9:12] += 2e-6 * np.eye(3)  # a random walk, twice the prior's variance
     ekf.P = P
-    core = slice(0, 15)  # a clone that has just been made is the pose once more
+    core = slice(0, 15)  # a new clone duplicates the pose, so that the whole P is singular
     before = np.linalg.eigvalsh(P[core, core]).min()
     ekf.replace_gyro_bias_prior(1e-6, 1e-5)
     assert np.linalg.eigvalsh(ekf.P[core, core]).min() > 0.5 * before
@@ -52,21 +52,21 @@ def updated(prior: GyroBiasPrior, b: float, sigma: float, levelled: float = 0.0)
     return prior.updated(levelled, 0.0, np.array([0.0, 0.0, b]), P, wander=0.0)
 
 
-def test_a_bias_that_the_data_tell_clearly_widens_it() -> None:
+def test_a_bias_that_the_data_clearly_show_widens_the_prior() -> None:
     prior = GyroBiasPrior(1e-3, 1e-6)
-    # Posterior of a measured 8e-3 +- 1e-3: half of it, the prior being as sure.
+    # Posterior of a measured 8e-3 +- 1e-3: half of it, since the prior is as certain.
     wider = updated(prior, 4e-3, 1e-3 / np.sqrt(2.0))
     assert wider.variance == pytest.approx(8e-3**2 - 3e-3**2)
 
 
 @pytest.mark.parametrize(("b", "e"), [(8e-3, 2e-2), (2.5e-3, 1e-3)])
-def test_what_is_vague_or_fits_leaves_it_alone(b: float, e: float) -> None:
-    """The network's displacements alone tell 2e-2 rad/s: their slow errors look like a bias."""
+def test_vague_or_consistent_data_leave_the_prior_unchanged(b: float, e: float) -> None:
+    """Displacements alone determine it to 2e-2 rad/s: their slow errors look like a bias."""
     prior, share = GyroBiasPrior(1e-3, 1e-6), 1e-6 / (1e-6 + e**2)
     assert updated(prior, share * b, np.sqrt(share) * e).variance == pytest.approx(1e-6)
 
 
-def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> None:
+def test_the_prior_is_wide_until_levelled_and_stays_wide_for_raw_rates() -> None:
     first = GyroBiasPrior.first(1e-3)
     nothing = np.zeros(3), first.variance * np.eye(3), 0.0
     early = first.updated(0.0, 1e-2, *nothing)
@@ -77,19 +77,19 @@ def test_it_is_wide_until_gravity_has_told_and_stays_wide_for_raw_rates() -> Non
     assert np.sqrt(uncorrected.variance) > 0.03
 
 
-def test_what_a_measurement_of_the_bias_told_is_that_measurement() -> None:
-    ekf = ekf_with_rates_measured(1e-3)
+def test_the_information_gained_from_a_bias_measurement_is_that_measurement() -> None:
+    ekf = ekf_with_measured_bias(1e-3)
     before, axis, sigma = ekf.state, np.array([[0.6, 0.0, 0.8]]), 3e-4
     off = np.array([5e-3]) - axis @ before.b_g
     ekf.update_linear(off, [(9, axis)], np.array([[sigma**2]]))
-    told = gained_bias_information(before, ekf.state)
-    assert told is not None
-    mean, covariance = told
+    gained = gained_bias_information(before, ekf.state)
+    assert gained is not None
+    mean, covariance = gained
     np.testing.assert_allclose(mean, 5e-3 * axis[0], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(axis @ covariance @ axis.T, sigma**2, rtol=1e-6)
 
 
-def test_what_says_nothing_of_the_bias_tells_nothing() -> None:
+def test_an_update_that_does_not_involve_the_bias_gains_no_information() -> None:
     ekf = StateCloningEkf(slots=0)
     zero = np.zeros(3)
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))

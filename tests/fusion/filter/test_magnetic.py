@@ -1,4 +1,4 @@
-"""The field's bearing: what it tells of the gyroscope, what it must not tell, what it survives."""
+"""The magnetic bearing: what it observes, what it must not observe, and how robust it is."""
 
 import math
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import CONFIG, GRAPH, streamed_off
+from support import CONFIG, GRAPH, stream_deviation
 
 from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.backends import BackendName
@@ -30,7 +30,7 @@ Make = Callable[..., Any]
 
 
 def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnetometer:
-    """The field of a place without steel, with a white noise of 1 uT."""
+    """Samples of the field in a place without steel, with white noise of 1 uT."""
     truth = sequence.truth
     time = np.arange(truth.time[0], truth.time[-1], 1.0 / rate)
     field = truth.at(time).attitude_WB.inv().apply(FIELD_W)
@@ -39,7 +39,7 @@ def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnet
 
 @pytest.fixture(scope="module")
 def biased_walk() -> ImuSequence:
-    """Two minutes with a gyroscope that drifts by a third of a degree a second."""
+    """Two minutes with a gyroscope that drifts by a third of a degree per second."""
     style = WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4))
     walk = generate_walk(3, 120.0, style=style)
     clean = simulate_imu(walk, 100.0, ImuErrors(gyro_turn_on=1e-4, accel_turn_on=1e-2), 3)
@@ -62,7 +62,7 @@ def test_bearing_jacobian_agrees_with_finite_differences() -> None:
     m_B = R.T @ FIELD_W + hard_iron
 
     def residual(error: np.ndarray) -> float:
-        """Azimuth minus bearing of the true state, seen from the estimate: what H is to tell."""
+        """Azimuth minus bearing of the true state, given its error from the estimate."""
         m_W = exp_so3(error[:3]) @ R @ (m_B - hard_iron - error[29:32])
         return error[27] + error[28] - math.atan2(m_W[1], m_W[0])
 
@@ -73,7 +73,7 @@ def test_bearing_jacobian_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(H, numeric, atol=1e-6)
 
 
-def test_yaw_and_azimuth_are_unobservable_together() -> None:
+def test_a_common_turn_of_yaw_and_azimuth_is_unobservable() -> None:
     (_, by_theta), (_, by_field) = bearing_jacobian(np.eye(3), FIELD_W, 27)
     assert by_theta[0, 2] + by_field[0, 0] == 0.0
 
@@ -97,7 +97,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
     assert ekf.state.P[2, 2] > 0.99 * yaw_variance
 
 
-def test_a_field_of_another_size_counts_for_less() -> None:
+def test_a_field_of_unusual_size_has_less_weight() -> None:
     reference = MagneticReference()
     for k in range(20):
         reference = reference.updated(0.5 * k, 45.0, 1.0, new_place=True)
@@ -111,7 +111,7 @@ def test_a_field_of_another_size_counts_for_less() -> None:
     assert gains[1] > gains[0]
 
 
-def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> None:
+def test_a_field_that_varies_along_the_path_has_a_wandering_azimuth() -> None:
     rng = np.random.default_rng(1)
     wander = {}
     for place, spread, new_place in (
@@ -125,11 +125,11 @@ def test_a_field_that_varies_along_the_way_says_that_its_azimuth_wanders() -> No
             reference = reference.updated(0.5 * k, size, dip, new_place)
         wander[place] = reference.wander_sigma
     assert wander["quiet"] < 0.15
-    assert wander["steel"] == wander["table"] == 0.4  # one spot says nothing of the others
+    assert wander["steel"] == wander["table"] == 0.4  # one spot gives no information about others
 
 
-def test_a_field_that_the_device_carries_on_itself_is_hardly_news() -> None:
-    """Its size is the same to a ten-thousandth, as no sensor's is."""
+def test_a_field_propagated_by_the_device_itself_has_little_weight() -> None:
+    """Its size repeats to a ten-thousandth, which no measured field does."""
     moved = []
     for change in (1e-4, 1e-2):
         ekf = StateCloningEkf(2)
@@ -144,7 +144,7 @@ def test_a_field_that_the_device_carries_on_itself_is_hardly_news() -> None:
     assert moved[1] > 2.0 * moved[0] > 0.0
 
 
-def test_a_quiet_place_tells_more_and_neither_more_than_it_can(make_oracle: Make) -> None:
+def test_a_quiet_field_is_more_informative_and_both_are_consistent(make_oracle: Make) -> None:
     walk = generate_walk(3, 120.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
     sigmas = []
     for disturbance in (0.5, 8.0):
@@ -167,7 +167,7 @@ def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
 
 
 def pushed(navigator: Stream, sequence: ImuSequence) -> list[NavState]:
-    """The states of a stream of both sensors."""
+    """States of a stream of both sensors."""
     states, fields = [], sequence.magnetometer
     waiting = list(zip(fields.time.tolist(), fields.field, strict=True)) if fields else []
     for row in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
@@ -177,8 +177,8 @@ def pushed(navigator: Stream, sequence: ImuSequence) -> list[NavState]:
     return [s for s in states if s is not None]
 
 
-def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Make) -> None:
-    """In a stream as in a batch; without it the yaw drifts, a magnet beside the device is found."""
+def test_bearings_determine_the_gyroscope_bias(biased_walk: ImuSequence, make_oracle: Make) -> None:
+    """In a stream as in a batch; without it the error of the bias is larger."""
     oracle = make_oracle(biased_walk, biased_walk.truth, CONFIG, noise=0.1, sigma=0.1)
     track = Navigator(oracle, CONFIG).run(biased_walk)
     blind = Navigator(oracle, CONFIG).run(replace(biased_walk, magnetometer=None))
@@ -188,33 +188,35 @@ def test_it_tells_the_gyroscopes_bias(biased_walk: ImuSequence, make_oracle: Mak
     assert blind.health.bearings == {}
 
     states = pushed(Stream(oracle, CONFIG), biased_walk)
-    assert streamed_off(states, track) < 1e-6
+    assert stream_deviation(states, track) < 1e-6
     assert last_yaw_error(states, biased_walk) < math.radians(20.0)
 
 
-def test_a_streams_graph_knows_the_bias_as_its_filter_does(
+def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
     biased_walk: ImuSequence, make_oracle: Make
 ) -> None:
     config = replace(GRAPH, filter=replace(GRAPH.filter, gyro_bias_sigma=1e-2))
     oracle = make_oracle(biased_walk, biased_walk.truth, config, noise=0.1, sigma=0.1)
     filtered = pushed(Stream(oracle, config), biased_walk)[-1]
-    told, untold = (
+    with_field, without_field = (
         pushed(Stream(oracle, config, backend="graph"), replace(biased_walk, magnetometer=field))[
             -1
         ]
         for field in (biased_walk.magnetometer, None)
     )
-    assert abs(told.b_g[2] - filtered.b_g[2]) < 0.2 * abs(untold.b_g[2] - filtered.b_g[2])
+    assert abs(with_field.b_g[2] - filtered.b_g[2]) < 0.2 * abs(
+        without_field.b_g[2] - filtered.b_g[2]
+    )
 
 
-def test_what_is_no_field_is_dropped_and_counted(still_model: Any) -> None:
+def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):
         navigator.push_magnetometer(time, field)
     assert navigator._front_end.counts.field_dropped == 2
 
 
-def test_switched_off_it_changes_nothing(biased_walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_disabled_magnetometer_has_no_effect(biased_walk: ImuSequence, make_oracle: Make) -> None:
     short = biased_walk.slice(0.0, 10.0)
     off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))
     oracle = make_oracle(short, biased_walk.truth, CONFIG)
@@ -227,7 +229,7 @@ def test_switched_off_it_changes_nothing(biased_walk: ImuSequence, make_oracle: 
 def test_a_declination_turns_the_track_to_true_north(
     biased_walk: ImuSequence, make_oracle: Make, backend: BackendName
 ) -> None:
-    """All of it, from the first pose on; the field of this place points to 39 degrees."""
+    """The whole track from the first pose on; the azimuth of the field here is 39 degrees."""
     declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
     settings = replace(GRAPH, filter=replace(GRAPH.filter, declination=declination))
     walk = biased_walk.slice(0.0, 60.0)
@@ -242,10 +244,10 @@ def test_a_declination_turns_the_track_to_true_north(
     assert track.health.fixes == {}
     assert track.health.bearings["north"] == 1
     before = Navigator(oracle, GRAPH, backend=backend).run(walk)
-    assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # the first yaw, without
+    assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # first yaw without a declination
 
 
-def test_north_is_not_told_where_the_direction_is_known(
+def test_north_is_not_applied_if_the_direction_is_known(
     biased_walk: ImuSequence, make_oracle: Make
 ) -> None:
     walk = biased_walk.slice(0.0, 20.0)
@@ -257,6 +259,6 @@ def test_north_is_not_told_where_the_direction_is_known(
 
 
 @pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
-def test_a_declination_is_an_angle(declination: Any) -> None:
+def test_a_declination_that_is_not_an_angle_is_refused(declination: Any) -> None:
     with pytest.raises(ConfigError, match="declination"):
         FilterConfig(declination=declination)

@@ -1,4 +1,4 @@
-"""Fixes in a map's coordinates, behind gaps, refused ones: for the filter and for the graph."""
+"""Fixes in map coordinates, after gaps, and refused ones, for the filter and for the graph."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stario.sequences.sequence import ImuSequence
 Make = Callable[..., Any]
 BACKENDS = ("ekf", "graph")
 MAP = np.array([5.0e5, 4.5e6, 120.0])
-"""Coordinates of a map in metres, such as UTM's."""
+"""Offset of a map's coordinates [m], such as UTM's."""
 
 
 def true_at(walk: ImuSequence, time: float) -> np.ndarray:
@@ -27,7 +27,7 @@ def true_at(walk: ImuSequence, time: float) -> np.ndarray:
 
 
 def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
-    """Positions to 0.3 m in a world that is turned and shifted."""
+    """Positions with a sigma of 0.3 m in a map frame that is turned and shifted."""
     rng, turn, covariance = np.random.default_rng(1), about_z(2.0), 0.09 * np.eye(3)
     return [
         position_fix(t, turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift, covariance)
@@ -35,14 +35,14 @@ def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
     ]
 
 
-def given(navigator: Navigator, walk: ImuSequence, fixes: list[Fix]) -> list[NavState]:
+def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix]) -> list[NavState]:
     for fix in fixes:
         navigator.update_position(fix.time, fix.value, fix.covariance)
     return stream(navigator, walk)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_map_far_from_its_origin_is_as_good_as_a_near_one(
+def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(
     make_walk: Make, make_oracle: Make, backend: Any
 ) -> None:
     walk = make_walk(3, 40.0)
@@ -51,7 +51,7 @@ def test_a_map_far_from_its_origin_is_as_good_as_a_near_one(
     for shift in (np.zeros(3), MAP):
         fixes = fixes_of(walk, np.arange(5.0, 38.0, 3.0), shift)
         track = Navigator(oracle, CONFIG, backend=backend).run(walk, fixes=fixes)
-        states = given(Navigator(oracle, CONFIG, backend=backend), walk, fixes)
+        states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, fixes)
         assert track.health.fixes == {"applied": len(fixes)}
         assert np.linalg.eigvalsh(track.covariance[:, 6:9, 6:9]).min() > 0.0
         found.append((track, states[-1], shift))
@@ -66,10 +66,10 @@ def test_a_map_far_from_its_origin_is_as_good_as_a_near_one(
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("gap", [4.0, 15.0])
-def test_behind_a_gap_that_lost_the_yaw_fixes_find_it_again(
+def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(
     make_walk: Make, make_oracle: Make, without: Make, backend: Any, gap: float
 ) -> None:
-    """The walker turns in the gap; what was before it stays where fixes had put it."""
+    """The pedestrian turns in the gap; the track before it stays where the fixes placed it."""
     walk = make_walk(6, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -85,8 +85,8 @@ def test_behind_a_gap_that_lost_the_yaw_fixes_find_it_again(
     assert np.mean(turn[late] ** 2 / track.covariance[late, 2, 2]) < 6.0
 
 
-def test_a_graph_takes_no_fix_that_the_filter_refused(make_walk: Make, make_oracle: Make) -> None:
-    """A yaw of a device that hangs upside down says nothing."""
+def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk: Make, make_oracle: Make) -> None:
+    """The yaw of a device that hangs upside down is undefined."""
     walk = make_walk(3, 20.0, mount_rotvec=(np.pi, 0.0, 0.0))
     oracle = make_oracle(walk, walk.truth, CONFIG)
     ends = []
@@ -100,7 +100,9 @@ def test_a_graph_takes_no_fix_that_the_filter_refused(make_walk: Make, make_orac
     np.testing.assert_allclose(*ends, atol=1e-9)
 
 
-def test_a_heading_alone_does_not_free_the_position(make_walk: Make, make_oracle: Make) -> None:
+def test_a_heading_alone_does_not_make_the_position_uncertain(
+    make_walk: Make, make_oracle: Make
+) -> None:
     walk = make_walk(4, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     fixes = [yaw_fix(10.0, 1.0, 0.05)]
@@ -110,8 +112,8 @@ def test_a_heading_alone_does_not_free_the_position(make_walk: Make, make_oracle
     assert track.covariance[0, 6:9, 6:9].trace() < 0.01
 
 
-class Level:
-    """A network that does not know stairs."""
+class Climbing:
+    """A network that adds 0.4 m of height to every displacement."""
 
     def __init__(self, inner: Any) -> None:
         self.inner = inner
@@ -121,21 +123,21 @@ class Level:
         return mean + np.array([0.0, 0.0, 0.4]), covariance
 
 
-def test_fixes_that_agree_win_against_a_track_that_is_sure_of_itself(
+def test_fixes_that_agree_prevail_over_an_overconfident_track(
     make_walk: Make, make_oracle: Make
 ) -> None:
-    """Else it ends twenty metres too high: each fix looks like an outlier."""
+    """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
     walk = make_walk(3, 60.0)
-    level = Level(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
+    climbing = Climbing(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
     fixes = fixes_of(walk, np.arange(3.0, 59.0, 2.0), np.zeros(3))
-    track = Navigator(level, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(climbing, CONFIG).run(walk, fixes=fixes)
     truth = walk.truth.at(np.clip(track.time, walk.time[0], walk.time[-1]))
     error = track.trajectory.position_W - about_z(2.0).apply(truth.position_W)
     assert np.linalg.norm(error[track.time > 20.0], axis=1).max() < 4.0
     assert track.health.fixes["gated"] > 3
 
 
-def test_neither_gaps_nor_fixes_let_a_streams_graph_grow(
+def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(
     make_walk: Make, make_oracle: Make, without: Make
 ) -> None:
     walk = make_walk(5, 40.0)
@@ -143,12 +145,12 @@ def test_neither_gaps_nor_fixes_let_a_streams_graph_grow(
     for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 39.0, 0.1), MAP))):
         oracle = make_oracle(recording, walk.truth, CONFIG)
         navigator = Navigator(oracle, CONFIG, backend="graph")
-        given(navigator, recording, fixes)
+        stream_with_fixes(navigator, recording, fixes)
         assert len(navigator._estimator._builder.graph.keyframes) < 16
 
 
-def yaw_off(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np.ndarray]:
-    """Error of the yaw after the fixes' frame was found [rad], and its sigma."""
+def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np.ndarray]:
+    """Yaw error in the frame of the fixes [rad], and its sigma."""
     attitude = walk.truth.at(np.array([s.time for s in states])).attitude_WB
     yaw = np.array([yaw_twist(s.R_WB) for s in states]) - yaw_of(attitude) - 2.0
     sigma = np.array([np.sqrt(s.covariance[2, 2]) for s in states])
@@ -157,15 +159,15 @@ def yaw_off(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np.n
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("off", [[200.0, 0.0, 0.0], [0.0, -60.0, 0.0]])
-def test_a_first_position_that_was_bad_turns_nothing(
+def test_a_wrong_first_position_does_not_turn_the_track(
     make_walk: Make, make_oracle: Make, backend: Any, off: list[float]
 ) -> None:
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
     bad = position_fix(fixes[0].time, fixes[0].value + off, fixes[0].covariance)
-    states = given(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
-    error, sigma = yaw_off(walk, states[-20:])
+    states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
+    error, sigma = yaw_error(walk, states[-20:])
     assert (np.abs(error) < 4.0 * sigma).all()
     assert sigma[-1] < 0.2
     end = fixes[-1]
@@ -173,7 +175,7 @@ def test_a_first_position_that_was_bad_turns_nothing(
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
 
 
-def test_a_better_position_places_who_stands_still(still_model: Any) -> None:
+def test_more_accurate_positions_move_a_stationary_track(still_model: Any) -> None:
     time = np.arange(0.0, 20.0, 0.01)
     still = ImuSequence(
         "still", time, np.zeros((len(time), 3)), np.tile([0.0, 0.0, 9.81], (len(time), 1))
@@ -186,7 +188,7 @@ def test_a_better_position_places_who_stands_still(still_model: Any) -> None:
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
 
 
-def test_a_yaw_that_says_nothing_tells_no_direction(make_walk: Make, make_oracle: Make) -> None:
+def test_a_yaw_too_coarse_to_be_informative_is_refused(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
@@ -198,7 +200,7 @@ def test_a_yaw_that_says_nothing_tells_no_direction(make_walk: Make, make_oracle
     np.testing.assert_array_equal(with_it.trajectory.position_W, without.trajectory.position_W)
 
 
-def test_a_prior_position_is_what_the_track_turns_about(make_walk: Make, make_oracle: Make) -> None:
+def test_the_track_is_turned_about_its_prior_position(make_walk: Make, make_oracle: Make) -> None:
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
@@ -207,12 +209,12 @@ def test_a_prior_position_is_what_the_track_turns_about(make_walk: Make, make_or
     p_W = turn.apply(walk.truth.position_W[0]) + far
     prior = PriorPose(first, np.zeros(3), p_W, yaw_sigma=3.0, position_sigma=1.0)
     navigator = Navigator(oracle, CONFIG, prior)
-    error, sigma = yaw_off(walk, given(navigator, walk, fixes))
+    error, sigma = yaw_error(walk, stream_with_fixes(navigator, walk, fixes))
     assert (np.abs(error) < 4.0 * sigma).all()
     assert sigma[-1] < 0.1
 
 
-def test_what_is_measured_in_a_gap_makes_its_turn_no_surer(
+def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(
     make_walk: Make, without: Any, still_model: Any
 ) -> None:
     walk = make_walk(3, 20.0)
@@ -220,15 +222,13 @@ def test_what_is_measured_in_a_gap_makes_its_turn_no_surer(
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), np.zeros(3), walk.truth.position_W[0])
     useless = [position_fix(t, np.zeros(3), 1e6 * np.eye(3)) for t in np.arange(8.2, 11.0, 0.2)]
     plain, cut = (Navigator(still_model, prior=prior).run(broken, fixes=f) for f in ([], useless))
-    behind = np.searchsorted(plain.time, 11.05)
-    assert plain.covariance[behind, 2, 2] > 1.0
-    np.testing.assert_allclose(
-        cut.covariance[behind, 2, 2], plain.covariance[behind, 2, 2], rtol=1e-3
-    )
+    row = np.searchsorted(plain.time, 11.05)
+    assert plain.covariance[row, 2, 2] > 1.0
+    np.testing.assert_allclose(cut.covariance[row, 2, 2], plain.covariance[row, 2, 2], rtol=1e-3)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_position_far_off_keeps_no_yaw_out(
+def test_a_false_position_does_not_block_a_yaw(
     make_walk: Make, make_oracle: Make, backend: Any
 ) -> None:
     walk = make_walk(3, 20.0)
@@ -238,12 +238,12 @@ def test_a_position_far_off_keeps_no_yaw_out(
     yaw = float(yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0]) + 2.0
     navigator = Navigator(oracle, CONFIG, backend=backend)
     navigator.update_yaw(5.0, yaw, 0.1)
-    error, sigma = yaw_off(walk, given(navigator, walk, [first, off])[-20:])
+    error, sigma = yaw_error(walk, stream_with_fixes(navigator, walk, [first, off])[-20:])
     assert (np.abs(error) < 4.0 * sigma).all()
     assert sigma[-1] < 0.2
 
 
-def test_a_place_in_the_plane_is_kept_against_a_worse_one_with_height(
+def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height(
     make_walk: Make, make_oracle: Make
 ) -> None:
     walk = make_walk(3, 20.0)

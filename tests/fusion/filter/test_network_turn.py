@@ -1,4 +1,4 @@
-"""The network's turn: a state of its own once fixes tell the direction, nothing before."""
+"""The network's turn: a state once fixes determine the direction, and absent before."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
 TURN = 0.12
-"""Of the network's displacements [rad]: seven degrees."""
+"""Turn of the network's displacements [rad]: seven degrees."""
 
 
 class Turned:
-    """A network that takes everything to be turned to the left."""
+    """A network whose displacements are all turned to the left."""
 
     def __init__(self, inner: Any) -> None:
         self.inner = inner
@@ -42,7 +42,7 @@ def with_turn(sigma: float) -> NavigatorConfig:
 
 
 def test_jacobian_agrees_with_finite_differences() -> None:
-    """What is measured of a true displacement grows with the turn."""
+    """The measurement of a true displacement turns with the network."""
     d, step = np.array([1.2, -0.7, 0.1]), 1e-6
     row, H = turn_jacobian(d, 21)
     assert row == 21
@@ -51,7 +51,7 @@ def test_jacobian_agrees_with_finite_differences() -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_track_without_fixes_does_not_know_of_it(
+def test_a_track_without_fixes_does_not_depend_on_the_turn(
     backend: BackendName, walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
@@ -66,22 +66,22 @@ def test_a_track_without_fixes_does_not_know_of_it(
 def test_a_turned_network_does_not_make_the_yaw_overconfident(
     backend: BackendName, make_walk: Make, make_oracle: Make
 ) -> None:
-    """The fixes tell where the track leads; which part of the difference is whose, nothing does."""
+    """Fixes determine the track's direction, but cannot separate the yaw's error from the turn."""
     walk = make_walk(11, 120.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
-    told, ignored = (
+    estimated, ignored = (
         track_with_fixes(model, walk, with_turn(sigma), "walks", 3.0, 0.1, backend=backend)
         for sigma in (0.1, 0.0)
     )
-    assert told.yaw_covered > 0.95
-    assert told.yaw_nees < 3.0
-    assert ignored.yaw_nees > 2.0 * told.yaw_nees
+    assert estimated.yaw_covered > 0.95
+    assert estimated.yaw_nees < 3.0
+    assert ignored.yaw_nees > 2.0 * estimated.yaw_nees
 
 
 def end_of_stream(
     backend: BackendName, config: NavigatorConfig, model: Any, walk: ImuSequence
 ) -> NavState:
-    """Of a stream with fixes that is interrupted half way and goes on elsewhere."""
+    """Last state of a stream with fixes that is interrupted half way and continued elsewhere."""
     navigator = Navigator(model, config, backend=backend)
     fixes, states = true_fixes(walk.truth, 3.0, 0.1, seed=0), []
     for k, sample in enumerate(zip(walk.time, walk.gyro, walk.accel, strict=True)):
@@ -96,10 +96,10 @@ def end_of_stream(
     return [s for s in states if s is not None][-1]
 
 
-def test_a_streams_graph_is_as_sure_of_the_yaw_as_its_filter(
+def test_a_streams_graph_is_as_certain_of_the_yaw_as_its_filter(
     make_walk: Make, make_oracle: Make
 ) -> None:
-    """Though it forgets all keyframes but those of the last seconds, and the turn with them."""
+    """Although it marginalises all keyframes but the last seconds', and the turn with them."""
     walk = make_walk(11, 120.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     ekf, graph = (end_of_stream(each, with_turn(0.1), model, walk) for each in ("ekf", "graph"))
@@ -107,11 +107,11 @@ def test_a_streams_graph_is_as_sure_of_the_yaw_as_its_filter(
     assert sigma == pytest.approx(np.sqrt(ekf.covariance[2, 2]), rel=0.1)
     true = walk.truth.at(np.array([graph.time])).attitude_WB.as_matrix()[0]
     assert abs(yaw_twist(graph.R_WB @ true.T)) < 3.0 * sigma
-    ignorant = end_of_stream("graph", with_turn(0.0), model, walk)
-    assert np.sqrt(ignorant.covariance[2, 2]) < 0.7 * sigma
+    without_turn = end_of_stream("graph", with_turn(0.0), model, walk)
+    assert np.sqrt(without_turn.covariance[2, 2]) < 0.7 * sigma
 
 
-def test_positions_too_near_for_one_to_tell_the_direction_tell_it_together(
+def test_positions_too_close_to_give_a_direction_alone_give_it_together(
     make_walk: Make, make_oracle: Make
 ) -> None:
     walk = make_walk(8, 60.0)
@@ -127,11 +127,13 @@ def test_positions_too_near_for_one_to_tell_the_direction_tell_it_together(
     assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
 
 
-# --- the fit -------------------------------------------------------------------------------------
+# --- the alignment -------------------------------------------------------------------------------
 
 
-def seen(rng: np.random.Generator, turn: float, count: int, sigma: float) -> PlanarAlignment:
-    """Of a walk in a room; every position's own noise in the fix."""
+def alignment_of(
+    rng: np.random.Generator, turn: float, count: int, sigma: float
+) -> PlanarAlignment:
+    """Alignment of a walk in a room, with independent noise in every fix."""
     z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
     noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)
     fixed = np.exp(1j * turn) * z + (3.0 - 1.0j) + noise
@@ -143,15 +145,15 @@ def seen(rng: np.random.Generator, turn: float, count: int, sigma: float) -> Pla
 
 
 @pytest.mark.parametrize("count", [5, 20])
-def test_the_fit_is_as_good_as_it_says(count: int) -> None:
+def test_the_sigma_of_the_fitted_turn_is_consistent(count: int) -> None:
     rng, errors = np.random.default_rng(0), []
     for turn in rng.uniform(-np.pi, np.pi, 400):
-        found, sigma = seen(rng, turn, count, 0.3).turn
+        found, sigma = alignment_of(rng, turn, count, 0.3).turn
         errors.append(np.angle(np.exp(1j * (found - turn))) / sigma)
     assert 0.8 < np.mean(np.square(errors)) < 1.3
 
 
-def test_nothing_and_one_place_tell_no_direction() -> None:
+def test_fewer_than_two_places_give_no_direction() -> None:
     assert PlanarAlignment().turn[1] == np.inf
     here = PlanarAlignment()
     for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
@@ -159,8 +161,8 @@ def test_nothing_and_one_place_tell_no_direction() -> None:
     assert here.turn[1] > 10.0
 
 
-def test_a_track_that_drifted_since_counts_for_less() -> None:
-    steady = seen(np.random.default_rng(2), 0.5, 8, 0.3)
+def test_positions_count_for_less_once_the_track_has_drifted() -> None:
+    steady = alignment_of(np.random.default_rng(2), 0.5, 8, 0.3)
     last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
     kept, drifted = (steady.with_position(*last, 0.09, drift) for drift in (0.0, 5.0))
     assert drifted.turn[1] > 2.0 * kept.turn[1]

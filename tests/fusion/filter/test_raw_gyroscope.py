@@ -1,4 +1,4 @@
-"""A gyroscope that hands out raw rates: gravity shows it, and the filter's prior widens."""
+"""A gyroscope with uncorrected bias: gravity reveals it, and the filter's prior widens."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stario.fusion import Navigator, NavigatorConfig
 from stario.sequences import ImuSequence
 
 RAW = np.array([0.04, -0.03, 0.05])
-"""As of an iPhone 5 [rad/s]."""
+"""Bias of an iPhone 5 [rad/s]."""
 
 
 def biased(walk: ImuSequence, bias: np.ndarray) -> ImuSequence:
@@ -24,22 +24,22 @@ def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle) ->
     track = Navigator(make_oracle(walk, walk.truth, config), config).run(walk)
     error = track.arrays()["gyro_bias_B"][-1] - RAW
     sigma = np.sqrt(np.diagonal(track.covariance[-1])[9:12])
-    # Forty seconds do not tell it well; a prior of 2.5e-3 rad/s would have forbidden it.
+    # Forty seconds do not determine it well; a prior of 2.5e-3 rad/s would have excluded it.
     assert np.linalg.norm(error) < 0.6 * np.linalg.norm(RAW)
     assert (np.abs(error) < 3.0 * sigma).all()
 
 
 @pytest.mark.parametrize("size", [0.0, 3e-3])
 def test_a_corrected_gyroscope_keeps_its_prior(make_walk, still_model, size: float) -> None:
-    """To the bit: nothing is added below the size that corrected devices keep within."""
+    """Exactly: a levelled bias below the limit of corrected devices adds nothing to it."""
     walk = biased(make_walk(seed=2, seconds=20.0), np.array([size, 0.0, 0.0]))
     navigator = Navigator(still_model)
     intervals = navigator.observe(walk).intervals
     assert max(interval.levelled_bias for interval in intervals) < 0.01
 
 
-def test_the_doubt_grows_without_a_jump(make_walk, make_oracle) -> None:
-    """A little more bias is a little more doubt: two near recordings end near each other."""
+def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) -> None:
+    """A slightly larger bias widens the prior slightly: similar recordings end close together."""
     ends = []
     for size in (0.030, 0.0302):
         walk = biased(make_walk(seed=2, seconds=30.0), np.array([size, 0.0, 0.0]))
@@ -50,8 +50,8 @@ def test_the_doubt_grows_without_a_jump(make_walk, make_oracle) -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_what_looks_like_rest_for_long_is_rest(still_model, backend) -> None:
-    """Flat on a table: gravity tells nothing of a raw bias about the vertical."""
+def test_apparent_rest_that_lasts_long_is_rest(still_model, backend) -> None:
+    """Flat on a table, gravity does not reveal an uncorrected bias about the vertical."""
     rng, n, bias = np.random.default_rng(1), 4500, np.array([0.002, -0.001, 0.05])
     gyro = bias + rng.normal(0.0, 2e-3, (n, 3))
     accel = np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.02, (n, 3))

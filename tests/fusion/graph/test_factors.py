@@ -1,4 +1,4 @@
-"""Jacobians of the graph's measurements against finite differences, and what they may not learn."""
+"""Jacobians of the graph's terms against finite differences, and what they must not observe."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
 
 
 @pytest.mark.parametrize("which", range(10))
-def test_jacobians_are_those_of_the_prediction(which: int) -> None:
+def test_jacobians_agree_with_finite_differences(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
         values = random_values(rng)
@@ -93,7 +93,7 @@ def in_turned_world(values: Any, yaw: float, shift: np.ndarray) -> Any:
     return turned
 
 
-def test_a_displacement_does_not_see_how_the_world_is_turned() -> None:
+def test_a_displacement_does_not_depend_on_the_turn_of_the_world() -> None:
     rng = np.random.default_rng(3)
     values = random_values(rng)
     term = terms(rng, values)[0]
@@ -102,8 +102,8 @@ def test_a_displacement_does_not_see_how_the_world_is_turned() -> None:
     np.testing.assert_allclose(ours, theirs, atol=1e-12)
 
 
-def test_a_displacement_says_nothing_of_tilt() -> None:
-    """About any horizontal axis the first pose may turn: the residual stays."""
+def test_a_displacement_gives_no_information_about_tilt() -> None:
+    """Turning the first pose about any horizontal axis leaves the residual unchanged."""
     rng = np.random.default_rng(4)
     values = random_values(rng)
     (_, H_i), _ = terms(rng, values)[0].linearise(values).blocks
@@ -111,12 +111,12 @@ def test_a_displacement_says_nothing_of_tilt() -> None:
     np.testing.assert_allclose(H_i[:, :3] @ R_i.T @ np.eye(3, 2), 0.0, atol=1e-12)
 
 
-def test_a_prior_that_knows_no_yaw_learns_none_wherever_it_is_linearised() -> None:
-    """The direction of a turn about the vertical stays in its null space as keyframes move."""
+def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised() -> None:
+    """A turn about the vertical stays in its null space as the keyframes move."""
     rng = np.random.default_rng(5)
     there = random_values(rng)
     root = rng.normal(size=(30, 30))
-    root[:, 17] = -root[:, 2]  # it knows the turn from one to the next
+    root[:, 17] = -root[:, 2]  # it constrains the turn from one keyframe to the next
     prior = Prior(0, tuple(KeyframeState.of(there, k) for k in (0, 1)), root, np.zeros(30))
     values = random_values(rng)
     up = np.array([0.0, 0.0, 1.0])
@@ -131,7 +131,7 @@ def test_a_prior_that_knows_no_yaw_learns_none_wherever_it_is_linearised() -> No
     np.testing.assert_allclose(change, 0.0, atol=1e-12)
 
 
-def test_the_error_about_itself_is_zero_and_about_a_turned_self_is_the_turn() -> None:
+def test_the_error_from_itself_is_zero_and_of_a_turned_state_is_the_turn() -> None:
     values = random_values(np.random.default_rng(6))
     state = KeyframeState.of(values, 0)
     turned = KeyframeState.of(in_turned_world(values, 0.7, np.zeros(3)), 0)

@@ -36,17 +36,17 @@ def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigato
     return Navigator(model, config, backend="graph", **more)
 
 
-# --- what it is good for ---------------------------------------------------------------------
+# --- accuracy --------------------------------------------------------------------------------
 
 
-def test_it_is_closer_to_the_truth_than_the_filter() -> None:
+def test_the_graph_is_more_accurate_than_the_filter() -> None:
     scores = [score_walk(seed, 30.0) for seed in range(1, 4)]
     figures = summary(scores)
     assert figures["median_ate_to_ekf"]["graph"] < 0.95
     assert 0.8 < figures["median_ate_to_ekf"]["fixed_lag"] < 1.2
 
 
-def test_its_states_stand_at_the_filters_times_with_a_smaller_covariance(
+def test_states_are_at_the_filters_times_with_a_smaller_covariance(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -60,11 +60,11 @@ def test_its_states_stand_at_the_filters_times_with_a_smaller_covariance(
         np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
         assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert "keyframes" in smoothed.health.notes[0]
-    assert 0.5 < position_nees(smoothed.trajectory, walk.truth).mean < 3.0  # 1.0 of this walk
+    assert 0.5 < position_nees(smoothed.trajectory, walk.truth).mean < 3.0  # 1.0 for this walk
 
 
-def test_between_keyframes_it_moves_like_the_imu(walk: ImuSequence, make_oracle: Make) -> None:
-    """Velocity is the derivative of position, and nothing jumps where keyframes stand."""
+def test_the_track_follows_the_imu_between_keyframes(walk: ImuSequence, make_oracle: Make) -> None:
+    """Velocity is the derivative of position, and nothing jumps at keyframes."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
     track = graph(oracle).run(walk).trajectory
     step = np.diff(track.time)[:, None]
@@ -76,7 +76,7 @@ def test_between_keyframes_it_moves_like_the_imu(walk: ImuSequence, make_oracle:
     assert np.abs(np.diff(turned)).max() < 0.01
 
 
-def test_a_run_is_the_same_twice(walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_run_is_reproducible_without_ground_truth(walk: ImuSequence, make_oracle: Make) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG)
     once, twice = graph(oracle).run(walk), graph(oracle).run(walk.without_truth())
     for name, values in once.arrays().items():
@@ -100,7 +100,7 @@ def test_a_turned_and_shifted_world_turns_and_shifts_the_track(
     np.testing.assert_allclose(there.velocity_W, turn.apply(here.velocity_W), atol=1e-4)
 
 
-def test_another_mount_turns_the_track_about_the_vertical_and_no_more(
+def test_another_mount_only_turns_the_track_about_the_vertical(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     R_BM = Rotation.from_rotvec([1.5, 1.0, -0.5])
@@ -128,7 +128,7 @@ def first_state(covariance: np.ndarray) -> NavState:
 
 
 @pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "pose"), (9, "bias")])
-def test_a_state_that_nothing_determines_is_named(first: int, name: str) -> None:
+def test_an_undetermined_state_is_named(first: int, name: str) -> None:
     sigma = np.full(15, 0.1)
     sigma[first : first + 3] = 1e9
     graph = KeyframeGraph(first_state(np.diag(sigma**2)), gate=0.997)
@@ -140,7 +140,7 @@ def test_a_state_that_nothing_determines_is_named(first: int, name: str) -> None
     np.testing.assert_array_equal(graph.pose(1).p_W, np.zeros(3))
 
 
-def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
+def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(self: KeyframeGraph, max_rounds: int = 5) -> None:
@@ -158,8 +158,8 @@ def test_where_the_graph_fails_the_track_is_the_filters_and_says_so(
     assert any("filter's track" in line for line in health_lines(track.health))
 
 
-def test_a_perfect_sensor_is_no_reason_to_fail(walk: ImuSequence, make_oracle: Make) -> None:
-    """Densities of zero: gtsam has nothing to invert, the track comes out all the same."""
+def test_the_graph_accepts_a_perfect_sensor(walk: ImuSequence, make_oracle: Make) -> None:
+    """With densities of zero gtsam has nothing to invert; the track is computed all the same."""
     exact = replace(CONFIG, noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
     track = graph(make_oracle(walk, walk.truth, exact), exact).run(walk)
     assert np.isfinite(track.trajectory.position_W).all()
@@ -170,7 +170,7 @@ def test_a_perfect_sensor_is_no_reason_to_fail(walk: ImuSequence, make_oracle: M
 
 
 @pytest.mark.parametrize(("mean", "variance"), [(np.nan, 1e-4), (0.0, np.inf), (0.0, -1.0)])
-def test_measurements_without_meaning_are_refused_and_counted(
+def test_invalid_predictions_are_refused_and_counted(
     walk: ImuSequence, make_oracle: Make, mean: float, variance: float
 ) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
@@ -232,16 +232,16 @@ def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(
     truth = walk.truth.at(np.array([time])).position_W[0]
     fix = position_fix(time, truth, 1e-4 * np.eye(3))
     track = graph(oracle, prior=prior).run(walk, fixes=[fix])
-    for error, limit in ((track, 0.06), (graph(oracle, prior=prior).run(walk), np.inf)):
-        near = np.abs(error.time - time) < 0.11
-        true = walk.truth.at(error.time[near]).position_W
-        assert np.linalg.norm(error.trajectory.position_W[near] - true, axis=1).max() < limit
+    for each, limit in ((track, 0.06), (graph(oracle, prior=prior).run(walk), np.inf)):
+        near = np.abs(each.time - time) < 0.11
+        true = walk.truth.at(each.time[near]).position_W
+        assert np.linalg.norm(each.trajectory.position_W[near] - true, axis=1).max() < limit
     k = int(np.argmin(np.abs(track.time - time)))
     assert np.sqrt(track.covariance[k, 6:9, 6:9].trace()) < 0.08
     assert track.health.fixes == {"applied": 1}
 
 
-def test_heading_and_velocity_fixes_are_met(walk: ImuSequence, make_oracle: Make) -> None:
+def test_the_track_meets_heading_and_velocity_fixes(walk: ImuSequence, make_oracle: Make) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG)
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], np.zeros(3))
     truth = walk.truth.at(np.array([9.25, 14.0]))
@@ -266,9 +266,9 @@ def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
     walk = make_walk(2, 40.0)
     R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
     truth = walk.truth.at(np.array([5.0, 30.0]))
-    seen = R.apply(truth.position_W) + shift
-    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip((5.0, 30.0), seen, strict=True)]
-    # This network is never turned; a filter that reckons with it states too large a sigma.
+    p_W = R.apply(truth.position_W) + shift
+    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip((5.0, 30.0), p_W, strict=True)]
+    # This network is never turned; a filter that allows for a turn states too large a sigma.
     straight = replace(CONFIG, filter=replace(CONFIG.filter, network_turn_sigma=0.0))
     track = graph(make_oracle(walk, walk.truth, CONFIG), straight).run(walk, fixes=fixes)
     times = np.clip(track.time, 0.0, walk.time[-1])
@@ -276,5 +276,5 @@ def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
     assert np.linalg.norm(error, axis=1).max() < 1.0
     P = track.covariance[:, 6:9, 6:9]
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    assert 0.1 < np.median(nees) < 2.4  # of chi-square with 3: 2.4
+    assert 0.1 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
     assert track.health.fixes["applied"] == 2

@@ -1,4 +1,4 @@
-"""A wild time among fields or samples costs one of them, not all that follow."""
+"""A wild timestamp of a field or a sample costs that one, not all that follow."""
 
 import math
 from dataclasses import replace
@@ -22,15 +22,15 @@ def walk() -> ImuSequence:
     return replace(sequence, magnetometer=Magnetometer(time, np.tile(FIELD_B, (len(time), 1))))
 
 
-def with_field(sequence: ImuSequence) -> int:
+def count_with_field(sequence: ImuSequence) -> int:
     intervals, _ = cut_recording(sequence, NavigatorConfig())
     return sum(interval.field_B is not None for interval in intervals)
 
 
-def test_a_wild_sample_time_leaves_the_fields_where_they_belong(walk: ImuSequence) -> None:
+def test_a_wild_sample_time_costs_at_most_one_interval_its_field(walk: ImuSequence) -> None:
     time = walk.time.copy()
     time[1000] += 1e4
-    assert with_field(replace(walk, time=time)) >= with_field(walk) - 1 > 150
+    assert count_with_field(replace(walk, time=time)) >= count_with_field(walk) - 1 > 150
 
 
 @pytest.mark.parametrize("wild", [1e4, -1e4, math.nan])
@@ -43,7 +43,7 @@ def test_a_wild_field_time_costs_one_field(wild: float) -> None:
             assert buffer.at(time) is not None
 
 
-def test_late_and_repeated_fields_are_refused() -> None:
+def test_late_repeated_and_infinite_fields_are_refused() -> None:
     buffer = FieldBuffer()
     assert buffer.add(1.0, FIELD_B, now=1.0)
     assert not buffer.add(1.0, FIELD_B, now=1.0)
@@ -53,7 +53,7 @@ def test_late_and_repeated_fields_are_refused() -> None:
     assert buffer.at(1.2) is None
 
 
-def test_fields_may_come_some_seconds_before_their_samples() -> None:
+def test_fields_may_arrive_seconds_before_their_samples() -> None:
     buffer = FieldBuffer()
     for batch in range(5):
         for k in range(60):
@@ -61,7 +61,7 @@ def test_fields_may_come_some_seconds_before_their_samples() -> None:
         assert buffer.at(3.0 * batch + 0.12) is not None
 
 
-def test_a_field_that_comes_too_late_for_any_interval_is_told() -> None:
+def test_a_field_too_late_for_any_interval_is_refused() -> None:
     buffer = FieldBuffer()
     assert buffer.add(1.0, FIELD_B, 1.0)
     assert buffer.at(1.5) is None

@@ -1,4 +1,4 @@
-"""Intervals and windows: every moment once, nothing across a gap, and nothing from the filter."""
+"""Intervals cover every moment once; windows span no gap and do not depend on the filter."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ def integral(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def assert_seamless(intervals: list[ImuInterval], first: float) -> None:
-    """Each interval begins where the one before ended, with the same samples there."""
+    """Assert that each interval begins where the previous one ended, with the same sample."""
     assert intervals[0].start == first
     for before, after in pairwise(intervals):
         assert after.start == before.stop
@@ -35,7 +35,7 @@ def assert_seamless(intervals: list[ImuInterval], first: float) -> None:
 
 
 def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) -> ImuSequence:
-    """The walk sampled unevenly: times jittered (values as the walk had them), samples lost."""
+    """The walk sampled unevenly: jittered times (values interpolated there) and lost samples."""
     rng = np.random.default_rng(seed)
     time = sequence.time + jitter / sequence.rate * rng.uniform(-0.45, 0.45, len(sequence))
     time[0] = sequence.time[0]
@@ -63,7 +63,7 @@ def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) ->
         (1000.0, 1.0, 0.2),
     ],
 )
-def test_epochs_cover_every_moment_once(
+def test_intervals_cover_every_moment_once(
     make_walk: Callable[..., ImuSequence], rate: float, jitter: float, drops: float
 ) -> None:
     walk = uneven(make_walk(2, 8.0, rate), drops, jitter)
@@ -74,7 +74,7 @@ def test_epochs_cover_every_moment_once(
     np.testing.assert_allclose([e.stop - e.start for e in intervals], period, atol=1e-9)
     end = intervals[-1].stop
     assert walk.time[-1] - end < period
-    # Trapezoids between the recording's samples, up to the last interval's end.
+    # Trapezoidal integral of the recording's samples up to the last interval's end.
     inside = walk.time < end
     for name in ("gyro", "accel"):
         values = getattr(walk, name)
@@ -85,7 +85,7 @@ def test_epochs_cover_every_moment_once(
 
 
 @pytest.mark.parametrize("rate", [1, 2, 5, 10, 20])
-def test_windows_come_at_the_update_rate_one_second_after_the_start(
+def test_windows_come_at_the_update_rate_after_the_first_second(
     walk: ImuSequence, rate: int
 ) -> None:
     intervals, _ = cut_recording(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
@@ -101,7 +101,7 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
 ) -> None:
     walk = make_walk(3, 6.0, rate, PERFECT_IMU)
     intervals, _ = cut_recording(walk, CONFIG)
-    # The levelled attitude stands in for the truth; corrections at intervals' ends are small steps.
+    # The levelled attitude serves as truth; corrections at the intervals' ends are small steps.
     pairs = [(e.time[k], e.attitudes[k]) for e in intervals for k in range(len(e.time) - 1)]
     time, R = zip(*pairs, strict=True)
     truth = Trajectory(np.array(time), np.zeros((len(time), 3)), Rotation.from_matrix(np.stack(R)))
@@ -117,7 +117,7 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
     assert ours.dtype == np.float32
 
 
-def test_windows_start_with_the_attitude_they_state(walk: ImuSequence) -> None:
+def test_windows_start_with_their_stated_attitude(walk: ImuSequence) -> None:
     intervals, _ = cut_recording(walk, CONFIG)
     by_stop = {round(e.stop, 6): e for e in intervals}
     checked = 0
@@ -132,7 +132,7 @@ def test_windows_start_with_the_attitude_they_state(walk: ImuSequence) -> None:
     assert checked > 100
 
 
-def test_bad_samples_are_dropped_and_counted_and_the_rest_is_as_if_they_had_never_been(
+def test_bad_samples_are_dropped_and_counted_and_do_not_affect_the_rest(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
@@ -153,16 +153,16 @@ def test_bad_samples_are_dropped_and_counted_and_the_rest_is_as_if_they_had_neve
         np.testing.assert_array_equal(ours.attitudes, theirs.attitudes)
 
 
-def cut(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
+def samples_within(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
     return (walk.time > start) & (walk.time < stop)
 
 
 @pytest.mark.parametrize("length", [0.25, 0.5, 5.0])
-def test_a_gap_is_one_epoch_and_no_window_spans_it(
+def test_a_gap_is_one_interval_and_no_window_spans_it(
     walk: ImuSequence, without: Callable[..., ImuSequence], length: float
 ) -> None:
     start, stop = 6.02, 6.02 + length
-    holed = without(walk, cut(walk, start + 1e-9, stop - 1e-9))
+    holed = without(walk, samples_within(walk, start + 1e-9, stop - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
     (gap,) = [e for e in intervals if e.gap]
     assert gap.start == pytest.approx(start)
@@ -175,11 +175,11 @@ def test_a_gap_is_one_epoch_and_no_window_spans_it(
     assert min(after) == pytest.approx(stop + WINDOW_SECONDS)
 
 
-def test_a_hole_is_bridged_and_what_touches_it_is_flagged(
+def test_a_hole_is_bridged_and_intervals_and_windows_across_it_are_flagged(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
     start, stop = 6.02, 6.17
-    holed = without(walk, cut(walk, start + 1e-9, stop - 1e-9))
+    holed = without(walk, samples_within(walk, start + 1e-9, stop - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
     assert not any(e.gap for e in intervals)
     assert front_end.counts.gaps == [(pytest.approx(start), pytest.approx(stop - start))]
@@ -192,20 +192,20 @@ def test_a_hole_is_bridged_and_what_touches_it_is_flagged(
             assert e.window_flagged == (touches and e.stop > missing[0].start + 1e-9)
 
 
-def test_a_tenth_of_a_second_is_bridged(
+def test_a_hole_of_a_tenth_of_a_second_is_bridged(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
-    holed = without(walk, cut(walk, 6.0 + 1e-9, 6.1 - 2e-2))
+    holed = without(walk, samples_within(walk, 6.0 + 1e-9, 6.1 - 2e-2))
     intervals, front_end = cut_recording(holed, CONFIG)
     assert front_end.counts.gaps == []
     assert not any(e.gap for e in intervals)
     assert_seamless(intervals, walk.time[0])
 
 
-def test_after_a_gap_in_the_first_second_it_begins_anew(
+def test_after_a_gap_in_the_first_second_the_front_end_restarts(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
-    holed = without(walk, cut(walk, 0.5 + 1e-9, 0.9 - 1e-9))
+    holed = without(walk, samples_within(walk, 0.5 + 1e-9, 0.9 - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
     assert front_end.counts.gaps == [(pytest.approx(0.5), pytest.approx(0.4))]
     assert front_end.start is not None
@@ -214,10 +214,10 @@ def test_after_a_gap_in_the_first_second_it_begins_anew(
     assert not any(e.gap for e in intervals)
 
 
-def test_two_gaps_with_one_sample_between_them(
+def test_two_gaps_with_one_sample_between_them_are_counted_separately(
     walk: ImuSequence, without: Callable[..., ImuSequence]
 ) -> None:
-    gone = cut(walk, 5.0 + 1e-9, 6.0 - 1e-9)
+    gone = samples_within(walk, 5.0 + 1e-9, 6.0 - 1e-9)
     gone[np.argmin(np.abs(walk.time - 5.5))] = False
     intervals, front_end = cut_recording(without(walk, gone), CONFIG)
     assert [length for _, length in front_end.counts.gaps] == pytest.approx([0.5, 0.5])
@@ -225,11 +225,11 @@ def test_two_gaps_with_one_sample_between_them(
     assert_seamless(intervals, walk.time[0])
 
 
-def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
+def test_the_newest_gaps_are_listed_and_all_are_counted(
     walk: ImuSequence,
 ) -> None:
     front_end = FrontEnd(CONFIG)
-    for k in range(250):  # half a second of samples, then 0.5 s without, once 0.8 s
+    for k in range(250):  # 0.5 s of samples, then 0.5 s without, once 0.8 s
         for j in range(50):
             row = (float(k) + (0.3 if k > 100 else 0.0) + 0.01 * j, *walk.gyro[j], *walk.accel[j])
             front_end.push(row)
@@ -240,7 +240,7 @@ def test_of_any_number_of_gaps_the_newest_are_listed_and_all_are_counted(
     assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
 
 
-def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence) -> None:
+def test_times_since_1970_give_the_same_windows(walk: ImuSequence) -> None:
     late = replace(walk, time=walk.time + 1.7e9)
     ours, theirs = (
         [e.window for e in cut_recording(s, CONFIG)[0] if e.window is not None]
@@ -250,7 +250,7 @@ def test_large_times_as_since_1970_change_nothing_but_the_time(walk: ImuSequence
     assert np.abs(np.stack(ours) - np.stack(theirs)).max() < 2e-3
 
 
-def test_what_the_filter_is_told_does_not_reach_the_windows(walk: ImuSequence) -> None:
+def test_filter_settings_do_not_affect_the_windows(walk: ImuSequence) -> None:
     other = NavigatorConfig(
         filter=FilterConfig(update_rate=10, covariance_scale=9.0, gyro_bias_sigma=1.0)
     )
@@ -261,7 +261,7 @@ def test_what_the_filter_is_told_does_not_reach_the_windows(walk: ImuSequence) -
         assert (ours.window is None) == (theirs.window is None)
 
 
-def test_it_takes_samples_one_by_one_and_holds_no_more_than_a_second(walk: ImuSequence) -> None:
+def test_the_front_end_buffers_no_more_than_a_second(walk: ImuSequence) -> None:
     front_end = FrontEnd(CONFIG)
     held = 0
     for row in np.column_stack([walk.time, walk.gyro, walk.accel]).tolist():

@@ -34,7 +34,7 @@ def state() -> tuple[np.ndarray, ...]:
 
 
 def moved(x: tuple[np.ndarray, ...], error: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The state that lies a right-invariant error away."""
+    """The state displaced by a right-invariant error."""
     R, v, p = exp_se23(error[:9])
     return R @ x[0], R @ x[1] + v, R @ x[2] + p, x[3] + error[9:12], x[4] + error[12:]
 
@@ -46,7 +46,7 @@ def difference(x: tuple[np.ndarray, ...], y: tuple[np.ndarray, ...]) -> np.ndarr
 
 
 def coning(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """One second of attitude that cones about x at 10 Hz, with a vibrating force; exact end."""
+    """One second of coning about x at 10 Hz with a vibrating force: samples and exact end state."""
     t = np.linspace(0.0, 1.0, round(rate) + 1)
 
     def signals(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +67,9 @@ def coning(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
     return t, gyro, accel, end[:9].reshape(3, 3), end[9:]
 
 
-def folded(dt: np.ndarray, rate: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def integrated(
+    dt: np.ndarray, rate: np.ndarray, force: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     R, v = np.eye(3), np.zeros(3)
     for step, w, a in zip(dt, rate, force, strict=True):
         v = v + R @ a * step
@@ -75,8 +77,8 @@ def folded(dt: np.ndarray, rate: np.ndarray, force: np.ndarray) -> tuple[np.ndar
     return R, v
 
 
-def between(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
-    """Samples of the straight lines between samples."""
+def interpolated(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
+    """Linear interpolation between samples, at `finer` times their rate."""
     fine = np.linspace(t[0], t[-1], finer * (len(t) - 1) + 1)
     return np.stack([np.interp(fine, t, column) for column in values.T], axis=1)
 
@@ -87,7 +89,7 @@ def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
     finer = 100
     dt = 0.005 / finer
     expected_R, expected_v, expected_p = R, v, p
-    w, a = between(t, gyro, finer) - b_g, between(t, accel, finer) - b_a
+    w, a = interpolated(t, gyro, finer) - b_g, interpolated(t, accel, finer) - b_a
     for k in range(finer * (len(t) - 1)):
         rate, force = 0.5 * (w[k] + w[k + 1]), 0.5 * (a[k] + a[k + 1])
         a_W = expected_R @ exp_so3(0.5 * dt * rate) @ force - [0, 0, GRAVITY]
@@ -104,7 +106,7 @@ def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
     np.testing.assert_allclose(p, expected_p, atol=5e-5)
 
 
-def test_a_device_at_rest_stays() -> None:
+def test_a_device_at_rest_stays_in_place() -> None:
     R, _, p, b_g, b_a = state()
     t = np.linspace(0.0, 1.0, 101)
     gyro = np.tile(b_g, (101, 1))
@@ -116,7 +118,7 @@ def test_a_device_at_rest_stays() -> None:
     np.testing.assert_allclose(p_end, p, atol=1e-12)
 
 
-def test_coning_and_sculling_corrections_beat_the_midpoint() -> None:
+def test_coning_and_sculling_corrections_beat_the_midpoint_rule() -> None:
     t, gyro, accel, R_true, v_true = coning(200)
     corrected = corrected_increments(t, gyro, accel)
     midpoint = np.diff(t), 0.5 * (gyro[1:] + gyro[:-1]), 0.5 * (accel[1:] + accel[:-1])
@@ -124,13 +126,13 @@ def test_coning_and_sculling_corrections_beat_the_midpoint() -> None:
     def errors(
         increments: tuple[np.ndarray, ...], R_ref: np.ndarray, v_ref: np.ndarray
     ) -> np.ndarray:
-        R, v = folded(*increments)
+        R, v = integrated(*increments)
         return np.array([np.linalg.norm(log_so3(R @ R_ref.T)), np.linalg.norm(v - v_ref)])
 
     # Against the true motion, which bends between samples, and against straight lines between them.
     assert (errors(corrected, R_true, v_true) < 0.6 * errors(midpoint, R_true, v_true)).all()
-    fine = np.linspace(0.0, 1.0, 10_001), between(t, gyro, 50), between(t, accel, 50)
-    lines = folded(*corrected_increments(*fine))
+    fine = np.linspace(0.0, 1.0, 10_001), interpolated(t, gyro, 50), interpolated(t, accel, 50)
+    lines = integrated(*corrected_increments(*fine))
     assert (errors(corrected, *lines) < 0.02 * errors(midpoint, *lines)).all()
 
 
@@ -158,7 +160,7 @@ def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
     )
 
 
-def test_yaw_and_position_stay_unobservable_constants() -> None:
+def test_propagation_keeps_yaw_and_position_unobservable() -> None:
     x = state()
     segment = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY)
     unobservable = np.zeros((15, 4))
@@ -167,13 +169,13 @@ def test_yaw_and_position_stay_unobservable_constants() -> None:
     np.testing.assert_array_equal(propagated(segment, *x).transition @ unobservable, unobservable)
 
 
-def test_noise_is_that_of_perturbed_samples() -> None:
-    """Sum over every sample's noise and every step of the biases' walks, by finite differences."""
+def test_noise_agrees_with_that_of_perturbed_samples() -> None:
+    """Sum over each sample's noise and each step of the biases' walks, by finite differences."""
     R, v, p, b_g, b_a = state()
     n, dt = 10, 0.02
     t, gyro, accel = samples(1 / dt, n * dt)
     step = 1e-5
-    # Without rotation inside the intervals' corrections the samples act one interval each.
+    # Perturbed after the corrections for rotation, so that each sample acts on one interval.
     dt_k, rate, force = corrected_increments(t, gyro - b_g, accel - b_a)
 
     def end(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -208,7 +210,7 @@ def test_noise_is_that_of_perturbed_samples() -> None:
     )
 
 
-def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
+def test_more_white_noise_does_not_change_the_random_walk_of_the_biases() -> None:
     x = state()
     loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
     plain, scaled = (
@@ -219,8 +221,8 @@ def test_more_white_noise_leaves_the_walks_of_the_biases() -> None:
     np.testing.assert_array_equal(scaled[9:, 9:], plain[9:, 9:])
 
 
-def test_a_segment_with_the_noise_of_its_parts_is_their_sequence() -> None:
-    """An impact is followed by what it did to the speed: the noise of their mean is another."""
+def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence() -> None:
+    """An impact's velocity error acts on the position afterwards, which mean noise would miss."""
     x = state()
     t, gyro, accel = samples(200)
     loud = [replace(NOISE, accel_noise=size * NOISE.accel_noise) for size in (8.0, 1.0, 1.0, 4.0)]

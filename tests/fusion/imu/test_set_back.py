@@ -1,4 +1,4 @@
-"""A clock that is set back begins another recording, and nothing pretends otherwise."""
+"""A clock that is set back starts another recording, and the user is informed."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,11 +17,11 @@ Make = Callable[..., Any]
 
 
 def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
-    note_late = walk.time >= at
-    return replace(walk.without_truth(), time=np.where(note_late, walk.time - by, walk.time))
+    late = walk.time >= at
+    return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
 
 
-def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> None:
+def test_a_stream_raises_an_error_and_restarts(make_walk: Make, still_model: Any) -> None:
     walk = set_back(make_walk(3, 16.0), 100.0)
     first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
     navigator, states, errors = Navigator(still_model, prior=first), [], []
@@ -35,13 +35,13 @@ def test_a_stream_says_so_and_begins_anew(make_walk: Make, still_model: Any) -> 
     assert errors[0].by == pytest.approx(100.0, abs=0.1)
     times = [state.time for state in states if state is not None]
     assert times[-1] == pytest.approx(walk.time[-1], abs=0.11)
-    # What was known of the first pose, or waited, is of the other clock.
+    # The prior pose and the waiting fix belonged to the other clock.
     assert np.linalg.norm(navigator.state.p_W) < 10.0
     assert navigator.health.fixes == {}
 
 
 @pytest.mark.parametrize("by", [7.0, 100.0])
-def test_a_recordings_track_ends_there_and_its_health_says_why(
+def test_a_recordings_track_ends_there_and_its_health_states_why(
     make_walk: Make, still_model: Any, by: float
 ) -> None:
     walk = set_back(make_walk(3, 16.0), by)
@@ -54,19 +54,21 @@ def test_a_recordings_track_ends_there_and_its_health_says_why(
     assert f"{by - 0.01:.3g} s at 8.0 s" in problem
 
 
-def test_late_samples_and_bursts_are_no_other_clock() -> None:
-    watch = ClockSetBackDetector()
+def test_late_samples_and_bursts_are_not_another_clock() -> None:
+    detector = ClockSetBackDetector()
     for k in range(300):  # two sensors in turn, one half a second behind
-        watch.on_time()
-        watch.note_late(0.01 * k - 0.5, 0.01 * k)
+        detector.on_time()
+        detector.note_late(0.01 * k - 0.5, 0.01 * k)
     for k in range(490):
-        watch.note_late(0.01 * k, 10.0)
-    watch.on_time()
-    for k in range(300):  # falling
-        watch.note_late(9.0 - 0.01 * k, 10.0)
+        detector.note_late(0.01 * k, 10.0)
+    detector.on_time()
+    for k in range(300):  # decreasing times
+        detector.note_late(9.0 - 0.01 * k, 10.0)
 
 
-def test_a_block_that_is_logged_twice_costs_nothing(make_walk: Make, still_model: Any) -> None:
+def test_a_block_that_is_logged_twice_does_not_change_the_track(
+    make_walk: Make, still_model: Any
+) -> None:
     walk = make_walk(3, 16.0).without_truth()
     rows = np.r_[0:800, 600 : len(walk)]
     twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
@@ -74,7 +76,7 @@ def test_a_block_that_is_logged_twice_costs_nothing(make_walk: Make, still_model
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
-def test_rows_in_disorder_are_to_be_sorted(make_walk: Make) -> None:
+def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk: Make) -> None:
     walk = make_walk(3, 16.0)
     order = np.random.default_rng(0).permutation(len(walk))
     shuffled = replace(
@@ -85,7 +87,7 @@ def test_rows_in_disorder_are_to_be_sorted(make_walk: Make) -> None:
     assert "ms" not in problems
 
 
-def test_values_that_no_sensor_gives_are_named_and_leave_the_means_alone(make_walk: Make) -> None:
+def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk: Make) -> None:
     walk = make_walk(3, 16.0)
     gyro = walk.gyro.copy()
     gyro[::300] = 1e6
@@ -94,9 +96,9 @@ def test_values_that_no_sensor_gives_are_named_and_leave_the_means_alone(make_wa
     assert found.gyro_norm < 10.0
 
 
-def test_a_clock_that_is_set_back_by_little_is_told(make_walk: Make, still_model: Any) -> None:
+def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk: Make, still_model: Any) -> None:
     walk = make_walk(3, 16.0)
     track = Navigator(still_model).run(set_back(walk, 3.0))
-    (words,) = (note for note in track.health.notes if "late" in note)
-    assert "for 3.0 s in a row" in words
+    (message,) = (note for note in track.health.notes if "late" in note)
+    assert "for 3.0 s in a row" in message
     assert not [note for note in Navigator(still_model).run(walk).health.notes if "late" in note]

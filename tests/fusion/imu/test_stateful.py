@@ -1,4 +1,4 @@
-"""A network that remembers earlier windows gives the same track in a stream as at once."""
+"""A network that remembers earlier windows gives the same track in a stream as in a batch."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from stario.sequences.errors import InputError
 
 
 class Counting:
-    """Says how many windows its memory holds: a metre upwards for each, in each series."""
+    """Predicts one metre upwards per window in its memory, separately for each series."""
 
     def predict(self, windows):
-        raise AssertionError("a network that remembers is asked along a track")
+        raise AssertionError("a network with memory must be called through `stateful_inference`")
 
     def stateful_inference(self, updates):
-        return _Chains(updates)
+        return _Series(updates)
 
 
-class _Chains:
+class _Series:
     def __init__(self, updates):
         self.counts, self.index = [0] * updates, 0
 
@@ -48,10 +48,10 @@ def with_gap(walk, without):
 
 
 @pytest.mark.parametrize("rate", [1, 5])
-def test_memory_lasts_from_gap_to_gap_in_series_of_their_own(walk, without, rate) -> None:
+def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, rate) -> None:
     config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
     preprocessed = Navigator(Counting(), config).observe(with_gap(walk, without))
-    stretches, told = [[]], []
+    stretches, all_counts = [[]], []
     for interval, measurement in zip(
         preprocessed.intervals, preprocessed.measurements, strict=True
     ):
@@ -62,11 +62,11 @@ def test_memory_lasts_from_gap_to_gap_in_series_of_their_own(walk, without, rate
     assert len(stretches) == 2
     for stretch in stretches:
         assert stretch == pytest.approx([k // rate for k in range(len(stretch))])
-        told += stretch
-    assert len(told) > 15 * rate
+        all_counts += stretch
+    assert len(all_counts) > 15 * rate
 
 
-def test_a_stream_is_the_same_track_also_when_continued(walk, without) -> None:
+def test_a_stream_equals_the_batch_also_after_a_restore(walk, without) -> None:
     sequence = with_gap(walk, without)
     track = Navigator(Counting()).run(sequence).trajectory
     navigator = Navigator(Counting())
@@ -82,7 +82,7 @@ def test_a_stream_is_the_same_track_also_when_continued(walk, without) -> None:
     np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
 
 
-def test_the_track_with_true_attitude_remembers_too(walk) -> None:
+def test_the_track_with_true_attitude_uses_memory_too(walk) -> None:
     config = NavigatorConfig(filter=FilterConfig(update_rate=1))
     track = network_track_true_attitude(Counting(), walk, config)
     speed = track.trajectory.velocity_W[:, 2]
@@ -90,7 +90,7 @@ def test_the_track_with_true_attitude_remembers_too(walk) -> None:
     assert speed[-1] == pytest.approx(len(track.trajectory.time) - 2)
 
 
-def test_a_model_without_memory_is_asked_itself(still_model) -> None:
+def test_a_model_without_memory_is_called_directly(still_model) -> None:
     network = StatefulInference(still_model, 10)
     assert not network.is_recurrent
     assert network.memory is None

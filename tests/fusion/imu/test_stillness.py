@@ -1,4 +1,4 @@
-"""Rest: found where nothing moves, never in motion, and worth something for bias and velocity."""
+"""Rest: detected where nothing moves, never in motion; informative about bias and velocity."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU
 
 CONFIG = NavigatorConfig()
-BLIND = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
+NO_STILLNESS = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])
 GRAVITY = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
@@ -32,7 +32,7 @@ Make = Callable[..., Any]
 def lying(
     seconds: float, rate: float = 100.0, turn: float = 0.0, bias: np.ndarray = BIAS
 ) -> ImuSequence:
-    """A phone that lies on a table, or is turned about the vertical at a rate [rad/s]."""
+    """A phone that lies on a table, or turns about the vertical at the rate `turn` [rad/s]."""
     rng = np.random.default_rng(0)
     n = round(seconds * rate) + 1
     white = np.sqrt(rate) * rng.standard_normal((2, n, 3))
@@ -41,7 +41,7 @@ def lying(
     return ImuSequence("lying", np.arange(n) / rate, gyro, accel)
 
 
-def share_at_rest(sequence: ImuSequence) -> float:
+def fraction_at_rest(sequence: ImuSequence) -> float:
     intervals, _ = cut_recording(sequence, CONFIG)
     detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
     return float(np.mean([detector.is_still(interval) for interval in intervals]))
@@ -49,11 +49,11 @@ def share_at_rest(sequence: ImuSequence) -> float:
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 1000.0])
 def test_a_device_on_a_table_is_at_rest_after_a_second(rate: float) -> None:
-    assert share_at_rest(lying(10.0, rate)) == pytest.approx(91 / 100, abs=0.03)
+    assert fraction_at_rest(lying(10.0, rate)) == pytest.approx(91 / 100, abs=0.03)
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "trolley"])
-def test_who_walks_is_not_at_rest(make_walk: Make, carry: str) -> None:
+def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
     walk = make_walk(5, 20.0, 100.0, PHONE_IMU, carry=carry)
     intervals, _ = cut_recording(walk, CONFIG)
     detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
@@ -74,19 +74,19 @@ def test_rest_needs_a_whole_second_and_a_gap_ends_it() -> None:
     assert all(found[40:])
 
 
-def yaw_off(track: Track) -> float:
+def yaw_drift(track: Track) -> float:
     turn = track.trajectory.attitude_WB[0].inv() * track.trajectory.attitude_WB[-1]
     return float(turn.magnitude())
 
 
-def test_rest_measures_the_bias_and_holds_yaw_and_place(still_model: Any) -> None:
+def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model: Any) -> None:
     table = lying(30.0)
     with_zero_velocity = Navigator(still_model, CONFIG).run(table)
-    without = Navigator(still_model, BLIND).run(table)
+    without = Navigator(still_model, NO_STILLNESS).run(table)
     assert with_zero_velocity.health.zero_velocity == {"applied": 291}
     assert without.health.zero_velocity == {}
     np.testing.assert_allclose(with_zero_velocity.b_g[-1], BIAS, atol=1e-4)
-    assert yaw_off(with_zero_velocity) < 0.2 * yaw_off(without)
+    assert yaw_drift(with_zero_velocity) < 0.2 * yaw_drift(without)
     assert np.linalg.norm(with_zero_velocity.trajectory.velocity_W[-1]) < 0.01
     assert np.linalg.norm(with_zero_velocity.trajectory.position_W[-1]) < 0.05
     sigma = np.sqrt(np.diag(with_zero_velocity.covariance[-1]))
@@ -95,22 +95,22 @@ def test_rest_measures_the_bias_and_holds_yaw_and_place(still_model: Any) -> Non
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_what_lies_still_does_not_drift_by_what_the_network_says(backend: BackendName) -> None:
-    """The network learned from walking: of a table it says a centimetre a second."""
+def test_a_device_at_rest_does_not_drift_with_the_predictions(backend: BackendName) -> None:
+    """Trained on walks, the network predicts a centimetre per second on a table."""
     track = Navigator(load_model(), CONFIG, backend=backend).run(lying(60.0))
     assert np.linalg.norm(track.trajectory.position_W[-1]) < 0.05
     error, P = track.trajectory.position_W[-1], track.covariance[-1, 6:9, 6:9]
     assert error @ np.linalg.solve(P, error) < 12.0
 
 
-def test_rest_says_nothing_of_yaw(still_model: Any) -> None:
+def test_rest_gives_no_information_about_yaw(still_model: Any) -> None:
     prior = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3), yaw_sigma=0.3)
     track = Navigator(still_model, CONFIG, prior).run(lying(10.0))
     assert np.sqrt(track.covariance[-1, 2, 2]) > 0.3
 
 
-def test_an_even_glide_is_not_stopped(still_model: Any) -> None:
-    """No vibration, and no network that knows: what the filter knows of its speed decides."""
+def test_a_steady_glide_is_not_stopped(still_model: Any) -> None:
+    """With no vibration and an uninformative network, the filter's own speed decides."""
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
     config = replace(CONFIG, noise=PHONE_IMU.noise, filter=quiet)
@@ -119,7 +119,7 @@ def test_an_even_glide_is_not_stopped(still_model: Any) -> None:
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
-def test_a_slow_turn_is_not_taken_for_bias(still_model: Any) -> None:
+def test_a_slow_turn_is_not_mistaken_for_bias(still_model: Any) -> None:
     track = Navigator(still_model, CONFIG).run(lying(20.0, turn=0.05, bias=np.zeros(3)))
     assert track.health.zero_velocity == {"gated": 191}
     assert np.abs(track.b_g[-1]).max() < 2e-3
@@ -135,7 +135,7 @@ def test_a_slow_turn_is_not_taken_for_bias(still_model: Any) -> None:
         ("tumvi/dataset-room1_512_16", False),
     ],
 )
-def test_recordings_rest_only_where_the_truth_does(name: str, found: bool) -> None:
+def test_rest_is_detected_only_where_the_ground_truth_rests(name: str, found: bool) -> None:
     if not (DATA / name).exists():
         pytest.skip(f"no {name} at {DATA}")
     recording = read_recording(DATA / name)
