@@ -71,8 +71,8 @@ def check_covariance(covariance: FloatArray) -> None:
 def floored(covariance: FloatArray, sigma: float) -> FloatArray:
     """Raise positive variances to at least sigma^2; others are left for later checks to refuse."""
     variance = covariance.diagonal()
-    short = (variance > 0.0) & (variance < sigma * sigma)
-    if not short.any():
+    too_small = (variance > 0.0) & (variance < sigma * sigma)
+    if not too_small.any():
         return covariance
-    lift: FloatArray = np.diag(np.where(short, sigma * sigma - variance, 0.0))
-    return covariance + lift
+    increase: FloatArray = np.diag(np.where(too_small, sigma * sigma - variance, 0.0))
+    return covariance + increase

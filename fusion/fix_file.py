@@ -26,7 +26,7 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import increasing_mask
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
-_NEEDED = (*_COLUMNS[:3], "sx")
+_REQUIRED = (*_COLUMNS[:3], "sx")
 
 _UNITS = {"t": ("s",), "kind": ()}
 """Units that a header may name for a column; for the others m, m/s and rad."""
@@ -52,7 +52,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
     header = [_without_unit(word).lower() for word in rows[0]] if rows else []
     unknown = [word for word in header if word not in _COLUMNS]
-    missing = [word for word in _NEEDED if word not in header]
+    missing = [word for word in _REQUIRED if word not in header]
     if unknown or missing or len(set(header)) < len(header):
         found = ",".join(header) or "nothing"
         raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
@@ -76,9 +76,9 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
     Raises:
         InputError: none does, so that they belong to another clock.
     """
-    counted = sequence.time[np.isfinite(sequence.time)]
-    counted = counted[increasing_mask(counted)]
-    times, start, stop = [fix.time for fix in fixes], counted[0], counted[-1]
+    sample_times = sequence.time[np.isfinite(sequence.time)]
+    sample_times = sample_times[increasing_mask(sample_times)]
+    times, start, stop = [fix.time for fix in fixes], sample_times[0], sample_times[-1]
     if times and not any(start <= t <= stop for t in times):
         found = f"times from {min(times):.6g} to {max(times):.6g} s"
         expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"
@@ -104,8 +104,8 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
     if kind == "yaw" and (abs(value[0]) > LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
-        found, fix = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
-        raise ReadError(path, f"{where}, yaw", found, "radians", fix)
+        found, remedy = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
+        raise ReadError(path, f"{where}, yaw", found, "radians", remedy)
     (time,) = _numbers(path, where, cells, ["t"])
     return make_fix(time, kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]
 

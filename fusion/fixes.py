@@ -33,7 +33,7 @@ KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 MOST_WAITING = 10_000
 """Number of fixes of a stream that may wait for their time, which bounds the memory."""
 
-_SMALLEST_SIGMA = 1e-4
+_MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
 
@@ -180,5 +180,5 @@ def make_fix(time: Any, kind: FixKind, value: Any, covariance: Any) -> Fix:
         time=shaped("time", time, ()).item(),
         kind=kind,
         value=shaped(kind, value, (n,)),
-        covariance=floored(shaped("covariance", covariance, (n, n)), _SMALLEST_SIGMA),
+        covariance=floored(shaped("covariance", covariance, (n, n)), _MIN_SIGMA),
     )

@@ -265,9 +265,9 @@ class Navigator:
         """
         check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
         if not callable(progress):
-            fix = "pass fixes by name: fixes=[...]"
+            remedy = "pass fixes by name: fixes=[...]"
             raise InputError(
-                "progress", f"{progress!r:.60}", "a function of the fraction done", fix
+                "progress", f"{progress!r:.60}", "a function of the fraction done", remedy
             )
         return preprocess(sequence, self.model, self.config, progress)
 

@@ -133,8 +133,8 @@ def _whole(value: Any, arrays: dict[str, Any]) -> Any:
             return arrays[f"a{k}"]
         case {"is": name, "has": has}:
             return _rebuilt(_classes()[name], {k: _whole(v, arrays) for k, v in has.items()})
-        case {"deque": entries, "maxlen": most}:
-            return deque((_whole(entry, arrays) for entry in entries), maxlen=most)
+        case {"deque": entries, "maxlen": maxlen}:
+            return deque((_whole(entry, arrays) for entry in entries), maxlen=maxlen)
         case {"tuple": entries}:
             return tuple(_whole(entry, arrays) for entry in entries)
         case {"map": entries}:
@@ -146,8 +146,8 @@ def _rebuilt(kind: type, has: dict[str, Any]) -> Any:
     if issubclass(kind, tuple):
         return kind(**has)
     new = kind.__new__(kind)
-    put = getattr(new, "__setstate__", vars(new).update)
-    put(has)
+    set_state = getattr(new, "__setstate__", vars(new).update)
+    set_state(has)
     return new
 
 
@@ -161,5 +161,5 @@ def check_same(name: str, found: object, expected: object) -> None:
         for key, value in expected.items():
             check_same(f"{name}.{key}", found[key], value)
     elif found != expected:
-        fix = "restore with the same configuration and weights"
-        raise InputError(f"snapshot: {name}", repr(found), repr(expected), fix)
+        remedy = "restore with the same configuration and weights"
+        raise InputError(f"snapshot: {name}", repr(found), repr(expected), remedy)

@@ -233,7 +233,7 @@ class Track:
 
     def arrays(self) -> dict[str, Any]:
         """Return all arrays by name, for an npz file."""
-        known = {
+        arrays = {
             "time": self.time,
             "position_W": self.trajectory.position_W,
             "quat_xyzw_WB": self.trajectory.quat_xyzw,
@@ -243,7 +243,7 @@ class Track:
             "accel_bias_B": self.b_a,
             "covariance": self.covariance,
         }
-        return {name: value for name, value in known.items() if value is not None}
+        return {name: value for name, value in arrays.items() if value is not None}
 
 
 def track_from_states(

@@ -97,14 +97,14 @@ def gaps(
 
 def _judge_each(
     title: str,
-    given: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
+    options: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
     judge: Judge,
     table: Callable[[Sequence[Any]], str],
 ) -> None:
     """Evaluate each recording, print a table or JSON, and exit with 1 if any was skipped."""
     from stario.fusion.evaluation.judging.judge import check_by, labels
 
-    reading, paths, estimating, by, as_json = given
+    reading, paths, estimating, by, as_json = options
     grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
 
@@ -112,9 +112,9 @@ def _judge_each(
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
     results, skipped = map_recordings(title, reading, paths, judged)
-    found = [one for several in results for one in several]
+    found = [result for group in results for result in group]
     if as_json:
-        print_json([asdict(one) for one in found])
+        print_json([asdict(result) for result in found])
     elif found:
         typer.echo(table(found))
     exit_if_skipped(skipped)

@@ -218,11 +218,11 @@ def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        made = {
+        grouped = {
             name: groups[name](**{key: values.pop(key) for key in keys})
             for name, keys in members.items()
         }
-        command(**values, **made)
+        command(**values, **grouped)
 
     flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     flat.__annotations__ = {name: option.annotation for name, option in options.items()}

@@ -50,8 +50,8 @@ class AlternativeHypothesis:
     def updated(self, fits: bool, fits_filter: bool) -> AlternativeHypothesis:
         """Return the hypothesis after a displacement that fits it, the filter, both or neither."""
         if not fits:
-            alone = self.exclusive_fits if not fits_filter else 0
-            return changed(self, exclusive_fits=alone, shared_fits=0)
+            exclusive = self.exclusive_fits if not fits_filter else 0
+            return changed(self, exclusive_fits=exclusive, shared_fits=0)
         return changed(
             self,
             exclusive_fits=self.exclusive_fits + (not fits_filter),

@@ -63,8 +63,8 @@ class StateCloningEkf(ErrorStateEngine):
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
-        nothing = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
-        self.state = EkfState.initial(nothing, slots)
+        undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
+        self.state = EkfState.initial(undefined, slots)
         super().__init__(CORE + CLONE * slots + 1)
         self.gravity = gravity
         self.slots = slots

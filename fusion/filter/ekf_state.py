@@ -165,7 +165,7 @@ class EkfState:
         """
         time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
         if time is None:
-            taken = [k for k, known in enumerate(self.clone_times) if known is not None]
+            taken = [k for k, clone_time in enumerate(self.clone_times) if clone_time is not None]
             raise InputError("slot", repr(slot), f"a slot that holds a clone: {taken}")
         return time
 

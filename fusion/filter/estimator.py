@@ -109,20 +109,20 @@ class Estimator:
         factor = self._displacements.accel_noise.factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
-        self._remember(interval, displacement, fixes)
+        self._record_step(interval, displacement, fixes)
         if interval.gap or fixes:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
-        at_rest = self._update_zero_velocity(interval)
+        zupt = self._update_zero_velocity(interval)
         # Zero velocity beats a network trained on walking, which predicts 1 cm/s at rest.
-        offered = displacement if at_rest is None else None
-        taken = None if offered is None else self._update_displacement(interval, *offered)
+        offered = displacement if zupt is None else None
+        applied = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self._bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
-        return IntervalMeasurements(interval, offered, taken, bearing, at_rest, accepted, segment)
+        return IntervalMeasurements(interval, offered, applied, bearing, zupt, accepted, segment)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Apply a fix from the past; return None if it is more than a window late.
@@ -146,7 +146,7 @@ class Estimator:
             accepted += self.step(step.interval, step.displacement, fixes).fixes
         return accepted
 
-    def _remember(
+    def _record_step(
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix]
     ) -> None:
         if self._streaming:
@@ -162,7 +162,7 @@ class Estimator:
         """Propagate through the fixes; return the segment (None if split) and the fixes applied."""
         self.in_gap = interval.gap
         if interval.gap:
-            self._forget_window()
+            self._release_clones()
         if interval.restart is not None:
             # Fixes within a long gap are useless: nothing links them to the track after it.
             for _ in fixes:
@@ -273,7 +273,7 @@ class Estimator:
             self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
         )
 
-    def _forget_window(self) -> None:
+    def _release_clones(self) -> None:
         """Release the clones: no displacement spans a gap."""
         for slot in self._clones:
             self.ekf.release(slot)

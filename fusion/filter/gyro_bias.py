@@ -41,10 +41,10 @@ _WIDEST = 0.015
 """Maximum sigma to which the data widen the prior [rad/s]; a larger bias is uncorrected, which
 levelling detects sooner."""
 
-_REST_SIGMA = 2.5e-3
+_STILLNESS_SIGMA = 2.5e-3
 """Minimum sigma of the prior where rest measures the bias [rad/s]: a turning glide is not rest."""
 
-_LONG_REST, _RAW_SIGMA = 30.0, 0.1
+_LONG_STILLNESS, _RAW_SIGMA = 30.0, 0.1
 """Apparent rest of this length [s] is rest, although the gyroscope reads up to this [rad/s]:
 gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly for so long."""
 
@@ -101,9 +101,9 @@ class GyroBiasPrior:
         """
         uncorrected = max(self.uncorrected, levelled - _MAX_CORRECTED_BIAS)
         evidence = max(self.evidence, min(self._variance_from_data(b_g, P, wander), _WIDEST**2))
-        known = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
+        floor = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
         return changed(
-            self, variance=max(known, evidence), uncorrected=uncorrected, evidence=evidence
+            self, variance=max(floor, evidence), uncorrected=uncorrected, evidence=evidence
         )
 
     def _variance_from_data(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
@@ -143,7 +143,7 @@ class AdaptiveBiasPrior:
     def begin(self) -> None:
         """Widen the prior for the time before gravity provides information."""
         if self._config.filter.adaptive:
-            self._exchange(self.prior.before_levelling())
+            self._replace_prior(self.prior.before_levelling())
 
     def update(self, interval: ImuInterval) -> None:
         """Adapt the prior after an interval to what gravity and the data show about the bias."""
@@ -155,14 +155,14 @@ class AdaptiveBiasPrior:
             return
         levelled = interval.levelled_bias, interval.levelled_bias_sigma
         s = self._hypotheses.ekf.state
-        self._exchange(
+        self._replace_prior(
             self.prior.updated(*levelled, s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander)
         )
 
     def widen_for_rest(self) -> None:
         """Widen the prior before rest measures the bias."""
-        sigma = _REST_SIGMA if self.prior.refused_seconds < _LONG_REST else _RAW_SIGMA
-        self._exchange(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
+        sigma = _STILLNESS_SIGMA if self.prior.refused_seconds < _LONG_STILLNESS else _RAW_SIGMA
+        self._replace_prior(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
 
     def note_refused_rest(self, seconds: float) -> None:
         """Add to the time of rejected apparent rest [s]; 0 resets it (accepted, or moving)."""
@@ -170,7 +170,7 @@ class AdaptiveBiasPrior:
         if refused_seconds != self.prior.refused_seconds:
             self.prior = changed(self.prior, refused_seconds=refused_seconds)
 
-    def _exchange(self, updated: GyroBiasPrior) -> None:
+    def _replace_prior(self, updated: GyroBiasPrior) -> None:
         """Replace the prior as if the new one had been used from the start."""
         old, new = self.prior.variance + self._wander, updated.variance + self._wander
         ekf = self._hypotheses.ekf
@@ -199,11 +199,11 @@ def gained_bias_information(
     Returns:
         Bias (3,) [rad/s] and covariance (3, 3); None if nothing was gained.
     """
-    was, now = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
-    gained, axes = np.linalg.eigh(now - was)
-    gain, axis = float(gained[-1]), axes[:, -1]
-    if gain < _MIN_GAIN * float(np.trace(was)):
+    prior, posterior = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
+    eigenvalues, axes = np.linalg.eigh(posterior - prior)
+    gain, axis = float(eigenvalues[-1]), axes[:, -1]
+    if gain < _MIN_GAIN * float(np.trace(prior)):
         return None
-    value = float(axis @ (now @ after.b_g - was @ before.b_g)) / gain
+    value = float(axis @ (posterior @ after.b_g - prior @ before.b_g)) / gain
     covariance = np.outer(axis, axis) / gain + _VAGUE_SIGMA**2 * (np.eye(3) - np.outer(axis, axis))
     return value * axis, covariance

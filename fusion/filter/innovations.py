@@ -60,8 +60,8 @@ class UpdateCounts:
 
     def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more measurement at rest."""
-        what = "applied" if result.accepted else result.reason
-        return changed(self, zero_velocity=incremented(self.zero_velocity, what))
+        outcome = "applied" if result.accepted else result.reason
+        return changed(self, zero_velocity=incremented(self.zero_velocity, outcome))
 
     def add_bearing(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more bearing of the magnetic field."""

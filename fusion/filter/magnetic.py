@@ -80,7 +80,7 @@ _AVERAGING_COUNT = 120
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Initial spread, as in a building, and the number of bearings it counts as."""
 
-_HELD_FACTOR = 10.0
+_EXTRAPOLATED_FACTOR = 10.0
 """Factor on the variance of a field that the device has propagated by its own gyroscope."""
 
 _MIN_SPEED = 0.3
@@ -139,11 +139,11 @@ class MagneticReference:
         count = self.count + 1
         if count == 1:
             return changed(self, time=time, count=1, size=size, dip=dip)
-        share = 1.0 / min(count, _AVERAGING_COUNT)
+        mean_gain = 1.0 / min(count, _AVERAGING_COUNT)
         size_clip = 2.0 * _SIZE_TOLERANCE * self.size
-        usual_size = self.size + share * min(max(size - self.size, -size_clip), size_clip)
+        usual_size = self.size + mean_gain * min(max(size - self.size, -size_clip), size_clip)
         dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
-        usual_dip = self.dip + share * dip_change
+        usual_dip = self.dip + mean_gain * dip_change
         means = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
         if not new_place:
             return means
@@ -195,9 +195,9 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """
     assert s.field is not None  # set by `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
-    kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.P, s.first_field + 1, kept, sigma)
-    return changed(s, P=P, field=changed(s.field, wander=kept * s.field.wander))
+    correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
+    P = gauss_markov(s.P, s.first_field + 1, correlation, sigma)
+    return changed(s, P=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 
 def update_bearing(
@@ -222,11 +222,12 @@ def update_bearing(
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
-    held = reference.is_held(measured)
-    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
+    extrapolated = reference.is_held(measured)
+    new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
-    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * (_HELD_FACTOR if held else 1.0)
+    factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
+    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * factor
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -142,8 +142,8 @@ class MapFrame:
             reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
             return UpdateResult(math.nan, len(fix.value), False, reason=reason)
         result = self._update(ekf, fix)
-        done = self._with_uncertainty(transform, _nav_state(ekf))
-        self.state = changed(self.state, transforms=(*self.state.transforms, done))
+        completed = self._with_uncertainty(transform, _nav_state(ekf))
+        self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
@@ -205,8 +205,8 @@ class MapFrame:
         now = _nav_state(ekf)
         turn, sigma = _turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself then measures the turn
-        most = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
-        if not (math.isfinite(turn) and sigma <= most):
+        max_sigma = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
+        if not (math.isfinite(turn) and sigma <= max_sigma):
             if fix.kind != "position":
                 return None
             turn, inflation = self.state.alignment.turn

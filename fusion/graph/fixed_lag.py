@@ -92,15 +92,17 @@ class FixedLagEstimator:
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> None:
         """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
-        taken = self._filter.step(interval, displacement, fixes)
+        applied = self._filter.step(interval, displacement, fixes)
         self._narrow_bias_prior()
         if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bearing and (bias := gained_bias_information(*taken.bearing)):
+        if applied.bearing and (bias := gained_bias_information(*applied.bearing)):
             self._add_bias_information(*bias)
-        local_fixes = [self._in_graph_frame(accepted) for accepted in taken.fixes]
-        if self._builder.step(taken.interval, taken.displacement, local_fixes, taken.zero_velocity):
+        local_fixes = [self._in_graph_frame(accepted) for accepted in applied.fixes]
+        if self._builder.step(
+            applied.interval, applied.displacement, local_fixes, applied.zero_velocity
+        ):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -114,8 +116,8 @@ class FixedLagEstimator:
         if self._stale or self._filter.gating_counts != gating_counts:
             self._begin(self._builder.count)
             return accepted
-        for taken in accepted:
-            if taken.fix is fix and self._builder.fix(self._in_graph_frame(taken)):
+        for applied in accepted:
+            if applied.fix is fix and self._builder.fix(self._in_graph_frame(applied)):
                 self._solve()
         return accepted
 

@@ -149,7 +149,7 @@ class KeyframeGraph:
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
-            raise IndeterminateError(self._state_named(str(error))) from error
+            raise IndeterminateError(self._undetermined_state(str(error))) from error
         return Solution(rounds, down_weighted)
 
     def pose(self, k: int) -> KeyframeState:
@@ -183,7 +183,7 @@ class KeyframeGraph:
         try:
             _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
-            raise IndeterminateError(self._state_named(str(error))) from error
+            raise IndeterminateError(self._undetermined_state(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
         self.add(self._marginal(range(before, max(reached) + 1), remaining), gated=False)
         for k in old:
@@ -272,12 +272,12 @@ class KeyframeGraph:
                     f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s is undetermined"
                 )
 
-    def _state_named(self, message: str) -> str:
+    def _undetermined_state(self, message: str) -> str:
         """Name the state that gtsam's message concerns."""
-        found = re.search(r"Symbol: ([xvbt])(\d+)", message)
-        if found is None:
+        match = re.search(r"Symbol: ([xvbt])(\d+)", message)
+        if match is None:
             return message.strip().splitlines()[0]
-        return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s is undetermined"
+        return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"
 
 
 def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:

@@ -83,8 +83,8 @@ class WindowBuffer:
         tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         start = float(time[0])
         # The first average reaches half a grid step back, into the tail.
-        known = rows if tail is None else np.concatenate([tail, rows])
-        imu_N = resample(known[:, 0], known[:, 1:], start + self._grid).astype(np.float32).T
+        samples = rows if tail is None else np.concatenate([tail, rows])
+        imu_N = resample(samples[:, 0], samples[:, 1:], start + self._grid).astype(np.float32).T
         R_NB = attitudes[0]
         self._blocks.append(Block(imu_N, R_NB, facing(R_NB), flagged))
 
@@ -135,14 +135,14 @@ class FieldBuffer:
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         newest = max(newest, self._last_query - _MAX_DELAY)
-        right = (
+        valid = (
             math.isfinite(time)
             and time > newest
             and float(np.abs(field_B).sum()) < MAX_SENSOR_VALUE
         )
-        if right:
+        if valid:
             self._fields.append((time, field_B))
-        return right
+        return valid
 
     def at(self, time: float) -> FloatArray | None:
         """Return the newest field (3,) up to a time [s], None if too old; later fields wait."""

@@ -129,12 +129,12 @@ class FrontEnd:
     def _drop_ahead(self, time: float) -> None:
         """Drop the waiting samples whose times are refuted by a new sample at `time`."""
         ahead = self._unconfirmed
-        known = len(ahead)
+        count = len(ahead)
         if time < ahead[0][0]:
             ahead.clear()
         while len(ahead) > 1 and ahead[-1][0] > max(time, ahead[-2][0] + MAX_IMU_GAP):
             ahead.pop()
-        self.counts.future += known - len(ahead)
+        self.counts.future += count - len(ahead)
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
         """Hold a sample that jumps ahead in time or follows one; accept all once confirmed."""

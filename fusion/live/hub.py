@@ -131,10 +131,10 @@ class Viewer:
         for device, session in list(self._hub.sessions.items()):
             drawn = session.drawn
             points, revision = drawn.points, drawn.revision
-            known_revision, known = self._known.get(device, (-1, 0))
-            fresh = revision != known_revision
+            sent_revision, sent = self._known.get(device, (-1, 0))
+            fresh = revision != sent_revision
             count = len(points)
-            new = points[0 if fresh else known : count]
+            new = points[0 if fresh else sent : count]
             if len(new) > MOST_SENT:
                 new = [*new[: -1 : -(-len(new) // MOST_SENT)], new[-1]]
             self._known[device] = (revision, count)

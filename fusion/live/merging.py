@@ -67,7 +67,7 @@ class Join:
 
     def ready(self) -> list[Sample]:
         """Return the samples that are complete so far, in time order."""
-        done: list[Sample] = []
+        complete: list[Sample] = []
         while self._first and self._second:
             time, value = self._first[0]
             while len(self._second) > 1 and self._second[1][0] <= time:
@@ -79,11 +79,11 @@ class Join:
             if other is None:
                 self.alone += 1
             else:
-                done.append((time, value, other))
+                complete.append((time, value, other))
         while self._first and self._newest[0] - self._first[0][0] > LONGEST_WAIT:
             self._first.popleft()
             self.alone += 1
-        return done
+        return complete
 
     def _at(self, time: int) -> Vector | None:
         """Return the second stream's value at a time; None outside it or in a gap."""
@@ -132,10 +132,10 @@ class Merger:
         """Sensor that a track needs but the device does not send; empty if none is missing."""
         if self._gyro or not self._waiting:
             return ""
-        seen = {reading.sensor for reading in self._waiting}
-        if not seen & set(_GYROS):
+        sensors = {reading.sensor for reading in self._waiting}
+        if not sensors & set(_GYROS):
             return "gyroscope"
-        if not any(set(names) <= seen for names in _ACCELS):
+        if not any(set(names) <= sensors for names in _ACCELS):
             return "total acceleration, or accelerometer with gravity"
         return ""
 
@@ -180,14 +180,14 @@ class Merger:
         times = [reading.time_ns for reading in self._waiting]
         if not times or max(times) - min(times) < CHOOSING:
             return False
-        seen = {reading.sensor for reading in self._waiting}
-        gyro = next((name for name in _GYROS if name in seen), "")
-        accel = next((names for names in _ACCELS if set(names) <= seen), ())
+        sensors = {reading.sensor for reading in self._waiting}
+        gyro = next((name for name in _GYROS if name in sensors), "")
+        accel = next((names for names in _ACCELS if set(names) <= sensors), ())
         if not gyro or not accel:
             newest = max(times)  # bounds memory
             self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
             return False
-        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in seen
+        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in sensors
         self.upward = _cosine(
             _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
             *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),

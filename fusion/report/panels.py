@@ -156,9 +156,9 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
     traces = []
     for name, series in tracks.items():
         inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
-        known = np.isfinite(truth.position[:, 0])
-        at = interpolated(series.time, truth.time[known], truth.position[known, :2])
-        error = np.linalg.norm(series.position[:, :2] - at, axis=1)
+        valid = np.isfinite(truth.position[:, 0])
+        true_position = interpolated(series.time, truth.time[valid], truth.position[valid, :2])
+        error = np.linalg.norm(series.position[:, :2] - true_position, axis=1)
         traces += curve(name, series.time, np.where(inside, error, np.nan), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
 
@@ -167,7 +167,7 @@ def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
 ) -> list[go.Scatter]:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    quiet: dict[str, Any] = {
+    common: dict[str, Any] = {
         "x": _rounded(time),
         "mode": "lines",
         "line": {"width": 0},
@@ -177,8 +177,8 @@ def _band(
     }
     fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
     return [
-        go.Scatter(y=_rounded(value - 3.0 * sigma), **quiet),
-        go.Scatter(y=_rounded(value + 3.0 * sigma), **quiet, **fill),
+        go.Scatter(y=_rounded(value - 3.0 * sigma), **common),
+        go.Scatter(y=_rounded(value + 3.0 * sigma), **common, **fill),
     ]
 
 

@@ -144,11 +144,11 @@ def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
 def _speed_of(trajectory: Trajectory) -> FloatArray:
     """Take central differences over half a second either way, to suppress noise of poses."""
     t, half = trajectory.time, 0.5
-    known = np.flatnonzero(trajectory.valid)
-    if len(known) < 2:
+    valid = np.flatnonzero(trajectory.valid)
+    if len(valid) < 2:
         return np.full(len(t), np.nan)
-    first, last = t[known[0]], t[known[-1]]
+    first, last = t[valid[0]], t[valid[-1]]
     before, after = (np.clip(t + sign * half, first, last) for sign in (-1.0, 1.0))
-    ends = [interpolated(at, t[known], trajectory.position_W[known]) for at in (before, after)]
+    ends = [interpolated(at, t[valid], trajectory.position_W[valid]) for at in (before, after)]
     span = np.maximum(after - before, 1e-9)
     return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / span)

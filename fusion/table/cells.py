@@ -58,7 +58,7 @@ class Cell:
     @property
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
-        test = [str(one.path) for one in self.dataset.test]
+        test = [str(entry.path) for entry in self.dataset.test]
         trained = "" if self.recipe is None else recipe_digest(self.recipe, self.dataset)
         return hashlib.sha256(json.dumps([self.network, trained, test]).encode()).hexdigest()
 

@@ -98,11 +98,11 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
     )
     for name in names:
         for seed, content in filled[name].items():
-            for one in content["recordings"]:
-                for protocol, errors in one["tracks"].items():
+            for recording in content["recordings"]:
+                for protocol, errors in recording["tracks"].items():
                     values = (_number(errors[metric]) for metric in METRICS)
                     table.entries.append(
-                        Entry(one["recording"], name, f"seed {seed}", protocol, *values)
+                        Entry(recording["recording"], name, f"seed {seed}", protocol, *values)
                     )
     return table
 
@@ -114,7 +114,7 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
         content = filled.get(cell.network, {}).get(cell.seed)
         if cell.recipe is None or cell.seed != 0 or content is None:
             continue
-        found = {one["recording"]: one["tracks"] for one in content["recordings"]}
+        found = {recording["recording"]: recording["tracks"] for recording in content["recordings"]}
         for name, shown in read_tracks(cell, out).items():
             track = _level(shown.time, shown.position_W)
             truth = _level(shown.time, shown.truth_W)

@@ -45,8 +45,8 @@ def table_cells(
     def filled(dataset: DataSet, members: Sequence[str], seed: int) -> list[Cell]:
         return [Cell(dataset, n, seed, cell_recipe(recipe, n, seed, steps)) for n in members]
 
-    first = [one for one in sets if one.name in FIRST]
-    others = [one for one in sets if one.name not in FIRST]
+    first = [dataset for dataset in sets if dataset.name in FIRST]
+    others = [dataset for dataset in sets if dataset.name not in FIRST]
     leading = [name for name in names if name in LEADING]
     cells = []
     for part in (first, others):

@@ -65,14 +65,14 @@ def score_walk(seed: int, seconds: float) -> Score:
         gyro_turn_on=PHONE_IMU.gyro_turn_on,
         accel_turn_on=PHONE_IMU.accel_turn_on,
     )
-    known = FilterConfig(
+    matched = FilterConfig(
         update_rate=1,
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         adaptive=False,
     )
-    config = NavigatorConfig(noise=errors.noise, filter=known)
+    config = NavigatorConfig(noise=errors.noise, filter=matched)
     walk = generate_walk(seed, seconds)
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
     preprocessed = Navigator(DummyPredictor(), config).observe(sequence)

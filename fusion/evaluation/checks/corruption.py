@@ -44,8 +44,8 @@ def faults(duration: float) -> list[Fault]:
         *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
         Fault("accelerometer clipped", _clipped(0.98)),
         *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
-        Fault("one NaN from the network", modify_predictions=_nan_answer(0)),
-        Fault("one NaN in the covariance", modify_predictions=_nan_answer(1)),
+        Fault("one NaN from the network", modify_predictions=_nan_prediction(0)),
+        Fault("one NaN in the covariance", modify_predictions=_nan_prediction(1)),
         Fault("1 % duplicated, 1 % swapped", _reordered(0.01)),
         Fault("three wild timestamps", _wild_times(3)),
         Fault("ten spikes", _spikes(10)),
@@ -54,35 +54,35 @@ def faults(duration: float) -> list[Fault]:
 
 def _offset_block(share: float, metres: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
-        mean[(over > 0.5) & (over <= 0.5 + share), 0] += metres
+        mean[(fraction > 0.5) & (fraction <= 0.5 + share), 0] += metres
 
     return modify_predictions
 
 
 def _outliers(share: float, metres: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
-        hit = rng.random(len(mean)) < share
-        mean[hit] += rng.choice([-metres, metres], (int(hit.sum()), 3)) / np.sqrt(3.0)
+        selected = rng.random(len(mean)) < share
+        mean[selected] += rng.choice([-metres, metres], (int(selected.sum()), 3)) / np.sqrt(3.0)
 
     return modify_predictions
 
 
 def _overconfident(factor: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         covariance *= factor
 
     return modify_predictions
 
 
-def _nan_answer(which: int) -> ModifyPredictions:
+def _nan_prediction(which: int) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         (mean, covariance)[which][len(mean) // 2] = np.nan
 

@@ -70,11 +70,11 @@ def end_shifts(
         InputError: the recording cannot be run, or its track is shorter than a metre.
     """
 
-    def run(spoilt: ImuSequence) -> Track:
-        return Navigator(model, config, backend=backend).run(spoilt)
+    def run(faulty: ImuSequence) -> Track:
+        return Navigator(model, config, backend=backend).run(faulty)
 
-    whole = run(sequence)
-    steps = np.diff(whole.trajectory.position_W[:, :2], axis=0)
+    unmodified = run(sequence)
+    steps = np.diff(unmodified.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())
     if path < _SHORTEST_PATH:
         raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
@@ -82,14 +82,14 @@ def end_shifts(
     faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
     return [
-        EndShift(sequence.name, group, name, *_between(whole, run(spoilt), path))
+        EndShift(sequence.name, group, name, *_between(unmodified, run(faulty), path))
         for name, modify_samples in faults
-        for spoilt in (modify_samples(sequence, np.random.default_rng(seed)),)
+        for faulty in (modify_samples(sequence, np.random.default_rng(seed)),)
     ]
 
 
-def _between(whole: Track, other: Track, path: float) -> tuple[float, float]:
-    a, b = whole.trajectory, other.trajectory
+def _between(unmodified: Track, other: Track, path: float) -> tuple[float, float]:
+    a, b = unmodified.trajectory, other.trajectory
     metres = float(np.linalg.norm(a.position_W[-1, :2] - b.position_W[-1, :2])) / path
     turn = (b.attitude_WB[-1] * a.attitude_WB[-1].inv()).as_matrix()
     return metres, abs(math.degrees(yaw_twist(turn)))
@@ -100,13 +100,13 @@ def end_shift_table(found: Sequence[EndShift]) -> str:
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
     for group, part in by_group(found):
-        metres = np.array([one.metres for one in part])
-        degrees = np.array([one.degrees for one in part])
-        stay = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
+        metres = np.array([shift.metres for shift in part])
+        degrees = np.array([shift.degrees for shift in part])
+        within = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
         figures = [
             f"{value:.2f}"
             for values in (100.0 * metres, degrees)
             for value in np.quantile(values, (0.5, 0.95, 1.0))
         ]
-        rows.append([group, str(len(part)), f"{stay:.0%}", *figures])
+        rows.append([group, str(len(part)), f"{within:.0%}", *figures])
     return "\n".join(aligned(rows))

@@ -77,12 +77,14 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
     accel_N = stream.windows()[:, 3:5].astype(np.float64)
     if len(accel_N) <= 3 * _SECOND:
         return Direction()
-    told = accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
-    told = told[:-_SECOND] + told[_SECOND:]
-    moved = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
-    a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
-    apart = len(d) / (3.0 * _SECOND)  # a change spans three seconds
-    return Direction(complex(np.vdot(d, a)), _square(d), _square(a), apart)
+    accel_change = (
+        accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
+    )
+    accel_change = accel_change[:-_SECOND] + accel_change[_SECOND:]
+    network_change = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
+    a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (accel_change, network_change))
+    count = len(d) / (3.0 * _SECOND)  # a change spans three seconds
+    return Direction(complex(np.vdot(d, a)), _square(d), _square(a), count)
 
 
 def _without_slow(changes: Any) -> Complex:

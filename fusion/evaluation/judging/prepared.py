@@ -114,11 +114,11 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         pieces = [build(stream, sequence.positions) for stream in streams]
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _KEPT}
+    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _ATTRIBUTES}
     return Prepared(path, sequence.name, kind, attributes, pieces)
 
 
-_KEPT = ("person", "device", "place", "carry", "grade", "magnets_near")
+_ATTRIBUTES = ("person", "device", "place", "carry", "grade", "magnets_near")
 
 
 def prepared_recordings(
@@ -137,11 +137,11 @@ def prepared_recordings(
         folder: folder of the cache.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
     """
-    work = partial(_kept, read=read, options=options, folder=folder)
+    work = partial(_cached, read=read, options=options, folder=folder)
     yield from each(work, paths, jobs)
 
 
-def _kept(
+def _cached(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
 ) -> Prepared:
     key = recording_key(path, {**options, "preparation": _code()})
@@ -209,13 +209,13 @@ def _store(file: Path, prepared: Prepared) -> None:
     for k, piece in enumerate(prepared.pieces):
         for name, value in _arrays(piece).items():
             arrays[f"{k}.{name}"] = value
-    told = {
+    description = {
         "name": prepared.name,
         "kind": prepared.kind,
         "attributes": prepared.attributes,
         "pieces": len(prepared.pieces),
     }
-    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(told)})
+    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(file, "wb") as target:
@@ -229,15 +229,17 @@ def _load(file: Path, path: Path) -> Prepared | None:
         return None
     try:
         with safetensors.safe_open(file, "numpy") as source:
-            told = json.loads(source.metadata()["recording"])
+            description = json.loads(source.metadata()["recording"])
             pieces = [
                 _piece({name: source.get_tensor(f"{k}.{name}") for name in _ARRAYS})
-                for k in range(told["pieces"])
+                for k in range(description["pieces"])
             ]
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
         log.warning("%s: unreadable, prepared again: %s", file, error)
         return None
-    return Prepared(path, told["name"], told["kind"], told["attributes"], pieces)
+    return Prepared(
+        path, description["name"], description["kind"], description["attributes"], pieces
+    )
 
 
 def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:
