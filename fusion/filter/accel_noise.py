@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from stario.fusion.filter.engine import UpdateResult
 
 TARGET_NIS = 0.3
-"""Target for the median NIS per degree of freedom: the network's errors are similar for seconds, so
-that consistent innovations are smaller than single errors."""
+"""Target for the median NIS per degree of freedom: the network's errors are correlated over
+seconds, so consistent innovations are smaller than single errors."""
 
 GAIN, FIRST_GAIN = 0.05, 0.2
-"""Step of the logarithm per displacement: in the long run, and at first, when nothing is known."""
+"""Step of the logarithm per displacement: in the long run, and for the first displacement."""
 
 MAX_FACTOR = 30.0
 """Maximum factor: the accelerometer then rules out little more than jumps."""

@@ -259,7 +259,7 @@ class StateCloningEkf(ErrorStateEngine):
     def update_bearing(
         self, m_B: FloatArray, variance: float, gate: float | None = None
     ) -> UpdateResult:
-        """Update with the bearing of a magnetic field against the state's azimuth.
+        """Update with the bearing of a magnetic field, which measures the state's azimuth.
 
         Args:
             m_B: (3,) measured field [uT]; the state must have a field (`magnetic.first_field`).

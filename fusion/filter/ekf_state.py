@@ -32,7 +32,7 @@ right-invariant error they multiply the attitude error, which leaves no digits f
 they are map coordinates."""
 
 _CHUNK = 2000
-"""Estimates converted at a time: an hour's at once would take hundreds of megabytes more."""
+"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class EkfState:
         return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
 
     def _poses(self) -> list[tuple[int, int]]:
-        """First rows of theta and rho_p of the current pose and of every clone."""
+        """Return the first rows of theta and rho_p of the current pose and of every clone."""
         taken = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
         return [(0, 6), *((first, first + 3) for first in taken)]
 

@@ -114,7 +114,7 @@ class Estimator:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
         zupt = self._update_zero_velocity(interval)
-        # Zero velocity beats a network trained on walking, which predicts 1 cm/s at rest.
+        # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
         applied = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
@@ -237,7 +237,7 @@ class Estimator:
         return (d_N, result.scale * covariance_N) if result.accepted else None
 
     def _update_north(self) -> list[Accepted]:
-        """Apply the magnetic field's yaw once, if a declination is set and yaw is still unknown."""
+        """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""
         declination = self._config.filter.declination
         if declination is None or self._map_frame.state.oriented:
             return []
@@ -283,7 +283,7 @@ class Estimator:
 
     @property
     def state(self) -> EstimatorState:
-        """Everything that varies except a recording's innovations; assign one to restore it."""
+        """All that varies except a recording's innovations; assign an earlier one to restore it."""
         return EstimatorState(
             self.ekf.state,
             self._clones,
@@ -358,7 +358,7 @@ class Estimator:
         return innovations_from_rows(self._innovations)
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
-        """Return the report so far, with the sigmas of another estimator's state if given."""
+        """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
         if self._config.filter.declination is not None and not self._map_frame.state.oriented:
             note = "north could not be determined: the track starts with yaw zero"

@@ -8,11 +8,11 @@ The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A com
 azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the gyroscope's
 vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
 much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
-or dip for the place has less weight, as does one that the device has propagated by its own
-gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. Only
-if a declination is given, the field determines north once, as a fix of yaw.
+or dip for the place has less weight, as does one that the device has extrapolated by its own
+gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. If a
+declination is given, and only then, the field determines north once, as a fix of yaw.
 
-The field varies slowly and its errors are similar for metres: two bearings a second suffice.
+The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _WANDER_PER_SPREAD = 2.0
 OxIOD, RIDI, KIPD and tyrex."""
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
-"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and of
-other changes."""
+"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and the
+duration of other changes."""
 
 HARD_IRON_SIGMA = 10.0
 """Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
@@ -81,10 +81,10 @@ _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Initial spread, as in a building, and the number of bearings it counts as."""
 
 _EXTRAPOLATED_FACTOR = 10.0
-"""Factor on the variance of a field that the device has propagated by its own gyroscope."""
+"""Factor on the variance of a field that the device has extrapolated by its own gyroscope."""
 
 _MIN_SPEED = 0.3
-"""Speed below which the spread is not updated [m/s]: in one spot the field is always quiet."""
+"""Speed below which the spread is not updated [m/s]: in one spot the field hardly varies."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class MagneticReference:
         count: number of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
-        spread: mean distance of size (fraction) and dip [rad] from their usual values in motion.
+        spread: mean deviation of size (fraction) and dip [rad] from their usual values in motion.
         moving_count: number of bearings averaged in `spread`.
         measured: size of the last measured field, including hard iron [uT].
     """
@@ -120,7 +120,7 @@ class MagneticReference:
         return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
 
     def is_held(self, measured: float) -> bool:
-        """Return whether a field of this size [uT] is the last one, propagated by the device."""
+        """Return whether a field of this size [uT] is the last one, extrapolated by the device."""
         return abs(measured - self.measured) < HELD_CHANGE * measured
 
     def is_due(self, time: float) -> bool:
@@ -186,7 +186,7 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
 
 
 def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """Return the state after the azimuth has wandered for a time at the current speed.
+    """Return the state with its azimuth propagated for a time at the current speed.
 
     Args:
         s: state before.

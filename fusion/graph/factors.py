@@ -64,7 +64,7 @@ class Prior:
 
     Attributes:
         k: number of the first keyframe.
-        about: n states, of keyframe k and its successors, relative to which the error is defined.
+        reference: n states, of keyframe k and its successors, from which the error is measured.
         root: (m, 15 n + t) square-root information; columns of the keyframes, then of the turns.
         offset: (m,) right-hand side.
         turns: t keyframes with a network's turn, and the turn [rad] at which its error is zero.
@@ -157,7 +157,7 @@ class TurnProcess:
     Attributes:
         i: keyframe of the previous turn.
         j: keyframe of this turn.
-        correlation: of the two; 0 for the first turn, where i is j.
+        correlation: correlation of the two turns; 0 for the first turn, where i is j.
         covariance: (1, 1) covariance of n [rad^2].
     """
 
@@ -182,14 +182,14 @@ class TurnProcess:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """A position some time after a keyframe: p_k + dt v_k + shift_W.
+    """A position some time after a keyframe: p_k + dt v_k + dp_W.
 
     Attributes:
         k: keyframe before the measurement.
         p_W: (3,) position [m].
         covariance: (3, 3) [m^2].
         dt: time since the keyframe [s].
-        shift_W: (3,) displacement beyond p_k + dt v_k until then, by the IMU [m].
+        dp_W: (3,) displacement beyond p_k + dt v_k until then, by the IMU [m].
     """
 
     k: int
@@ -214,13 +214,13 @@ class Position:
 
 @dataclass(frozen=True, eq=False)
 class Velocity:
-    """A velocity some time after a keyframe: v_k + gain_W.
+    """A velocity some time after a keyframe: v_k + dv_W.
 
     Attributes:
         k: keyframe before the measurement.
         v_W: (3,) velocity [m/s].
         covariance: (3, 3) [m^2/s^2].
-        gain_W: (3,) change of velocity until then, by the IMU [m/s].
+        dv_W: (3,) change of velocity until then, by the IMU [m/s].
     """
 
     k: int

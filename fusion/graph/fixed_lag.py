@@ -70,7 +70,7 @@ class FixedLagEstimator:
     Args:
         config: noise, filter and graph settings.
         start: time and levelled attitude of the first sample.
-        prior: prior of the first pose; None starts level, at rest, at the origin.
+        prior: prior on the first pose; None starts levelled, at rest, at the origin.
     """
 
     smoothed = None
@@ -162,7 +162,7 @@ class FixedLagEstimator:
 
     @property
     def _stale(self) -> bool:
-        """Whether the filter has changed what the graph began from."""
+        """Whether the filter has since changed the state from which the graph began."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
         jumped = self._filter.map_frame_state.jumps != self._jumps

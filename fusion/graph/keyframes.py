@@ -100,7 +100,7 @@ class KeyframeGraph:
         return self.last
 
     def add_disconnected(self, state: NavState) -> int:
-        """Add a unconnected keyframe with its covariance as prior; return its number."""
+        """Add a disconnected keyframe with its covariance as prior; return its number."""
         self._insert(state)
         self.add(_prior(self.last, state), gated=False)
         return self.last
@@ -128,7 +128,7 @@ class KeyframeGraph:
         self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
     def solve(self, max_rounds: int = 10) -> Solution:
-        """Optimise the keyframes.
+        """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
             max_rounds: maximum number of linearisations of the measurements.
@@ -164,7 +164,7 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Marginalise the keyframes before one, keeping their information on it and its successors.
+        """Marginalise the keyframes before a given one; the others keep their information.
 
         Raises:
             IndeterminateError: a marginalised state is not determined.
@@ -201,7 +201,7 @@ class KeyframeGraph:
         return values
 
     def _imu_factors(self, before: float = math.inf) -> Any:
-        """Return the factors that connect each keyframe before one to the next."""
+        """Return the factors that connect each keyframe before a given one to the next."""
         factors = gtsam.NonlinearFactorGraph()
         for i, segment in self._segments.items():
             if i < before:
@@ -273,7 +273,7 @@ class KeyframeGraph:
                 )
 
     def _undetermined_state(self, message: str) -> str:
-        """Name the state that gtsam's message concerns."""
+        """Return the name and time of the state that gtsam's message concerns."""
         match = re.search(r"Symbol: ([xvbt])(\d+)", message)
         if match is None:
             return message.strip().splitlines()[0]
@@ -294,7 +294,7 @@ def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
 
 
 def _root_information(covariance: FloatArray) -> FloatArray:
-    """Return a root of the inverse; directions left without variance by rounding get a little."""
+    """Return a square root of the inverse, with eigenvalues bounded below against rounding."""
     scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     values = np.maximum(values, _MIN_EIGENVALUE)

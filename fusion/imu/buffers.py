@@ -63,7 +63,7 @@ class WindowBuffer:
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
 
     def clear(self) -> None:
-        """Forget all samples, so that no window spans a gap."""
+        """Drop all samples, so that no window spans a gap."""
         self._blocks.clear()
         self._tail = None
 
@@ -89,7 +89,7 @@ class WindowBuffer:
         self._blocks.append(Block(imu_N, R_NB, facing(R_NB), flagged))
 
     def window(self) -> Window | None:
-        """Return the second that ends with the newest interval; None before a whole one is held."""
+        """Return the second that ends with the newest interval; None if it is not complete yet."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
             return None
@@ -108,7 +108,7 @@ _MAX_FIELD_AGE = 0.11
 """Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
 
 _MAX_DELAY = 0.1
-"""A field this much older than the end of the last interval [s] is too late for any other."""
+"""A field older than the end of the last interval by more than this [s] is dropped as late."""
 
 
 class FieldBuffer:
@@ -125,7 +125,7 @@ class FieldBuffer:
             time: time of the field [s].
             field_B: (3,) magnetic field in B [uT].
             now: time of the newest sample [s]. A field far ahead of it is kept only until an
-                earlier one comes, so that one wild time does not make all later fields look late.
+                earlier one comes, so that one wild timestamp does not make later fields look late.
         """
         while (
             self._fields
@@ -145,7 +145,7 @@ class FieldBuffer:
         return valid
 
     def at(self, time: float) -> FloatArray | None:
-        """Return the newest field (3,) up to a time [s], None if too old; later fields wait."""
+        """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
         self._last_query = time
         return next(
             (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None

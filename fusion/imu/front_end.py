@@ -137,7 +137,7 @@ class FrontEnd:
         self.counts.future += count - len(ahead)
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
-        """Hold a sample that jumps ahead in time or follows one; accept all once confirmed."""
+        """Queue a sample that jumps ahead in time or follows one; accept all once confirmed."""
         ahead = self._unconfirmed
         ahead.append(sample)
         far = ahead[0][0] - self._newest > LONG_GAP
@@ -288,7 +288,7 @@ def cut_recording(
         )
     )
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        # A wild sample time must not release all later fields at once.
+        # A wild timestamp must not release all later fields at once.
         while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
             front_end.push_field(*fields.popleft())
         try:

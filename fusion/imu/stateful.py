@@ -59,7 +59,7 @@ class StatefulInference:
         return self._stretch is not self._model
 
     def restart(self) -> None:
-        """Forget all windows before a gap."""
+        """Clear the memory of windows before a gap."""
         begin = getattr(self._model, "stateful_inference", None)
         self._stretch: Any = self._model if begin is None else begin(self._updates)
 
@@ -112,9 +112,9 @@ class StatefulInference:
 def displacements_of(
     network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
 ) -> list[Displacement]:
-    """Predict the displacements of the intervals' windows, with covariances that can be trusted.
+    """Predict the displacements of the intervals' windows, with inflated and floored covariances.
 
-    Counts the windows, and those that move unlike anything the weights were trained on.
+    Also count the windows, and those that move unlike anything the weights were trained on.
     """
     windows_N = np.stack([_window(interval) for interval in intervals])
     counts.windows += len(windows_N)

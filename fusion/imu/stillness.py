@@ -21,8 +21,8 @@ class StillnessDetector:
         scale: factor on the noise densities of a phone's IMU; 0 never detects.
 
     Attributes:
-        window: (14,) for each interval of the last second: number of samples, seconds, sums of gyro
-            and accel, sums of their squares; None if it alone moves more than a still second may.
+        window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
+            and accel, sums of their squares; None if it moves more than a still second may.
     """
 
     def __init__(self, intervals: int, scale: float) -> None:
@@ -51,7 +51,7 @@ class StillnessDetector:
         return float(np.array(self.window)[:, 1].mean())
 
     def _moves(self, interval: ImuInterval) -> bool:
-        """Whether the interval's specific force alone scatters more than a still second may."""
+        """Return whether an interval's specific force scatters more than a still second's may."""
         accel = interval.accel[1:]
         count = len(accel)
         total = accel.sum(axis=0)
@@ -61,7 +61,7 @@ class StillnessDetector:
         return not looks_still(0.0, scatter, bound)
 
     def _is_quiet(self, sums: FloatArray) -> bool:
-        """Whether a second with these sums scatters no more than a still one may."""
+        """Return whether a second with these sums scatters no more than a still one may."""
         count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
         bound = scatter_bound(count, float(sums[1]), self._scale)
