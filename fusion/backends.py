@@ -52,13 +52,13 @@ class StreamEstimator(Protocol):
         """Propagate to the end of the interval and apply its measurements."""
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Apply a fix from the past; None if it is too old."""
+        """Apply a fix from the past; return None if it is too old."""
 
     def nav_state(self) -> NavState:
-        """The newest state."""
+        """Return the newest state."""
 
     def health(self, counts: SampleCounts) -> Health:
-        """The health report so far."""
+        """Return the health report so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +66,9 @@ class FilteredRecording:
     """A recording after the filter.
 
     Attributes:
-        estimator: after the last interval.
+        estimator: the filter after the last interval.
         estimates: the initial state and one per interval.
-        measurements: those applied, one entry per interval.
+        measurements: measurements applied, one entry per interval.
         clones: poses released from the window, corrected by all its measurements.
     """
 

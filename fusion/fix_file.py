@@ -2,11 +2,11 @@
 
 t     time since the recording's first sample [s]
 kind  position, velocity or yaw
-x y z position [m] or velocity [m/s] in W; a yaw gives its yaw [rad] in x and leaves y, z
+x y z position [m] or velocity [m/s] in W; a yaw [rad] is given in x, with y and z empty
 sx    standard deviation [m], [m/s] or [rad]
 sy sz standard deviations of the other axes; empty, or no column, where they equal sx
 
-Columns come in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
+Columns may be in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
 A position without z is horizontal; its height is unknown.
 """
 
@@ -74,7 +74,7 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
     """Check that at least one fix lies within the recording.
 
     Raises:
-        InputError: none does, so that they belong to another clock.
+        InputError: none does; their times are then on another clock.
     """
     sample_times = sequence.time[np.isfinite(sequence.time)]
     sample_times = sample_times[increasing_mask(sample_times)]
@@ -104,7 +104,7 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
     if kind == "yaw" and (abs(value[0]) > LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
-        found, remedy = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
+        found, remedy = f"{cells['x']} +- {cells['sx']}", "for degrees, use the kind `yaw [deg]`"
         raise ReadError(path, f"{where}, yaw", found, "radians", remedy)
     (time,) = _numbers(path, where, cells, ["t"])
     return make_fix(time, kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]

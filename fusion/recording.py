@@ -36,7 +36,7 @@ class PreprocessedRecording:
         update_rate: network updates per second that it was cut for.
         measurements: predicted displacement of the window ending with each interval, None if no
             window ends there.
-        front_end: holds the sample counts and the start.
+        front_end: the front end, with the sample counts and the start.
         seconds_front_end: computing time of the front end [s].
         seconds_network: computing time of the network [s].
     """

@@ -1,10 +1,10 @@
-"""Snapshots of a stream as bytes, without pickle: it can be continued in another process.
+"""Snapshots of a stream as bytes, without pickle, to continue it in another process.
 
 Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON value in
 which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
 `{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
 dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
-`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree holds
+`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree contains
 
     format     "stario snapshot"
     version    version of this layout; others are refused
@@ -152,10 +152,10 @@ def _rebuilt(kind: type, has: dict[str, Any]) -> Any:
 
 
 def check_same(name: str, found: object, expected: object) -> None:
-    """Check that a snapshot belongs to this navigator; names the first value that differs.
+    """Check that a value of a snapshot equals that of this navigator.
 
     Raises:
-        InputError: the values differ.
+        InputError: the values differ; names the first that does.
     """
     if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
         for key, value in expected.items():

@@ -41,7 +41,7 @@ def fusion(
     graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the filter's error with its network's by group, with NIS and consistency of yaw."""
+    """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
     from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)

@@ -189,9 +189,9 @@ class EstimatorOptions:
 
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Expand a command's `Reading` and `Estimating` parameters into one typer option per field.
+    """Expand a command's parameters of an option group into one typer option per field.
 
-    The options are thus defined once, and any command that takes `reading: Reading` has them.
+    Groups are `ReadingOptions` and `EstimatorOptions`: each option is thus defined only once.
     """
     hints = typing.get_type_hints(command, include_extras=True)
     groups = {

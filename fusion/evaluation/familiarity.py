@@ -1,4 +1,4 @@
-"""Comparison of a recording with a model's training data and predicted direction."""
+"""Familiarity of a recording's motion to a model, and direction of the model's displacements."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Familiarity:
 
     @property
     def is_unfamiliar(self) -> bool:
-        """Whether so much of the recording lies outside that the track deserves less trust."""
+        """Whether too many windows lie outside for the track to be trusted fully."""
         return self.outside is not None and self.outside > UNFAMILIAR_SHARE
 
     def as_dict(self) -> dict[str, object]:

@@ -60,7 +60,7 @@ def _track_at(track: Track, time: FloatArray) -> FloatArray:
 
 
 def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None:
-    """Return known positions to draw next to a track, as `placed`; None with a true track."""
+    """Return the known positions as `placed`, to draw next to a track; None with true poses."""
     if sequence.truth is not None or sequence.positions is None:
         return None
     return placed(track, sequence.positions)

@@ -103,4 +103,4 @@ def _loaded(name: str) -> DisplacementModel:
 
 
 def _ignore_progress(share: float) -> None:
-    """Ignore progress made in another process."""
+    """Ignore progress within a recording in another process."""

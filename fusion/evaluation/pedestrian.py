@@ -83,7 +83,7 @@ class PedestrianDeadReckoning:
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:
-    """Compute a recording's track, levelled from the IMU; gaps keep its position and heading.
+    """Compute a recording's track, levelled from the IMU; position and heading stay across gaps.
 
     Raises:
         InputError: there is no unbroken stretch of 2 s, or the rate is not accepted.

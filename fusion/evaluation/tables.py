@@ -107,7 +107,7 @@ class NetworkTable:
     def mean_and_spread(
         self, network: str, protocol: str, metric: str, recording: str = ""
     ) -> tuple[float, float | None]:
-        """Return the mean over recordings, or of one, and its deviation over the weights."""
+        """Return the mean over recordings, or of one, and its standard deviation over weights."""
         chosen = [
             e
             for e in self.entries
@@ -138,7 +138,7 @@ def compare_networks(
     """Compute the tracks of every network on every recording.
 
     Args:
-        paths: recordings with truth.
+        paths: recordings with true poses.
         models: models under distinct names.
         config: configuration of the filter.
         read: function that reads a path; must be picklable.
@@ -231,7 +231,7 @@ def _tracks(
 ) -> tuple[list[Entry], Sample]:
     sequence = read(path)
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     entries: list[Entry] = []
     shown: dict[str, Trajectory] = {}
     shown_errors: dict[str, tuple[float, float]] = {}

@@ -95,7 +95,7 @@ def network_track_true_attitude(
     displacements of those seconds would measure the gap and not the network.
 
     Raises:
-        InputError: the recording has no truth, or no second with valid truth.
+        InputError: the recording has no true poses, or no second of valid ones.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
@@ -138,7 +138,7 @@ def _predicted_displacements(
 
 
 def _propagated_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
-    """Return poses at the samples from the first to the last true one, attitude without gaps."""
+    """Return poses at the samples within the truth, with the attitude propagated through gaps."""
     time, gyro, _ = clean_samples(sequence)
     covered = np.flatnonzero(truth.covers(time))
     if len(covered) == 0:
@@ -173,7 +173,7 @@ def _true_windows(
 def _chained(
     time: FloatArray, attitude: Rotation, middle: FloatArray, velocity: FloatArray
 ) -> Trajectory:
-    """Integrate velocities known at the windows' middles to positions at `time`."""
+    """Return the trajectory at `time` from velocities at the windows' middles."""
     at_time = interpolated(time, middle, velocity)
     steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])

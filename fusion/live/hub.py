@@ -112,7 +112,7 @@ class Hub:
 
 
 class Viewer:
-    """Record of what one viewer has received, so that only new points are sent.
+    """One viewer and the points it has received, so that only new ones are sent.
 
     Args:
         hub: hub to watch.

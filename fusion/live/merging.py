@@ -48,7 +48,7 @@ class Join:
 
     Attributes:
         late: number of values dropped because their stream already had newer ones.
-        alone: number of values of the first dropped for lack of nearby values of the second.
+        alone: number of values of the first stream dropped for lack of values of the second.
     """
 
     def __init__(self) -> None:
@@ -176,7 +176,7 @@ class Merger:
             self._join.add(1, time, value)
 
     def _choose(self) -> bool:
-        """Choose the best sensors, once the stream is long enough to have shown all."""
+        """Choose the best sensors, once the stream is long enough to contain all of them."""
         times = [reading.time_ns for reading in self._waiting]
         if not times or max(times) - min(times) < CHOOSING:
             return False

@@ -33,7 +33,7 @@ MOST_ENTRIES = 50_000
 """Maximum number of samples in one push; the fastest phone takes a minute to record them."""
 
 LONGEST_SPAN = 600 * 10**9
-"""Maximum time [ns] between a push's first and last sample; beyond it a time stamp is wrong."""
+"""Maximum time [ns] between a push's first and last sample; beyond it a timestamp is wrong."""
 
 _MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
@@ -58,7 +58,7 @@ class Reading:
     Attributes:
         sensor: one of `SENSORS`, or `ORIENTATION`.
         time_ns: time on the device's clock [ns].
-        value: reading in rad/s, m/s^2 or uT; for an attitude, the unit vector up, in B.
+        value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B.
     """
 
     sensor: str
@@ -72,7 +72,7 @@ class Batch:
 
     Attributes:
         device: name of the device.
-        recording: its own name for the recording; empty if it has none.
+        recording: the device's name for the recording; empty if it gives none.
         readings: readings in order of arrival.
     """
 
@@ -85,7 +85,7 @@ def parse_push(body: bytes) -> Batch:
     """Parse a push of Sensor Logger.
 
     Raises:
-        InputError: the body is not such JSON; the error names the field.
+        InputError: the body does not have this form; the error names the field.
     """
     message = _object("body", json_from(body))
     payload = message.get("payload")
@@ -112,7 +112,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
         sender: name of the device if the line gives none.
 
     Raises:
-        InputError: the line is not such JSON; the error names the field.
+        InputError: the line does not have this form; the error names the field.
     """
     message = _object("line", json_from(line))
     if "payload" in message:
@@ -176,7 +176,7 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
 
 
 def _vertical(time: Any, values: Any) -> Reading | None:
-    """Return the vertical by the phone's attitude; None if not valid, since no track needs it."""
+    """Return the vertical from the phone's attitude; None if invalid, since no track needs it."""
     try:
         x, y, z, w = (_number("q", values.get(f"q{axis}")) for axis in "xyzw")
         time_ns = _nanoseconds("time", time)
@@ -254,7 +254,7 @@ def _number(where: str, value: Any) -> float:
 
 
 def _describe(value: Any) -> str:
-    """Describe a value in a few words, whatever its size."""
+    """Return a short description of a value of any size."""
     if value is None:
         return "nothing"
     if isinstance(value, (dict, list)):

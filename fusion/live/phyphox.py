@@ -1,4 +1,4 @@
-"""Client of a phone running phyphox: polls its remote interface several times a second.
+"""Client of a phone running phyphox, which polls its remote interface several times a second.
 
 The app (menu: "Allow remote access") answers `/config` with the experiment's sensors and the names
 of their buffers, and `/get?acc_time=12.3&accX=12.3|acc_time` with the values after 12.3 s. The

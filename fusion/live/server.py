@@ -88,7 +88,7 @@ class TokenMiddleware:
     """Middleware that rejects requests without the token.
 
     Args:
-        app: application behind it.
+        app: application that handles accepted requests.
         token: required token, not empty.
     """
 
@@ -121,7 +121,7 @@ class TokenMiddleware:
 
 
 def tokens_match(shown: str, token: str) -> bool:
-    """Compare a token with the right one in constant time."""
+    """Return whether a token equals the required one, in constant time."""
     return hmac.compare_digest(*(text.encode("utf-8", "surrogatepass") for text in (shown, token)))
 
 
@@ -157,7 +157,7 @@ async def _data(request: Request) -> Response:
 
 
 def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
-    """Parse the batches of a body, all of them or none."""
+    """Return the batches of a body; an invalid line refuses all of them."""
     if not sender_of_lines:
         return [parse_push(body)]
     lines = [(k, line) for k, line in enumerate(body.splitlines(), 1) if line.strip()]

@@ -76,7 +76,7 @@ class Session:
             accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
 
         Returns:
-            Number of samples taken.
+            Number of samples processed.
         """
         self.received = received
         if not self.running:

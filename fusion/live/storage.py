@@ -61,7 +61,7 @@ class LiveFile:
         """Append samples and magnetic fields received at a time [s since 1970].
 
         Raises:
-            OSError: they could not all be written, in which case none is.
+            OSError: they could not all be written; the file is then unchanged.
         """
         end = f"{received:.3f}\n"
         rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]

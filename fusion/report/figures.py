@@ -31,7 +31,7 @@ def map_figure(
     Args:
         tracks: tracks by name.
         truth: ground truth in the same frame, or None.
-        known: positions or waypoints in the same frame, in place of a true track, or None.
+        known: positions or waypoints in the same frame, if there is no true track, or None.
     """
     figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
@@ -134,7 +134,7 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
 
 
 def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
-    """Draw some outlines in one trace, separated by nan; skip any too large for the map.
+    """Draw some outlines in one trace, separated by NaN; skip any too large for the map.
 
     Args:
         name: name of the track.
@@ -198,7 +198,7 @@ def _known(known: PositionTrack) -> go.Scatter:
 
 
 def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
-    """Return limits (2, 2) of x and y that fit the truth and all but the inertial-only track."""
+    """Return limits (2, 2) of x and y that fit all tracks except the inertial-only one."""
     bounded = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot

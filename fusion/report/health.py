@@ -25,7 +25,7 @@ GATED_SHARE = 0.1
 """Share of updates treated as outliers above which to warn."""
 
 NIS_RATIO = 2.0
-"""Factor between the mean NIS and its expectation, either way, above which to report it."""
+"""Factor between mean NIS and expectation, in either direction, above which to report it."""
 
 YAW_SIGMA = math.radians(15.0)
 """Standard deviation of yaw [rad] above which the track bends."""
@@ -171,7 +171,7 @@ def _updates(health: Health) -> list[Finding]:
     elif ratio < 1.0 / NIS_RATIO:
         text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
         advice = (
-            "Innovations say little about the track's sigmas: persistent errors keep them small."
+            "Innovations reveal little about the track's sigmas: persistent errors keep them small."
         )
         found.append(Finding("note", text, advice))
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")

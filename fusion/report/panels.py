@@ -51,7 +51,7 @@ def style(name: str) -> tuple[str, str, str]:
 
 
 def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
-    """Return panels of height, speed and yaw of every track, and of error if there is truth."""
+    """Return panels of height, speed and yaw, and of position error if there is ground truth."""
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     panels = [] if truth is None else [_error_panel(tracks, truth)]
     columns: tuple[tuple[str, str, Column, Column], ...] = (
@@ -220,7 +220,7 @@ def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
 
 
 def _limits(traces: Sequence[go.Scatter]) -> list[float]:
-    """Return axis limits that fit all curves, and the bands except where briefly wide."""
+    """Return axis limits that fit all curves, and the bands except for brief wide parts."""
     curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
     bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
     low, high = np.nanmin(curves), np.nanmax(curves)
@@ -238,5 +238,5 @@ def _whole_turns(yaw: FloatArray, reference: FloatArray) -> float:
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """Round to screen precision, to keep the file small."""
+    """Return values rounded to screen precision, to keep the file small."""
     return np.round(values, 5).astype(np.float32)

@@ -17,16 +17,16 @@ MOST_POINTS = 1500
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A track as columns of N rows, nan where poses are not valid.
+    """A track as columns of N rows, NaN where poses are not valid.
 
     Attributes:
-        time: time since the recording's first sample [s].
+        time: (N,) time since the recording's first sample [s].
         position: (N, 3) [m].
-        speed: [m/s].
-        yaw: [deg], unwrapped.
+        speed: (N,) [m/s].
+        yaw: (N,) [deg], unwrapped.
         position_covariance: (N, 3, 3) [m^2], or None.
-        speed_sigma: [m/s], or None.
-        yaw_sigma: [deg], or None.
+        speed_sigma: (N,) [m/s], or None.
+        yaw_sigma: (N,) [deg], or None.
         gyro_bias: (N, 3) [deg/s] and its sigma, or None.
         accel_bias: (N, 3) [m/s^2] and its sigma, or None.
     """
@@ -142,7 +142,7 @@ def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _speed_of(trajectory: Trajectory) -> FloatArray:
-    """Take central differences over half a second either way, to suppress noise of poses."""
+    """Return the speed (N,) by central differences over one second, to suppress noise of poses."""
     t, half = trajectory.time, 0.5
     valid = np.flatnonzero(trajectory.valid)
     if len(valid) < 2:

@@ -85,7 +85,7 @@ def _log_path(
 
 
 def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
-    """Log the device's axes at its position, and the ellipsoid of its position."""
+    """Log the device's axes at its position, with the 3-sigma ellipsoid of the position."""
     index = _times(rr, trajectory.time[trajectory.valid] - start)
     position = trajectory.position_W[trajectory.valid]
     columns = rr.Transform3D.columns(

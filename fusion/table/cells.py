@@ -1,7 +1,7 @@
 """One cell of the table: a network on a data set with a seed, filled once and kept as files.
 
 `<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
-done, then `errors.json` and `tracks.npz`. Filling a cell again does only what is missing.
+done, then `errors.json` and `tracks.npz`. Filling a cell again adds only what is missing.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Cell:
 
     Attributes:
         dataset: data set, with the recordings of each part.
-        network: architecture to train; otherwise `pdr` or weights as `load_model` accepts them.
+        network: architecture to train, or `pdr`, or weights as `load_model` accepts them.
         seed: seed of the training.
         recipe: training recipe; None where nothing is trained.
     """

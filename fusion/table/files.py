@@ -1,4 +1,4 @@
-"""The tables and figures that are written next to the cells."""
+"""Tables and figures written next to the cells."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
 
 
 def _number(value: float | None) -> float:
-    """Replace None, which stands for nan in JSON."""
+    """Return a number; NaN for None, which stands for it in JSON."""
     return float("nan") if value is None else value
 
 

@@ -1,4 +1,4 @@
-"""The cells of the table, the most important first, and filling them in parallel."""
+"""Cells of the table, the most important first, and their filling in parallel."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Column:
 
     Attributes:
         title: title of the column.
-        value: function that returns a recording's value; nan if it has none.
+        value: function that returns a recording's value; NaN if it has none.
     """
 
     title: str

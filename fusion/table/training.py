@@ -43,7 +43,7 @@ class ReaderConfig:
     Attributes:
         read: function that reads the recording at a path; must be picklable.
         options: what `read` depends on besides the path, as plain values.
-        cache: folder that keeps windows for the next cell.
+        cache: folder that caches windows for later cells.
     """
 
     read: Callable[[Path], ImuSequence]
@@ -76,7 +76,7 @@ def cell_recipe(
 def train_cell(
     dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
 ) -> dict[str, object]:
-    """Train a cell's network, resuming from its checkpoint; write the model and `SPARE`.
+    """Train a cell's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
 
     Returns:
         Plain values: errors of the last epoch [m^2], number of steps, windows per step, total and
@@ -126,7 +126,7 @@ def train_cell(
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
-    """Return the digest of all that a cell's training depends on except the code."""
+    """Return the digest of everything that a cell's training depends on except the code."""
     inputs = [
         asdict(recipe),
         [[str(path) for path in part] for part in (dataset.training, dataset.validation)],
@@ -184,7 +184,7 @@ class _Clock:
 
     @property
     def step_seconds(self) -> float:
-        """Mean over the steps that were timed from start to end; nan if there are none."""
+        """Mean over the steps that were timed from start to end; NaN if there are none."""
         return sum(self._steps) / len(self._steps) if self._steps else float("nan")
 
     def step(self) -> None:

@@ -84,10 +84,10 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
     """Score a recording, measured by a network.
 
     Raises:
-        InputError: it has no truth, is too short, or its units or rate are wrong.
+        InputError: it has no true poses, is too short, or its units or rate are wrong.
     """
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     preprocessed = Navigator(model, config).observe(sequence)
     return _scored(sequence.name, preprocessed, sequence.truth, config)
 
@@ -134,10 +134,10 @@ def score_table(scores: Sequence[Score]) -> str:
 
 
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the geometric mean (3,) over recordings of the ratio of errors (N, 3) to the EKF's.
+    """Return the geometric mean (3,) of the ratios of errors (N, 3) to the EKF's, and its error.
 
-    Its standard error (3,) is returned as well; without it two similar estimators seem to differ:
-    the ratio of their medians changes by a tenth with another twenty walks.
+    Without the standard error (3,), two similar estimators seem to differ: the ratio of their
+    medians changes by a tenth with another twenty walks.
     """
     logs = np.log(ate / ate[:, :1])
     mean = np.exp(logs.mean(axis=0))

@@ -74,7 +74,7 @@ class FilterSpeed:
 
 
 def filter_speed() -> FilterSpeed:
-    """Time the filter on a swaying device measured by displacements."""
+    """Time the filter and its dense counterpart on a swaying device with displacements."""
     data, slots = _SwayingDevice(), round(_UPDATE_RATE * _WINDOW) + 1
     engines = [StateCloningEkf(slots), DenseEkf(slots)]
     best = np.full(3, np.inf)

@@ -46,7 +46,7 @@ NEES of the first minute is 19 instead of 16."""
 
 @dataclass(frozen=True)
 class Consistency:
-    """Averages over the runs, and the bounds a consistent filter keeps in 95 of 100 trials.
+    """Averages over the runs, and bounds that a consistent filter meets in 95 of 100 trials.
 
     Attributes:
         runs: number of runs.
@@ -91,7 +91,7 @@ def consistency(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Consistency:
-    """Run the filter on simulated walks with errors as large as its configuration states.
+    """Run the filter on simulated walks with errors drawn from its configured standard deviations.
 
     Args:
         config: configuration of the filter and noise of the simulated IMU.
@@ -220,7 +220,7 @@ def _run(
 def _drawn_start(
     walk: AnalyticWalk, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
-    """Draw the prior of the first pose, and return it with the true biases (N, 3)."""
+    """Draw the prior on the first pose and the true biases (N, 3)."""
     f = config.filter
     tilt, yaw, velocity, position = f.tilt_sigma, yaw_sigma, f.velocity_sigma, _POSITION_SIGMA
     theta = np.array([tilt, tilt, yaw]) * rng.normal(size=3)

@@ -1,4 +1,4 @@
-"""Faults to put into a recording: each changes its samples or its measured displacements."""
+"""Faults to inject into a recording: each modifies its samples or its measured displacements."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 
 ModifySamples = Callable[[ImuSequence, np.random.Generator], ImuSequence]
 ModifyPredictions = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
-"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place; the first argument is
-the share (M,) of all windows that are complete at each one's end."""
+"""Function that modifies displacements (M, 3) and covariances (M, 3, 3) in place. Its first
+argument is the fraction (M,) of all windows up to and including each."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault.
+    """A fault of the samples or of the network's predictions.
 
     Attributes:
         name: name in the table.
-        spoil: change to the recording.
-        corrupt: change to the network's predictions.
+        modify_samples: function that returns the recording with the fault; None for no change.
+        modify_predictions: function that modifies the predictions; None for no change.
     """
 
     name: str

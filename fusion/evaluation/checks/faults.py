@@ -45,10 +45,10 @@ class FaultResult:
         backend: "ekf" or "graph".
         error_without: absolute trajectory error without the fault [m].
         error_with: absolute trajectory error with it [m].
-        end_error: distance from the truth at the end [m].
-        end_sigma: the track's own estimate of it, root of the covariance's trace [m].
+        end_error: distance from the ground truth at the end [m].
+        end_sigma: its standard deviation as reported, root of the covariance's trace [m].
         finite: whether every state, covariance included, is finite.
-        reported: what the health report states about it.
+        reported: faults counted in the health report, in words.
     """
 
     fault: str
@@ -88,7 +88,7 @@ def run_faults(
     """Run a recording with each fault through each back end.
 
     Args:
-        sequence: a recording with truth.
+        sequence: a recording with true poses.
         config: configuration of the navigator.
         model: network; None for the true displacements under white noise.
         seed: seed of the random faults.
@@ -96,10 +96,10 @@ def run_faults(
         only: faults to run; None for all of them.
 
     Raises:
-        InputError: the recording has no truth, or is too short.
+        InputError: the recording has no true poses, or is too short.
     """
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     results: list[FaultResult] = []
     for backend in backends:
         without = _error(_run(Fault(""), sequence, config, model, seed, backend), sequence)
@@ -165,16 +165,16 @@ def with_true_displacements(
     seed: int,
     noise: float = WHITE_NOISE,
 ) -> PreprocessedRecording:
-    """Replace a prepared recording's measurements by its true displacements under white noise.
+    """Replace a preprocessed recording's displacements by the true ones with white noise.
 
-    Like a network's, they are given in each window's frame, rotated by the yaw of the attitude the
-    window was prepared with. Their covariance is the true one after the filter's scaling.
+    Like a network's, they are given in each window's levelled frame, in which the window itself is
+    given. After the filter's scaling, their covariance is the true one.
 
     Args:
-        preprocessed: the prepared recording.
+        preprocessed: the preprocessed recording.
         truth: its true poses.
         config: configuration of the navigator.
-        seed: seed of the noise; a window's noise does not depend on what happened before it.
+        seed: seed of the noise; a window's noise does not depend on earlier windows.
         noise: standard deviation per axis [m].
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)

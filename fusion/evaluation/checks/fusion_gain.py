@@ -28,7 +28,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 LEAST_SIGMA = 3.0
-"""Number of standard deviations that the yaw error of a consistent track stays within."""
+"""Maximum yaw error of a consistent track, in standard deviations."""
 
 GOOD_YAW = math.radians(10.0)
 """Maximum acceptable yaw error at the end [rad]."""
@@ -36,7 +36,7 @@ GOOD_YAW = math.radians(10.0)
 
 @dataclass(frozen=True)
 class FusionGain:
-    """Errors of one recording with and without the fusion.
+    """Errors of one recording with and without fusion.
 
     Attributes:
         recording: name of the recording.
@@ -45,9 +45,9 @@ class FusionGain:
         fused_m: error by back end [m].
         nis: mean NIS of the first back end; 3 is expected.
         position_nees: median NEES of the first back end's position; 2.4 is expected for three axes,
-            nan without true attitude.
-        yaw_error: its yaw error at the end relative to the start [rad]; nan without true attitude.
-        yaw_sigma: reported standard deviation of this yaw [rad].
+            NaN without true attitude.
+        yaw_error: its yaw error at the end relative to the start [rad]; NaN without true attitude.
+        yaw_sigma: reported standard deviation of the yaw at the end [rad]; NaN likewise.
     """
 
     recording: str

@@ -1,4 +1,4 @@
-"""How far a track's end moves if samples are missing: results must not depend on a few samples.
+"""Shift of a track's end if samples are missing: results must not depend on a few samples.
 
 A recording is run unmodified, with a short gap at each of several instants, and with samples
 dropped at random; all tracks begin in the same pose, so their ends are compared without alignment.
@@ -28,7 +28,7 @@ GAP_SECONDS, DROPPED = 0.1, 0.05
 """Length of a gap [s], and the share of samples that is dropped."""
 
 INSTANTS = 6
-"""Number of instants for a gap, one gap per run."""
+"""Number of instants at which a gap is placed, in a run each."""
 
 MOST_METRES, MOST_DEGREES = 0.01, 3.0
 """Maximum acceptable shift of the end: in metres per metre of the path, and in yaw."""
@@ -45,8 +45,8 @@ class EndShift:
         recording: name of the recording.
         group: group that it is counted in.
         fault: what was missing.
-        metres: horizontal distance between the ends over the length of the track.
-        degrees: difference of their yaws [deg].
+        metres: horizontal distance between the ends, divided by the length of the track.
+        degrees: absolute difference of their yaws [deg].
     """
 
     recording: str
@@ -96,7 +96,7 @@ def _between(unmodified: Track, other: Track, path: float) -> tuple[float, float
 
 
 def end_shift_table(found: Sequence[EndShift]) -> str:
-    """Return a row for each group: how many ends stay within limits, and how far ends move."""
+    """Return a row for each group: share of the ends within limits, and how far ends move."""
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
     for group, part in by_group(found):

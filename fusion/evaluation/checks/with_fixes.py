@@ -1,4 +1,4 @@
-"""Consistency of a track with fixes: its error against its reported uncertainty.
+"""Consistency of a track with fixes: its error compared with its reported uncertainty.
 
 Fixes are the true positions at equal intervals with white errors. Only the second half of each
 track counts: by then several fixes have determined the direction.
@@ -111,7 +111,7 @@ def track_with_fixes(
 
 
 def fixes_table(found: Sequence[FixConsistency]) -> str:
-    """Return a row for each group: medians of its recordings, and how often yaw is covered."""
+    """Return a row for each group: medians over recordings, and share of yaw errors in 3 sigma."""
     head = ["group", "n", "fixes applied", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
     rows = [head]
     for group, part in by_group(found):

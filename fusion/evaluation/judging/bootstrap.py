@@ -19,7 +19,7 @@ REPLICATES = 1000
 CONFIDENCE = 0.95
 
 Blocks = tuple[FloatArray, FloatArray]
-"""Sums of squared errors of one recording's blocks: ours (B,), and theirs, the baseline's (B,)."""
+"""Sums of squared errors of a recording's blocks: evaluated network (B,) and baseline (B,)."""
 
 Groups = Mapping[str, Sequence[Blocks]]
 """Recordings of each group."""
@@ -27,7 +27,7 @@ Groups = Mapping[str, Sequence[Blocks]]
 
 @dataclass(frozen=True)
 class Interval:
-    """Geometric mean of the ratios of root mean square errors, ours over theirs, and its bounds."""
+    """Geometric mean of the ratios of root mean square errors to the baseline's, and its bounds."""
 
     ratio: float
     low: float

@@ -54,7 +54,7 @@ class Direction:
 
     @property
     def turn(self) -> float:
-        """Yaw from the network's direction to the accelerometer's [rad]; nan without motion."""
+        """Yaw from the network's direction to the accelerometer's [rad]; NaN without motion."""
         return math.atan2(self.product.imag, self.product.real) if self.product else math.nan
 
     @property
@@ -88,7 +88,7 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
 
 
 def _without_slow(changes: Any) -> Complex:
-    """Subtract the mean of each 20 s."""
+    """Return the changes minus their mean over each 20 s."""
     parts = np.array_split(changes, max(1, len(changes) // _STRETCH))
     return np.concatenate([part - part.mean() for part in parts])
 

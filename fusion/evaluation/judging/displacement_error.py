@@ -1,7 +1,7 @@
 """Errors of a network alone on one recording, for any kind of ground truth.
 
-All positions are horizontal and written x + iy. The track lives in N, whose yaw relative to the
-world is unknown; how it is resolved depends on the truth:
+All positions are horizontal and written x + iy. The track is given in N, whose yaw relative to the
+world is unknown; how it is determined depends on the truth:
 
 - poses: displacements over a horizon are rotated by the true yaw at the horizon's start; the track
   as a whole is fitted in yaw and position, or aligned with the first pose.
@@ -59,7 +59,7 @@ FIGURES = {
     "(expected: 3)",
     "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), if requested",
 }
-"""Figures of a recording and their meaning; nan if its kind of truth does not provide one."""
+"""Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class _Sums:
         return float(np.sqrt(total / count)) if count else float("nan")
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
-        """Add errors (K,) by start tick, nan where unknown."""
+        """Add errors (K,) by start tick, NaN where unknown."""
         if np.isfinite(errors).sum() < _MIN_DISPLACEMENTS:
             return
         self.add(measure, errors)
@@ -229,7 +229,7 @@ def _displacements(
 
 
 def _unbroken(truth: Complex, breaks: np.ndarray, span: int) -> BoolArray:
-    """Return at which ticks (n - span,) the next `span` ticks contain neither gap nor jump."""
+    """Return whether the `span` ticks after each tick (n - span,) contain neither gap nor jump."""
     ends = np.isfinite(truth[:-span]) & np.isfinite(truth[span:])
     return np.asarray(ends & (breaks[:-span] == breaks[span:]))
 
@@ -242,7 +242,7 @@ def _lengths(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) ->
 
 
 def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, seconds: int) -> Complex:
-    """Return exp(i yaw) (n,) that best fits the legs from each tick on; nan if broken."""
+    """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
     span = round(seconds / TICK_SECONDS)
     turn = np.full(len(track), complex(np.nan, np.nan))
     if span >= len(track):

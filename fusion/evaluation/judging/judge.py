@@ -59,8 +59,8 @@ class Row:
         recordings: number of recordings compared; those with fewer than three waypoints are not.
         path_km: total length of their true paths.
         medians: medians over recordings, by name of the weights and by figure.
-        ratios: ratios of errors over 1, 10 and 30 s, ours over theirs, by figure; empty without
-            weights to compare with. For waypoints, the residuals replace the 10 s errors.
+        ratios: ratios of errors over 1, 10 and 30 s to those of the weights compared with, by
+            figure; empty without these. For waypoints, the residuals replace the 10 s errors.
         pooled: whether the row covers all groups.
     """
 
@@ -132,7 +132,7 @@ def _errors(
 
 
 def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | None) -> list[Row]:
-    """Return a row for each group, sorted, and one over all if there are several.
+    """Return a row for each group, sorted by name, and one over all if there are several.
 
     Args:
         judged: the recordings.

@@ -1,7 +1,7 @@
 """Recordings prepared for judging networks: windows and ground truth at ticks, cached on disk.
 
-Everything here depends on the recording alone, so several sets of weights share it, and a second
-call finds it in the cache.
+Everything here depends on the recording alone, so several sets of weights share it, and later calls
+read it from the cache.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _ARRAYS = (
 
 @dataclass(frozen=True, eq=False)
 class PreparedPiece:
-    """An unbroken stretch of a recording with its known truth at the stream's K ticks.
+    """An unbroken stretch of a recording with its ground truth at the stream's K ticks.
 
     Attributes:
         stream: IMU, levelled without the truth.
-        position_W: (K,) horizontal position x + iy [m]; nan where unknown, and for waypoints.
+        position_W: (K,) horizontal position x + iy [m]; NaN where unknown, and for waypoints.
         breaks: (K,) number of gaps and jumps of the truth before each tick: a displacement between
             two ticks is known if both have the same number.
-        yaw_WN: (K,) yaw [rad] that rotates N to the true world; nan where the attitude is unknown.
+        yaw_WN: (K,) yaw [rad] that rotates N to the true world; NaN where the attitude is unknown.
         waypoint_time: (W,) times of the waypoints [s].
         waypoint_W: (W,) positions x + iy of the waypoints [m].
     """
@@ -200,7 +200,7 @@ def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPie
 
 @cache
 def _code() -> str:
-    """Return a digest of this module, so that files of other versions of it are not reused."""
+    """Return a digest of this module, so that files of its other versions are not reused."""
     return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 

@@ -59,7 +59,7 @@ class JudgingResult:
 
 
 def judgement_text(found: JudgingResult) -> str:
-    """Return the table as text: theirs, ours and the ratio below each other for every group."""
+    """Return the table as text: for every group rows "theirs" and "ours", then the ratios."""
     weights = {"theirs": found.theirs, "ours": found.ours}
     labels = {label: name for label, name in weights.items() if name is not None}
     table = [["", "", "n", "km", *(title for title, _ in _COLUMNS.values())]]
@@ -85,9 +85,9 @@ _MIN_GROUPS = 3
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Return whether ours should replace theirs; empty without a comparison over several groups.
+    """Return the verdict on replacing the weights compared with; empty without several groups.
 
-    Ours are accepted if the pooled interval is below 1 and no group is worse by more than a tenth.
+    Weights are accepted if the pooled interval is below 1 and no group is worse by over a tenth.
     """
     compared = [row for row in rows if _DECISIVE in row.ratios]
     ratios = {row.name: row.ratios[_DECISIVE] for row in compared if not row.pooled}
