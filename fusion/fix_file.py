@@ -66,8 +66,8 @@ def read_fixes(path: Path | str) -> list[Fix]:
 def _without_unit(title: str) -> str:
     """Return the name without its unit; the whole title if the unit is not the expected one."""
     name, _, unit = title.strip().partition("[")
-    known = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
-    return name.strip() if not unit or unit.rstrip("] ") in known else title.strip()
+    units = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
+    return name.strip() if not unit or unit.rstrip("] ") in units else title.strip()
 
 
 def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:

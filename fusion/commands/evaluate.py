@@ -97,9 +97,9 @@ def evaluate(
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
     if models is not None:
-        named, settings = [name.strip() for name in models.split(",")], estimating.settings()
+        names, settings = [name.strip() for name in models.split(",")], estimating.settings()
         averaging = convention or "rms"
-        skipped += _networks(named, runs, files, settings, reading, averaging, jobs, out, as_json)
+        skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
         exit_if_skipped(skipped)
         return
     if convention is not None:

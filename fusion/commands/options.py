@@ -126,8 +126,8 @@ class ReadingOptions:
         from stario.sequences.readers import read_recording
 
         topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
-        named = {name: topic for name, topic in topics.items() if topic is not None}
-        sequence = read_recording(path, self.format, **named)
+        given = {name: topic for name, topic in topics.items() if topic is not None}
+        sequence = read_recording(path, self.format, **given)
         return with_conventions(
             sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
         )

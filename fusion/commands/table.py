@@ -91,9 +91,9 @@ def table(
         for done, outcome in enumerate(fill(cells, out, reading, jobs), 1):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
-            words = "not filled" if isinstance(outcome, Skipped) else "done"
+            status = "not filled" if isinstance(outcome, Skipped) else "done"
             cell = outcome.item if isinstance(outcome, Skipped) else outcome
-            typer.echo(f"{done} of {len(cells)}: {cell}: {words}", err=True)
+            typer.echo(f"{done} of {len(cells)}: {cell}: {status}", err=True)
             write_results(cells, out, costs, learned, drawn=False)
     typer.echo(write_results(cells, out, costs, learned), nl=False)
     exit_if_skipped(skipped)

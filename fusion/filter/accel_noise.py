@@ -52,6 +52,6 @@ class AccelNoiseScale:
             return self
         ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
-        moved = self.log_factor + self.gain * excess
+        log_factor = self.log_factor + self.gain * excess
         gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
-        return AccelNoiseScale(min(max(moved, 0.0), math.log(MAX_FACTOR)), gain)
+        return AccelNoiseScale(min(max(log_factor, 0.0), math.log(MAX_FACTOR)), gain)

@@ -153,8 +153,8 @@ class Estimator:
             before = changed(self.state, history=())
             step = Step(before, interval.without_window(), displacement, tuple(fixes))
             oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
-            kept = (s for s in self._history if s.interval.stop >= oldest)
-            self._history = (*kept, step)
+            recent = (s for s in self._history if s.interval.stop >= oldest)
+            self._history = (*recent, step)
 
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
@@ -178,7 +178,7 @@ class Estimator:
         for piece, due in split_at_fixes(interval, fixes):
             if piece is not None:
                 self._propagate_piece(piece, interval.start)
-            accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
+            accepted += [applied for fix in due if (applied := self._update_fix(fix)) is not None]
         return None, accepted
 
     def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:

@@ -216,8 +216,8 @@ class MapFrame:
         R = exp_so3(np.array([0.0, 0.0, turn]))
         drift = float(now.covariance[2, 2])
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
-        moved = ekf.state.transformed(transform.R, transform.shift)
-        ekf.state = moved.with_yaw_inflated(pivot, inflation)
+        turned = ekf.state.transformed(transform.R, transform.shift)
+        ekf.state = turned.with_yaw_inflated(pivot, inflation)
         stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
         transforms = (*self.state.transforms, *stretches)
         self.state = changed(

@@ -151,15 +151,15 @@ class GraphBuilder:
             return
         graph = self.graph
         pieces = self.segments[graph.last]
-        whole = pieces[0]
+        segment = pieces[0]
         if len(pieces) > 1:
             _, _, _, b_g, b_a = graph.pose(graph.last)
-            whole = segment_of_all(self._pending, b_g, b_a, self._config)
+            segment = segment_of_all(self._pending, b_g, b_a, self._config)
         if guess is None:
             _, _, _, b_g, b_a = graph.pose(graph.last)
-            guess = NavState(whole.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
+            guess = NavState(segment.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
         self._pending = []
-        self.segments[graph.add_keyframe(whole, guess)] = []
+        self.segments[graph.add_keyframe(segment, guess)] = []
 
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""

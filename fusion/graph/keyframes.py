@@ -174,18 +174,18 @@ class KeyframeGraph:
             return
         values = self._values()
         linear = self._imu_factors(before).linearize(values)
-        reached = [before]
+        connected = [before]
         for term in self._terms:
             if term.first < before:
                 linear.push_back(term.factor(values))
-                reached += [k for k in term.term.keyframes if k > before]
+                connected += [k for k in term.term.keyframes if k > before]
         keys = [key for k in old for key in self._keys(k)]
         try:
             _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
             raise IndeterminateError(self._undetermined_state(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
-        self.add(self._marginal(range(before, max(reached) + 1), remaining), gated=False)
+        self.add(self._marginal(range(before, max(connected) + 1), remaining), gated=False)
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
@@ -209,20 +209,20 @@ class KeyframeGraph:
                 factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
         return factors
 
-    def _marginal(self, reached: range, remaining: Any) -> Prior:
+    def _marginal(self, keyframes: range, remaining: Any) -> Prior:
         """Return the prior that elimination left on the keyframes that it reached."""
-        turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
-        for k in reached:  # a window may reach only a pose; add the other columns
+        turns = tuple((k, self._turns[k]) for k in keyframes if k in self._turns)
+        for k in keyframes:  # a window may reach only a pose; add the other columns
             remaining.push_back(_uninformative_factor(k, k in self._turns))
-        keys = [key(k) for k in reached for key in (X, V, B)]
+        keys = [key(k) for k in keyframes for key in (X, V, B)]
         A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
-        reference = tuple(self.pose(k) for k in reached)
+        reference = tuple(self.pose(k) for k in keyframes)
         to_local = block_diag(
             *(np.linalg.inv(state.invariant_from_local()) for state in reference),
             np.eye(len(turns)),
         )
-        return Prior(reached[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
+        return Prior(keyframes[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
@@ -245,10 +245,10 @@ class KeyframeGraph:
             self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
             before = self._positions(values)
             values = values.retract(self._tree.optimize())
-            moved = float(np.abs(self._positions(values) - before).max())
-            if not moved > _CONVERGED:
+            change = float(np.abs(self._positions(values) - before).max())
+            if not change > _CONVERGED:
                 break
-        if not np.isfinite(moved):
+        if not np.isfinite(change):
             raise IndeterminateError("the optimisation diverged")
         return _round + 1, values
 

@@ -83,11 +83,11 @@ class StatefulInference:
 
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
         """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
-        known = getattr(getattr(self._model, "card", None), "known_motion", None)
-        if known is None:
+        known_motion = getattr(getattr(self._model, "card", None), "known_motion", None)
+        if known_motion is None:
             return 0
         moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
-        return int((moves & (known.novelty(windows) > 1.0)).sum())
+        return int((moves & (known_motion.novelty(windows) > 1.0)).sum())
 
     @property
     def memory(self) -> Any:

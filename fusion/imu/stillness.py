@@ -38,8 +38,8 @@ class StillnessDetector:
             return False
         sums = None if self._moves(interval) else _sums_of(interval)
         self.window = (*self.window, sums)[-self._intervals :]
-        quiet = [sums for sums in self.window if sums is not None]
-        return len(quiet) == self._intervals and self._is_quiet(np.sum(quiet, axis=0))
+        calm = [sums for sums in self.window if sums is not None]
+        return len(calm) == self._intervals and self._is_quiet(np.sum(calm, axis=0))
 
     def mean_rates(self) -> FloatArray:
         """Return the mean rate (n, 3) of each interval of a still second [rad/s]."""

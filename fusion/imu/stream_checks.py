@@ -167,11 +167,11 @@ class GyroUnitCheck:
 
 
 def _check_unit(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-    whole = [slice(0, len(time))]
+    stretches = [slice(0, len(time))]
     check_gyro(
         "stream",
         gyro,
         float(np.median(np.linalg.norm(accel, axis=1))),
-        average_force(time, gyro, accel, whole),
-        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, whole),
+        average_force(time, gyro, accel, stretches),
+        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, stretches),
     )

@@ -103,11 +103,11 @@ def report_html(
         )
         for name, track in tracks.items()
     }
-    known = None if truth is None else trajectory_series(truth, start)
+    true_series = None if truth is None else trajectory_series(truth, start)
     main = main_track(tracks)
     # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "inertial"} or series
-    panels = motion_panels(drawn, known) + bias_panels(main, series[main])
+    panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
     innovations = tracks[main].innovations or next(
         (t.innovations for t in tracks.values() if t.innovations), None
     )
@@ -116,7 +116,9 @@ def report_html(
     figures = {
         "map": json.loads(
             map_figure(
-                drawn if truth is None else series, known, shown_positions(sequence, tracks[main])
+                drawn if truth is None else series,
+                true_series,
+                shown_positions(sequence, tracks[main]),
             ).to_json()
         ),
         "time": json.loads(time_figure(panels).to_json()),
@@ -174,7 +176,7 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
         facts.append((f"{series.yaw_sigma[-1]:.1f} deg", "final yaw, 1 sigma"))
     end = track.trajectory.position_W[-1] - track.trajectory.position_W[0]
     facts.append((f"{float(np.hypot(*end[:2])):.1f} m", "between start and end"))
-    return "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in facts)
+    return "".join(f"<div><b>{value}</b><span>{label}</span></div>" for value, label in facts)
 
 
 def _legend(names: Sequence[str]) -> str:

@@ -82,9 +82,9 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
             continue
         label, traces = style(name)[0], []
         for k, axis in enumerate("xyz"):
-            look = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
+            line_style = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
             value, sigma = bias[0][:, k], bias[1][:, k]
-            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, look)
+            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, line_style)
         words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
         panels.append(Panel(words, traces, {"range": _limits(traces)}))
     return panels
@@ -188,7 +188,7 @@ def _dots(
     gated: BoolArray,
     unit: str,
 ) -> list[go.Scatter]:
-    looks: Sequence[tuple[Any, str, dict[str, Any]]] = (
+    marker_styles: Sequence[tuple[Any, str, dict[str, Any]]] = (
         (~gated, "used", {"color": "#0072B2", "size": 3}),
         (gated, "gated", {"color": "#D55E00", "size": 7, "symbol": "x-thin-open"}),
     )
@@ -202,7 +202,7 @@ def _dots(
             marker=marker,
             hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
         )
-        for rows, name, marker in looks
+        for rows, name, marker in marker_styles
         if rows.any()
     ]
 

@@ -138,8 +138,8 @@ def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
             _log_lines(rr, stream, ("estimate", name), index, values, labels)
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        at, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
-        _log_lines(rr, stream, ("estimate", "NIS [1]"), at, nis, ["NIS"])
+        update_index, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
+        _log_lines(rr, stream, ("estimate", "NIS [1]"), update_index, nis, ["NIS"])
 
 
 def _log_lines(

@@ -134,7 +134,7 @@ def _evaluate(cell: Cell, folder: Path, reading: ReaderConfig) -> None:
         "seed": cell.seed,
         "seconds": process_time() - began,
         "recordings": found,
-        "skipped": [asdict(one) for one in skipped],
+        "skipped": [asdict(failure) for failure in skipped],
     }
     write_json(folder / "errors.json", content)
 

@@ -131,8 +131,8 @@ def _blocks(track: Trajectory, truth: Trajectory) -> list[list[float]]:
     time = errors.estimate.time
     block = np.floor((time - time[0]) / BLOCK_SECONDS).astype(int)
     rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
-    kept: list[list[float]] = rows[rows[:, 1] > 0].tolist()
-    return kept
+    blocks: list[list[float]] = rows[rows[:, 1] > 0].tolist()
+    return blocks
 
 
 def _shown(track: Trajectory, truth: Trajectory) -> Shown:

@@ -32,15 +32,15 @@ from stario.sequences.sequence import FloatArray, Trajectory
 def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
     """Return parameters, FLOPs, memory and time, measured once per folder and network."""
     path = out / "costs.json"
-    known = {}
+    measured = {}
     if path.exists():
         rows = [ModelRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
-        known = {row.name: row for row in rows}
-    missing = [name for name in names if name not in known]
+        measured = {row.name: row for row in rows}
+    missing = [name for name in names if name not in measured]
     if missing:
-        known |= {row.name: row for row in survey(missing)}
-        write_json(path, [row.as_dict() for row in known.values()])
-    return [known[name] for name in names]
+        measured |= {row.name: row for row in survey(missing)}
+        write_json(path, [row.as_dict() for row in measured.values()])
+    return [measured[name] for name in names]
 
 
 def write_results(

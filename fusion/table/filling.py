@@ -83,14 +83,14 @@ def backend(name: str) -> AbstractContextManager[object]:
         ConfigError: the name is unknown.
         InputError: the backend's package is not installed.
     """
-    known: dict[str, Callable[[], AbstractContextManager[object]]] = {
+    backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
         "loky": nullcontext,
         "dask": _dask,
         "ray": _ray,
     }
-    if name not in known:
-        raise ConfigError("--backend", repr(name), f"one of {', '.join(known)}")
-    return known[name]()
+    if name not in backends:
+        raise ConfigError("--backend", repr(name), f"one of {', '.join(backends)}")
+    return backends[name]()
 
 
 @contextmanager

@@ -84,14 +84,14 @@ def development_sets(
     Raises:
         InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
-    known = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
+    available = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
     for name in chosen or ():
-        if name not in known:
-            raise InputError("--sets", repr(name), f"one of {', '.join(known)}")
+        if name not in available:
+            raise InputError("--sets", repr(name), f"one of {', '.join(available)}")
     recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
         _combined(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
-        for name in known
+        for name in available
         if chosen is None or name in chosen
     ]
 

@@ -33,7 +33,7 @@ INSTANTS = 6
 MOST_METRES, MOST_DEGREES = 0.01, 3.0
 """Maximum acceptable shift of the end: in metres per metre of the path, and in yaw."""
 
-_SHORTEST_PATH = 1.0
+_MIN_PATH = 1.0
 """Minimum path [m]: shifts are relative to the path."""
 
 
@@ -76,19 +76,19 @@ def end_shifts(
     unmodified = run(sequence)
     steps = np.diff(unmodified.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())
-    if path < _SHORTEST_PATH:
+    if path < _MIN_PATH:
         raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
-    faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
+    faults = [(f"gap at {instant:.0f} s", gap(float(instant), GAP_SECONDS)) for instant in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
     return [
-        EndShift(sequence.name, group, name, *_between(unmodified, run(faulty), path))
+        EndShift(sequence.name, group, name, *_end_shift(unmodified, run(faulty), path))
         for name, modify_samples in faults
         for faulty in (modify_samples(sequence, np.random.default_rng(seed)),)
     ]
 
 
-def _between(unmodified: Track, other: Track, path: float) -> tuple[float, float]:
+def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, float]:
     a, b = unmodified.trajectory, other.trajectory
     metres = float(np.linalg.norm(a.position_W[-1, :2] - b.position_W[-1, :2])) / path
     turn = (b.attitude_WB[-1] * a.attitude_WB[-1].inv()).as_matrix()

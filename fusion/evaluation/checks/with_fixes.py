@@ -125,5 +125,5 @@ def fixes_table(found: Sequence[FixConsistency]) -> str:
                 f"{np.mean([result.yaw_covered for result in part]):.1%}",
             ]
         )
-    words = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
-    return "\n".join([*aligned(rows), words])
+    note = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
+    return "\n".join([*aligned(rows), note])

@@ -62,8 +62,8 @@ def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArra
     results = [_group(recordings, rng) for recordings in groups.values() if recordings]
     if not results:
         return None
-    drawn = np.stack([replicates for _, replicates in results])
-    return float(np.mean([mean for mean, _ in results])), _means_of_draws(drawn, rng)
+    group_replicates = np.stack([replicates for _, replicates in results])
+    return float(np.mean([mean for mean, _ in results])), _means_of_draws(group_replicates, rng)
 
 
 def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[float, FloatArray]:
@@ -72,8 +72,8 @@ def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[floa
             [0.5 * np.log(evaluated.sum() / baseline.sum()) for evaluated, baseline in recordings]
         )
     )
-    drawn = np.stack([_recording(evaluated, baseline, rng) for evaluated, baseline in recordings])
-    return mean, _means_of_draws(drawn, rng)
+    replicates = np.stack([_recording(*blocks, rng) for blocks in recordings])
+    return mean, _means_of_draws(replicates, rng)
 
 
 def _recording(evaluated: FloatArray, baseline: FloatArray, rng: np.random.Generator) -> FloatArray:
