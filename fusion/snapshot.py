@@ -106,7 +106,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
     if not zipfile.is_zipfile(io.BytesIO(data)):
-        raise InputError("snapshot", "bytes of something else", f"bytes of a {FORMAT}, whole")
+        raise InputError("snapshot", "bytes of something else", f"all bytes of a {FORMAT}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -120,7 +120,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         raise
     except Exception as error:  # corrupt bytes may fail anywhere in zip, NumPy or JSON
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError("snapshot", found, f"bytes of a {FORMAT}, whole") from error
+        raise InputError("snapshot", found, f"all bytes of a {FORMAT}") from error
 
 
 def _whole(value: Any, arrays: dict[str, Any]) -> Any:

@@ -87,7 +87,7 @@ def gaps(
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
-    """Remove 0.1 s at six instants, then 5 % of the samples; report how far the end moves."""
+    """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
     _judge_each(

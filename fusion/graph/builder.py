@@ -254,7 +254,7 @@ class GraphBuilder:
 
 
 def _usable(value: FloatArray, covariance: FloatArray) -> bool:
-    """Whether a measurement is finite and its covariance positive definite."""
+    """Return whether a measurement is finite and its covariance positive definite."""
     with np.errstate(invalid="ignore", over="ignore"):
         finite = math.isfinite(float(np.vdot(value, value) + np.vdot(covariance, covariance)))
     return finite and dpotrf(covariance, lower=1)[1] == 0

@@ -164,7 +164,7 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Marginalise the keyframes before a given one; the others keep their information.
+        """Marginalise the keyframes before a given one, keeping their information on later ones.
 
         Raises:
             IndeterminateError: a marginalised state is not determined.

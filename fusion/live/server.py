@@ -1,7 +1,7 @@
 """HTTP side of the live server: receives pushes, serves one page.
 
     GET  /                       the page
-    GET  /events                 its updates, as server-sent events
+    GET  /events                 updates for the page, as server-sent events
     POST /data                   a push of Sensor Logger, or lines of JSON (application/x-ndjson)
     POST /devices/{id}/{command} start, stop, zero, or fix with {"x": m, "y": m, "sigma": m}
 

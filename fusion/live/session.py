@@ -30,7 +30,7 @@ _CERTAIN = 0.7
 
 
 class Session:
-    """Stream of one device. Not thread-safe: the caller holds `hub`'s lock.
+    """Stream of one device. Not thread-safe: the caller must hold the hub's lock for the device.
 
     Args:
         device: name of the device.
