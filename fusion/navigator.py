@@ -50,7 +50,7 @@ class Navigator:
     Args:
         model: a `DisplacementModel`, or any object with its `predict`.
         config: noise, filter, gravity; the defaults are for handheld devices.
-        prior: prior of the first pose; None starts levelled by gravity, with yaw and position zero.
+        prior: prior on the first pose; None starts levelled by gravity, with yaw and position zero.
         backend: "ekf", or "graph" for the factor graph, which is more accurate and slower.
 
     Raises:

@@ -11,7 +11,7 @@ dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an o
     backend    "ekf" or "graph"
     config     effective configuration, which must equal that of the restoring navigator
     model      checksum of the weights, which must be equal too; empty for models without a card
-    prior      prior of the first pose, or null
+    prior      prior on the first pose, or null
     front end  samples, windows and counts
     network    memory of the network, or null
     continuous the continuous pose, or null

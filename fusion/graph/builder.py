@@ -56,7 +56,7 @@ class GraphBuilder:
         streaming: rely on the filter's gating of fixes, and of displacements if it weights them
             equally. A robust loss in the graph starts from the IMU's prediction: while the speed
             was still unknown it rejected correct displacements, one after the other, and in 2 of
-            100 simulated walks for good.
+            100 simulated walks permanently.
 
     Attributes:
         graph: the graph so far.
