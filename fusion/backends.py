@@ -52,13 +52,13 @@ class StreamEstimator(Protocol):
         """Propagate to the end of the interval and apply its measurements."""
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Apply a fix from the past; None if it is too old."""
+        """Apply a fix from the past; return None if it is too old."""
 
     def nav_state(self) -> NavState:
-        """The newest state."""
+        """Return the newest state."""
 
     def health(self, counts: SampleCounts) -> Health:
-        """The health report so far."""
+        """Return the health report so far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +66,9 @@ class FilteredRecording:
     """A recording after the filter.
 
     Attributes:
-        estimator: after the last interval.
+        estimator: the filter after the last interval.
         estimates: the initial state and one per interval.
-        measurements: those applied, one entry per interval.
+        measurements: measurements applied, one entry per interval.
         clones: poses released from the window, corrected by all its measurements.
     """
 
@@ -129,13 +129,17 @@ class GraphBackend:
         """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
         estimator = filtered.estimator
         transforms, states = estimator.map_frame_state.transforms, nav_states(filtered.estimates)
-        end, seen = states[-1], estimator.ekf.state.field is not None
-        bias = (end.b_g, end.covariance[9:12, 9:12]) if seen else None
-        own = to_final_frame(states, transforms)
+        end, has_field = states[-1], estimator.ekf.state.field is not None
+        bias = (end.b_g, end.covariance[9:12, 9:12]) if has_field else None
+        filtered_states = to_final_frame(states, transforms)
         first = _with_bias_prior(states[0], estimator.bias_prior.variance)
         sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
-        whole = smooth(own, first, filtered.measurements, transforms, config, bias, sigma)
-        return Solution(own if whole.fell_back else whole.states, None, [whole.note])
+        smoothed = smooth(
+            filtered_states, first, filtered.measurements, transforms, config, bias, sigma
+        )
+        return Solution(
+            filtered_states if smoothed.fell_back else smoothed.states, None, [smoothed.note]
+        )
 
 
 def _with_bias_prior(first: NavState, variance: float) -> NavState:
@@ -187,8 +191,8 @@ def _filtered(
     filtered = FilteredRecording(estimator, [estimator.estimate()], [], [])
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):
-        taken = estimator.step(interval, displacement, queue.due(interval.stop))
-        filtered.measurements.append(taken)
+        applied = estimator.step(interval, displacement, queue.due(interval.stop))
+        filtered.measurements.append(applied)
         filtered.estimates.append(estimator.estimate())
         clone = estimator.released
         if clone is not None and clone not in filtered.clones[-1:]:

@@ -1,4 +1,4 @@
-"""Checks of arguments at the public edge."""
+"""Checks of arguments of the public interface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def check_type(name: str, value: object, kind: type, otherwise: str | None = "")
         name: name of the argument.
         value: value given.
         kind: required type.
-        otherwise: how to obtain one, for the message; None if the argument may be None.
+        otherwise: how to obtain a value of that type; None if the argument may be None.
 
     Raises:
         InputError: the type differs; names the argument.
@@ -69,10 +69,13 @@ def check_covariance(covariance: FloatArray) -> None:
 
 
 def floored(covariance: FloatArray, sigma: float) -> FloatArray:
-    """Raise positive variances to at least sigma^2; others are left for later checks to refuse."""
+    """Return a covariance with positive variances raised to sigma^2 or more; others are kept.
+
+    Later checks refuse those that are not positive.
+    """
     variance = covariance.diagonal()
-    short = (variance > 0.0) & (variance < sigma * sigma)
-    if not short.any():
+    too_small = (variance > 0.0) & (variance < sigma * sigma)
+    if not too_small.any():
         return covariance
-    lift: FloatArray = np.diag(np.where(short, sigma * sigma - variance, 0.0))
-    return covariance + lift
+    increase: FloatArray = np.diag(np.where(too_small, sigma * sigma - variance, 0.0))
+    return covariance + increase

@@ -46,24 +46,24 @@ class FilterConfig:
         gate: probability of the chi-square test. The covariance of an outlier is inflated rather
             than the measurement rejected: without it the speed drifts, and the next correct
             measurement looks false.
-        tilt_sigma: initial tilt of a moving device [rad].
-        yaw_sigma: initial yaw [rad]; small, since the start defines the yaw.
-        velocity_sigma: initial velocity, taken as zero [m/s].
-        gyro_bias_sigma: initial gyroscope bias of a device that corrects it well [rad/s]. The
+        tilt_sigma: sigma of the initial tilt of a moving device [rad].
+        yaw_sigma: sigma of the initial yaw [rad]; small, since the start defines the yaw.
+        velocity_sigma: sigma of the initial velocity, taken as zero [m/s].
+        gyro_bias_sigma: sigma of the gyroscope bias of a device that corrects it well [rad/s]. The
             network's information on the bias is weak and itself biased: its slow errors would turn
             the tracks of devices with a good gyroscope. The filter widens this prior where gravity,
             stillness or the magnetic field show a larger bias.
-        accel_bias_sigma: initial accelerometer bias [m/s^2].
-        gap_gyro_noise: density while no samples arrive [rad/s/sqrt(Hz)].
-        gap_accel_noise: density while no samples arrive [m/s^2/sqrt(Hz)].
+        accel_bias_sigma: sigma of the initial accelerometer bias [m/s^2].
+        gap_gyro_noise: gyroscope noise density in a gap [rad/s/sqrt(Hz)].
+        gap_accel_noise: accelerometer noise density in a gap [m/s^2/sqrt(Hz)].
         stillness_noise: factor on a phone's white noise below which a second of samples counts as
             stationary; 0 disables zero-velocity updates.
         adaptive: whether innovations and gravity adapt the accelerometer's density and the prior of
-            the gyroscope bias; False for a device that is known.
+            the gyroscope bias; False for a device whose noise is known.
         magnetometer: whether the magnetic field of a recording or stream is used.
-        declination: of magnetic from true north, positive east [rad]. If given, a track without any
-            other direction is turned by its magnetic field so that x points east and y north; None
-            leaves its initial yaw at zero.
+        declination: angle from true to magnetic north, positive east [rad]. If given, a track of
+            otherwise unknown direction is turned by its magnetic field so that x points east and
+            y north; None leaves its initial yaw at zero.
     """
 
     update_rate: int = 2
@@ -112,7 +112,7 @@ class FilterConfig:
 
     @property
     def window_updates(self) -> int:
-        """Number of updates per window, and so of clones held."""
+        """Number of updates per window, which is the number of clones."""
         return round(self.update_rate * WINDOW_SECONDS)
 
     @property

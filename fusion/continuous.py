@@ -1,4 +1,4 @@
-"""A continuous position next to the corrected one, for control and display (REP 105, map to odom).
+"""Continuous position next to the corrected one, for control and display (REP 105, map to odom).
 
 The corrected state steps at every update, as it should. The continuous position integrates the
 velocity only; its difference from the corrected one is kept as `correction_W` and bled in slowly.
@@ -57,10 +57,10 @@ def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
     p_W = state.p_W
     if before is not None and before.map_frame == state.map_frame and not state.in_gap:
         dt = state.time - before.time
-        carried = before.p_W + 0.5 * dt * (before.v_W + state.v_W)
-        missing = state.p_W - carried
-        part = -math.expm1(-dt / BLEED_SECONDS) * missing
-        p_W = carried + part * min(1.0, LARGEST_STEP / max(float(np.linalg.norm(part)), 1e-12))
+        integrated = before.p_W + 0.5 * dt * (before.v_W + state.v_W)
+        error = state.p_W - integrated
+        part = -math.expm1(-dt / BLEED_SECONDS) * error
+        p_W = integrated + part * min(1.0, LARGEST_STEP / max(float(np.linalg.norm(part)), 1e-12))
     correction_W = state.p_W - p_W
     return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, correction_W, state.map_frame)
 

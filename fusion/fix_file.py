@@ -2,11 +2,11 @@
 
 t     time since the recording's first sample [s]
 kind  position, velocity or yaw
-x y z position [m] or velocity [m/s] in W; a yaw gives its yaw [rad] in x and leaves y, z
+x y z position [m] or velocity [m/s] in W; a yaw [rad] is given in x, with y and z empty
 sx    standard deviation [m], [m/s] or [rad]
 sy sz standard deviations of the other axes; empty, or no column, where they equal sx
 
-Columns come in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
+Columns may be in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
 A position without z is horizontal; its height is unknown.
 """
 
@@ -26,7 +26,7 @@ from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import increasing_mask
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
-_NEEDED = (*_COLUMNS[:3], "sx")
+_REQUIRED = (*_COLUMNS[:3], "sx")
 
 _UNITS = {"t": ("s",), "kind": ()}
 """Units that a header may name for a column; for the others m, m/s and rad."""
@@ -52,7 +52,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
     header = [_without_unit(word).lower() for word in rows[0]] if rows else []
     unknown = [word for word in header if word not in _COLUMNS]
-    missing = [word for word in _NEEDED if word not in header]
+    missing = [word for word in _REQUIRED if word not in header]
     if unknown or missing or len(set(header)) < len(header):
         found = ",".join(header) or "nothing"
         raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
@@ -66,19 +66,19 @@ def read_fixes(path: Path | str) -> list[Fix]:
 def _without_unit(title: str) -> str:
     """Return the name without its unit; the whole title if the unit is not the expected one."""
     name, _, unit = title.strip().partition("[")
-    known = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
-    return name.strip() if not unit or unit.rstrip("] ") in known else title.strip()
+    units = _UNITS.get(name.strip().lower(), ("m", "m/s", "rad"))
+    return name.strip() if not unit or unit.rstrip("] ") in units else title.strip()
 
 
 def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
     """Check that at least one fix lies within the recording.
 
     Raises:
-        InputError: none does, so that they belong to another clock.
+        InputError: none does; their times are then on another clock.
     """
-    counted = sequence.time[np.isfinite(sequence.time)]
-    counted = counted[increasing_mask(counted)]
-    times, start, stop = [fix.time for fix in fixes], counted[0], counted[-1]
+    sample_times = sequence.time[np.isfinite(sequence.time)]
+    sample_times = sample_times[increasing_mask(sample_times)]
+    times, start, stop = [fix.time for fix in fixes], sample_times[0], sample_times[-1]
     if times and not any(start <= t <= stop for t in times):
         found = f"times from {min(times):.6g} to {max(times):.6g} s"
         expected = f"some within the recording's, {start:.6g} to {stop:.6g} s"
@@ -104,8 +104,8 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
     if kind == "yaw" and (abs(value[0]) > LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
-        found, fix = f"{cells['x']} +- {cells['sx']}", "of degrees write the kind `yaw [deg]`"
-        raise ReadError(path, f"{where}, yaw", found, "radians", fix)
+        found, remedy = f"{cells['x']} +- {cells['sx']}", "for degrees, use the kind `yaw [deg]`"
+        raise ReadError(path, f"{where}, yaw", found, "radians", remedy)
     (time,) = _numbers(path, where, cells, ["t"])
     return make_fix(time, kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]
 

@@ -25,15 +25,15 @@ FixKind = Literal["position", "yaw", "velocity"]
 log = logging.getLogger(__name__)
 
 LARGEST_YAW = 20.0 * math.pi
-"""Largest plausible yaw [rad]: more than ten turns means other units, or no yaw at all."""
+"""Largest plausible yaw [rad]: more than ten turns indicate other units or another quantity."""
 
 KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 """Kinds of fixes, with the dimension of each."""
 
 MOST_WAITING = 10_000
-"""Number of fixes of a stream that may wait for their time, which bounds the memory."""
+"""Maximum number of fixes of a stream that wait for their time, to bound memory."""
 
-_SMALLEST_SIGMA = 1e-4
+_MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
 
@@ -114,7 +114,7 @@ def yaw_fix(time: float, yaw: Any, sigma: Any) -> Fix:
 
 
 def by_time(fix: Fix) -> tuple[float, str]:
-    """Sort key: makes the result independent of the order of arrival."""
+    """Return the sort key, which makes the result independent of the order of arrival."""
     return fix.time, fix.kind
 
 
@@ -123,7 +123,7 @@ class FixQueue:
 
     Args:
         fixes: initial fixes.
-        most: largest number of waiting fixes; beyond it, those furthest ahead are refused.
+        most: maximum number of waiting fixes; beyond it, those furthest ahead are refused.
 
     Attributes:
         waiting: the waiting fixes.
@@ -180,5 +180,5 @@ def make_fix(time: Any, kind: FixKind, value: Any, covariance: Any) -> Fix:
         time=shaped("time", time, ()).item(),
         kind=kind,
         value=shaped(kind, value, (n,)),
-        covariance=floored(shaped("covariance", covariance, (n, n)), _SMALLEST_SIGMA),
+        covariance=floored(shaped("covariance", covariance, (n, n)), _MIN_SIGMA),
     )

@@ -44,7 +44,7 @@ def exp_times(theta: FloatArray, rho: FloatArray, X: FloatArray) -> FloatArray:
 
 
 def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
-    """Logarithm (..., 9) of SE_2(3) for angles below pi."""
+    """Return the logarithm (..., 9) of elements of SE_2(3), for angles below pi."""
     theta = log_so3(R)
     _, J = exp_and_left_jacobian(theta)
     rho = np.linalg.solve(J, np.stack([v, p], axis=-1))
@@ -55,7 +55,7 @@ def log_se23(R: FloatArray, v: FloatArray, p: FloatArray) -> FloatArray:
 # rotation about z by atan2(s, c), s = R10 - R01, c = R00 + R11 (README.md, "Frames").
 # `sequences.attitude.rotations.yaw_of` is the same for stacks.
 _UPSIDE_DOWN = 0.01
-"""s^2 + c^2 = (1 + cos tilt)^2 below which yaw is undefined: 26 degrees from upside down."""
+"""Yaw is undefined where s^2 + c^2 = (1 + cos tilt)^2 is smaller: 26 degrees from upside down."""
 
 
 def twist(R: FloatArray) -> tuple[float, float]:

@@ -50,7 +50,7 @@ class Navigator:
     Args:
         model: a `DisplacementModel`, or any object with its `predict`.
         config: noise, filter, gravity; the defaults are for handheld devices.
-        prior: prior of the first pose; None starts levelled by gravity, with yaw and position zero.
+        prior: prior on the first pose; None starts levelled by gravity, with yaw and position zero.
         backend: "ekf", or "graph" for the factor graph, which is more accurate and slower.
 
     Raises:
@@ -154,14 +154,14 @@ class Navigator:
         self._take(position_fix(time, p_W, covariance))
 
     def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> None:
-        """Apply a velocity fix (3,) [m/s] in W with covariance (3, 3), as `update_position`.
+        """Apply a velocity fix (3,) [m/s] in W with covariance (3, 3); see `update_position`.
 
         Rotate velocities measured along the body's axes, as by wheels, by the attitude first.
         """
         self._take(velocity_fix(time, v_W, covariance))
 
     def update_yaw(self, time: float, yaw: float, sigma: float) -> None:
-        """Apply a fix of the body's yaw [rad], as `update_position`.
+        """Apply a fix of the body's yaw [rad]; see `update_position`.
 
         Yaw counts counter-clockwise from the map's x axis, unlike a compass heading; at any tilt it
         is that of the twist about the vertical (`lie.yaw_twist`).
@@ -170,17 +170,17 @@ class Navigator:
 
     @property
     def state(self) -> NavState | None:
-        """The newest state of the stream; None during the first second."""
+        """Newest state of the stream; None during the first second."""
         return None if self._estimator is None else self._estimator.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
-        """The newest pose without steps at updates; None during the first second."""
+        """Newest pose, without steps at updates; None during the first second."""
         return None if self._continuous is None else copied(self._continuous)
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """The stream's newest pose delayed by one window (1 s), using all measurements since.
+        """Newest pose of the stream, delayed by one window (1 s) and using all measurements since.
 
         It changes with each network update; None before the first, and for the graph.
         """
@@ -188,7 +188,7 @@ class Navigator:
 
     @property
     def health(self) -> Health:
-        """The health report of the stream so far."""
+        """Health report of the stream so far."""
         counts = self._front_end.counts
         return self._fixes.health(
             counts.health() if self._estimator is None else self._estimator.health(counts)
@@ -265,9 +265,9 @@ class Navigator:
         """
         check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
         if not callable(progress):
-            fix = "pass fixes by name: fixes=[...]"
+            remedy = "pass fixes by name: fixes=[...]"
             raise InputError(
-                "progress", f"{progress!r:.60}", "a function of the fraction done", fix
+                "progress", f"{progress!r:.60}", "a function of the fraction done", remedy
             )
         return preprocess(sequence, self.model, self.config, progress)
 

@@ -36,7 +36,7 @@ class PreprocessedRecording:
         update_rate: network updates per second that it was cut for.
         measurements: predicted displacement of the window ending with each interval, None if no
             window ends there.
-        front_end: holds the sample counts and the start.
+        front_end: the front end, with the sample counts and the start.
         seconds_front_end: computing time of the front end [s].
         seconds_network: computing time of the network [s].
     """
@@ -89,10 +89,10 @@ def _displacements(
     for batch in _batches(intervals, unbroken=network.is_recurrent):
         if network.is_recurrent and intervals[batch[0]].gap:
             network.restart()
-        known = [k for k in batch if intervals[k].window is not None]
-        if known:
-            found = displacements_of(network, [intervals[k] for k in known], counts)
-            for k, displacement in zip(known, found, strict=True):
+        with_window = [k for k in batch if intervals[k].window is not None]
+        if with_window:
+            displacements = displacements_of(network, [intervals[k] for k in with_window], counts)
+            for k, displacement in zip(with_window, displacements, strict=True):
                 measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))
     return measurements

@@ -1,17 +1,17 @@
-"""Snapshots of a stream as bytes, without pickle: it can be continued in another process.
+"""Snapshots of a stream as bytes, without pickle, to continue it in another process.
 
 Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON value in
 which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
 `{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
 dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
-`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree holds
+`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree contains
 
     format     "stario snapshot"
     version    version of this layout; others are refused
     backend    "ekf" or "graph"
     config     effective configuration, which must equal that of the restoring navigator
     model      checksum of the weights, which must be equal too; empty for models without a card
-    prior      prior of the first pose, or null
+    prior      prior on the first pose, or null
     front end  samples, windows and counts
     network    memory of the network, or null
     continuous the continuous pose, or null
@@ -106,7 +106,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
     if not zipfile.is_zipfile(io.BytesIO(data)):
-        raise InputError("snapshot", "bytes of something else", f"bytes of a {FORMAT}, whole")
+        raise InputError("snapshot", "bytes of something else", f"all bytes of a {FORMAT}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -120,7 +120,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         raise
     except Exception as error:  # corrupt bytes may fail anywhere in zip, NumPy or JSON
         found = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError("snapshot", found, f"bytes of a {FORMAT}, whole") from error
+        raise InputError("snapshot", found, f"all bytes of a {FORMAT}") from error
 
 
 def _whole(value: Any, arrays: dict[str, Any]) -> Any:
@@ -133,8 +133,8 @@ def _whole(value: Any, arrays: dict[str, Any]) -> Any:
             return arrays[f"a{k}"]
         case {"is": name, "has": has}:
             return _rebuilt(_classes()[name], {k: _whole(v, arrays) for k, v in has.items()})
-        case {"deque": entries, "maxlen": most}:
-            return deque((_whole(entry, arrays) for entry in entries), maxlen=most)
+        case {"deque": entries, "maxlen": maxlen}:
+            return deque((_whole(entry, arrays) for entry in entries), maxlen=maxlen)
         case {"tuple": entries}:
             return tuple(_whole(entry, arrays) for entry in entries)
         case {"map": entries}:
@@ -146,20 +146,20 @@ def _rebuilt(kind: type, has: dict[str, Any]) -> Any:
     if issubclass(kind, tuple):
         return kind(**has)
     new = kind.__new__(kind)
-    put = getattr(new, "__setstate__", vars(new).update)
-    put(has)
+    set_state = getattr(new, "__setstate__", vars(new).update)
+    set_state(has)
     return new
 
 
 def check_same(name: str, found: object, expected: object) -> None:
-    """Check that a snapshot belongs to this navigator; names the first value that differs.
+    """Check that a value of a snapshot equals that of this navigator.
 
     Raises:
-        InputError: the values differ.
+        InputError: the values differ; names the first that does.
     """
     if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
         for key, value in expected.items():
             check_same(f"{name}.{key}", found[key], value)
     elif found != expected:
-        fix = "restore with the same configuration and weights"
-        raise InputError(f"snapshot: {name}", repr(found), repr(expected), fix)
+        remedy = "restore with the same configuration and weights"
+        raise InputError(f"snapshot: {name}", repr(found), repr(expected), remedy)

@@ -25,7 +25,7 @@ class NavState:
         b_a: (3,) accelerometer bias [m/s^2].
         covariance: (15, 15) of rotation about W's axes [rad], velocity, position, b_g, b_a; each
             error is true minus estimate. The properties below give its blocks.
-        in_gap: True right after a stretch without samples.
+        in_gap: whether the interval that ends here is a gap without samples.
         map_frame: number of frame transforms so far (`filter.map_frame`); states with different
             numbers must not be compared.
     """
@@ -133,11 +133,10 @@ class Health:
         refused: of these, numbers refused by reason.
         mean_nis: mean normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
-        fixes: numbers of fixes applied (of these gated) and refused by reason.
-        zero_velocity: numbers of zero-velocity updates (one per state) applied and refused by
+        fixes: numbers of fixes applied (of these gated), and refused by reason.
+        zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
             reason.
-        bearings: numbers of magnetic bearings applied (of these gated) and refused by reason, and
-            whether they determined north.
+        bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
         final_sigma: final standard deviations, the largest over the axes: tilt and yaw [rad],
@@ -233,7 +232,7 @@ class Track:
 
     def arrays(self) -> dict[str, Any]:
         """Return all arrays by name, for an npz file."""
-        known = {
+        arrays = {
             "time": self.time,
             "position_W": self.trajectory.position_W,
             "quat_xyzw_WB": self.trajectory.quat_xyzw,
@@ -243,7 +242,7 @@ class Track:
             "accel_bias_B": self.b_a,
             "covariance": self.covariance,
         }
-        return {name: value for name, value in known.items() if value is not None}
+        return {name: value for name, value in arrays.items() if value is not None}
 
 
 def track_from_states(

@@ -41,7 +41,7 @@ def fusion(
     graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the filter's error with its network's by group, with NIS and consistency of yaw."""
+    """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
     from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
@@ -87,7 +87,7 @@ def gaps(
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
-    """Remove 0.1 s at six instants, then 5 % of the samples; report how far the end moves."""
+    """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
     _judge_each(
@@ -97,14 +97,14 @@ def gaps(
 
 def _judge_each(
     title: str,
-    given: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
+    options: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
     judge: Judge,
     table: Callable[[Sequence[Any]], str],
 ) -> None:
     """Evaluate each recording, print a table or JSON, and exit with 1 if any was skipped."""
     from stario.fusion.evaluation.judging.judge import check_by, labels
 
-    reading, paths, estimating, by, as_json = given
+    reading, paths, estimating, by, as_json = options
     grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
 
@@ -112,9 +112,9 @@ def _judge_each(
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
     results, skipped = map_recordings(title, reading, paths, judged)
-    found = [one for several in results for one in several]
+    found = [result for group in results for result in group]
     if as_json:
-        print_json([asdict(one) for one in found])
+        print_json([asdict(result) for result in found])
     elif found:
         typer.echo(table(found))
     exit_if_skipped(skipped)

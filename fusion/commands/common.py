@@ -112,9 +112,9 @@ def process_each(
 
 def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
     """List what was skipped on stderr and exit with status 1 if there was any."""
-    for one in skipped:
-        where = "" if one.item in one.reason else f"{one.item}: "
-        typer.echo(f"stario: skipped: {where}{one.reason}", err=True)
+    for failure in skipped:
+        where = "" if failure.item in failure.reason else f"{failure.item}: "
+        typer.echo(f"stario: skipped: {where}{failure.reason}", err=True)
     if skipped:
         raise typer.Exit(1)
 
@@ -133,7 +133,7 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
         yield advance
 
 
-_WHOLE = 0.98
+_FULL_COVERAGE = 0.98
 """Share of a track below which the coverage by ground truth is reported as partial."""
 
 
@@ -166,13 +166,15 @@ def track_table(
         "seconds_network": "network [s]",
         "seconds_filter": "other [s]",
     }
-    rows = [[name, *(figure(found.get(key)) for key in columns)] for name, found in metrics.items()]
+    rows = [
+        [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
+    ]
     lines = aligned([["", *columns.values()], *rows])
     if truth is None:
         return "\n".join(lines)
     lines += [f"{key}: {words[key]}." for key in _EXPLAINED]
     covered = float(truth.covers(time).mean())
-    if covered < _WHOLE:
+    if covered < _FULL_COVERAGE:
         lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
     return "\n".join(lines)
 

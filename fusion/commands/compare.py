@@ -53,7 +53,7 @@ def compare(
     if report:
         optional_package("plotly", "report")
     settings, network = estimating.settings(), estimating.network_for(jobs)
-    known = [] if fixes is None else read_fixes(fixes)
+    absolute_fixes = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
     files, skipped = reading.recordings(paths or [])
     if fixes is not None and len(files) > 1:
@@ -62,11 +62,11 @@ def compare(
         if not paths:
             typer.echo("demonstration: a simulated walk not used in training", err=True)
             model = estimating.network()
-            made = compare_tracks(model, demonstration(), settings, progress, known)
-            comparisons.append(made)
+            comparison = compare_tracks(model, demonstration(), settings, progress, absolute_fixes)
+            comparisons.append(comparison)
         comparisons += collect_results(
             compare_recordings(
-                files, network, settings, reading.read, jobs, known, progress=progress
+                files, network, settings, reading.read, jobs, absolute_fixes, progress=progress
             ),
             skipped,
         )

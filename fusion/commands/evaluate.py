@@ -95,11 +95,11 @@ def evaluate(
     if against is not None:
         raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
     listed, skipped = _listed(reading, paths or [], data, split)
-    files = [one.path for one in listed]
+    files = [entry.path for entry in listed]
     if models is not None:
-        named, settings = [name.strip() for name in models.split(",")], estimating.settings()
-        averaged = convention or "rms"
-        skipped += _networks(named, runs, files, settings, reading, averaged, jobs, out, as_json)
+        names, settings = [name.strip() for name in models.split(",")], estimating.settings()
+        averaging = convention or "rms"
+        skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
         exit_if_skipped(skipped)
         return
     if convention is not None:

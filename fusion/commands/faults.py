@@ -23,7 +23,7 @@ def faults(
     estimating: EstimatorOptions,
     path: Annotated[
         Path | None,
-        typer.Argument(help="Recording with truth. Default: a walk with a known sensor."),
+        typer.Argument(help="Recording with true poses. Default: a simulated walk."),
     ] = None,
     network: Annotated[
         bool,

@@ -37,12 +37,12 @@ def inspect(
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, kind of motion."""
     from stario.network.model import load_model
 
-    work = partial(_inspect, network=load_model(model), told=not as_json)
+    work = partial(_inspect, network=load_model(model), printed=not as_json)
     process_each(reading, paths, out, work, as_json)
 
 
 def _inspect(
-    sequence: ImuSequence, folder: Path, network: DisplacementModel, told: bool
+    sequence: ImuSequence, folder: Path, network: DisplacementModel, printed: bool
 ) -> dict[str, object]:
     from stario.fusion.evaluation.results import make_folder
     from stario.sequences.drawing.figures import save_figure
@@ -63,7 +63,7 @@ def _inspect(
     motion = _motion(sequence, network)
     record = found.as_dict() | {"motion": motion and motion.as_dict()}
     write_json(folder / "inspection.json", record)
-    if told:
+    if printed:
         typer.echo(
             "\n".join([sequence.summary(), *found.lines(), *(motion.lines() if motion else [])])
         )

@@ -49,9 +49,9 @@ def evaluate_by_group(
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     if out is not None:
         make_folder(out)
-    paths = [one.path for one in recordings]
+    paths = [entry.path for entry in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
-    groups = {one.path: one.group for one in recordings}
+    groups = {entry.path: entry.group for entry in recordings}
     with progress_bar("judge", len(recordings)) as progress:
         judged, skipped = judge(
             prepared,

@@ -126,8 +126,8 @@ class ReadingOptions:
         from stario.sequences.readers import read_recording
 
         topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
-        named = {name: topic for name, topic in topics.items() if topic is not None}
-        sequence = read_recording(path, self.format, **named)
+        given = {name: topic for name, topic in topics.items() if topic is not None}
+        sequence = read_recording(path, self.format, **given)
         return with_conventions(
             sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
         )
@@ -189,9 +189,9 @@ class EstimatorOptions:
 
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Expand `ReadingOptions` and `EstimatorOptions` parameters into one typer option per field.
+    """Expand a command's parameters of an option group into one typer option per field.
 
-    The options are thus defined once; a command has them if it takes `reading: ReadingOptions`.
+    Groups are `ReadingOptions` and `EstimatorOptions`: each option is thus defined only once.
     """
     hints = typing.get_type_hints(command, include_extras=True)
     groups = {
@@ -218,11 +218,11 @@ def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        made = {
+        grouped = {
             name: groups[name](**{key: values.pop(key) for key in keys})
             for name, keys in members.items()
         }
-        command(**values, **made)
+        command(**values, **grouped)
 
     flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     flat.__annotations__ = {name: option.annotation for name, option in options.items()}

@@ -54,9 +54,9 @@ def run(
     if view:
         optional_package("rerun", "view")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
-    known = [] if fixes is None else read_fixes(fixes)
+    absolute_fixes = [] if fixes is None else read_fixes(fixes)
     shown = Shown(report, view, figures=not as_json)
-    work = partial(_run, navigator=navigator, fixes=known, shown=shown)
+    work = partial(_run, navigator=navigator, fixes=absolute_fixes, shown=shown)
     process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
 
 

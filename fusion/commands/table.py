@@ -76,9 +76,9 @@ def table(
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import cache_folder
 
-    known = _data_sets(data, sets, published or [], split_seed, per_group)
+    datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else [name.strip() for name in networks.split(",")]
-    cells = table_cells(known, _recipe(config), steps, chosen, seeds)
+    cells = table_cells(datasets, _recipe(config), steps, chosen, seeds)
     make_folder(out)
     costs = known_costs(_trained(cells), out)
     learned = {} if data is None else learned_from(data)
@@ -91,9 +91,9 @@ def table(
         for done, outcome in enumerate(fill(cells, out, reading, jobs), 1):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
-            words = "not filled" if isinstance(outcome, Skipped) else "done"
-            named = outcome.item if isinstance(outcome, Skipped) else outcome
-            typer.echo(f"{done} of {len(cells)}: {named}: {words}", err=True)
+            status = "not filled" if isinstance(outcome, Skipped) else "done"
+            cell = outcome.item if isinstance(outcome, Skipped) else outcome
+            typer.echo(f"{done} of {len(cells)}: {cell}: {status}", err=True)
             write_results(cells, out, costs, learned, drawn=False)
     typer.echo(write_results(cells, out, costs, learned), nl=False)
     exit_if_skipped(skipped)
@@ -106,18 +106,18 @@ def _data_sets(
 
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
-    known: list[DataSet] = []
+    datasets: list[DataSet] = []
     if data is not None:
         names = None if sets is None else [name.strip() for name in sets.split(",")]
-        known += development_sets(data, seed, per_group, names)
+        datasets += development_sets(data, seed, per_group, names)
     for word in published:
         name, equals, folder = word.partition("=")
         if not (name and equals and folder):
             raise InputError("--set", repr(word), "NAME=FOLDER", "such as ronin=/data/RoNIN")
-        if name in {one.name for one in known}:
+        if name in {dataset.name for dataset in datasets}:
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
-        known.append(folder_set(name, Path(folder), seed))
-    return known
+        datasets.append(folder_set(name, Path(folder), seed))
+    return datasets
 
 
 def _recipe(path: Path | None) -> dict[str, Any]:
@@ -129,5 +129,5 @@ def _trained(cells: list[Cell]) -> list[str]:
     """Return the networks of the cells, in the order of the paper's table."""
     from stario.network.architectures import ARCHITECTURES
 
-    asked = {cell.network for cell in cells}
-    return [name for name in ARCHITECTURES if name in asked]
+    requested = {cell.network for cell in cells}
+    return [name for name in ARCHITECTURES if name in requested]

@@ -134,17 +134,17 @@ def train(
         recipe.shares,
         recipe.reach,
     )
-    kept = mix_sources(held_out, [])
-    if recorded and not (kept.streams or kept.legs):
+    validation_data = mix_sources(held_out, [])
+    if recorded and not (validation_data.streams or validation_data.legs):
         raise InputError(
             "recordings",
             "none whose last fifth has an unbroken stretch of 2 s",
             "validation data to select and calibrate on",
             "name recordings with --validation",
         )
-    calibrated_by = last_stage or (None if kept.streams else start_from)
+    calibrated_by = last_stage or (None if validation_data.streams else start_from)
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
-    windows = kept.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
+    windows = validation_data.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
     if is_leader():
         for words in material.words:
             typer.echo(words, err=True)
@@ -167,8 +167,8 @@ def train(
             start_from=first,
             calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
             legs=material.legs,
-            validation_legs=kept.legs,
-            chosen_by_legs=not kept.streams,
+            validation_legs=validation_data.legs,
+            chosen_by_legs=not validation_data.streams,
         )
     if is_leader():
         typer.echo(str(path))
@@ -199,8 +199,8 @@ def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path],
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
-        for option, given in (("--leave-out", group is not None), ("--learn-from", name != "all")):
-            if given:
+        for option, used in (("--leave-out", group is not None), ("--learn-from", name != "all")):
+            if used:
                 raise InputError(option, "no --data", "the folder of the development recordings")
         return [], []
     if name not in ("all", "open", "few"):
@@ -213,10 +213,10 @@ def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path],
     if group is not None:
         outside, inside = hold_out_group(everything, group)
     else:
-        held = {one.path for one in read_packaged_list("holdout", data)}
-        outside = [one for one in everything if one.path not in held]
-        inside = [one for one in everything if one.path in held]
-    return [one.path for one in outside], [one.path for one in inside]
+        held_out = {entry.path for entry in read_packaged_list("holdout", data)}
+        outside = [entry for entry in everything if entry.path not in held_out]
+        inside = [entry for entry in everything if entry.path in held_out]
+    return [entry.path for entry in outside], [entry.path for entry in inside]
 
 
 def _recorded(
@@ -245,8 +245,8 @@ def _recorded(
 
 def _check_disjoint(files: list[Path], held_files: list[Path]) -> None:
     """Refuse a recording used for both training and validation: it would hide overfitting."""
-    kept = {path.resolve() for path in held_files}
-    both = [path for path in files if path.resolve() in kept]
+    held_out = {path.resolve() for path in held_files}
+    both = [path for path in files if path.resolve() in held_out]
     if both:
         raise InputError(
             "--validation", f"{both[0]}, which is also trained on", "other recordings",

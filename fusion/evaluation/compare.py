@@ -160,7 +160,7 @@ def compare(
 
 
 def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:
-    """Compute the figures of one track; null without truth, or without covariance.
+    """Compute the figures of one track; None where ground truth or covariance is missing.
 
     Args:
         track: track to measure.

@@ -1,4 +1,4 @@
-"""Comparison of a recording with a model's training data and predicted direction."""
+"""Familiarity of a recording's motion to a model, and direction of the model's displacements."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Familiarity:
 
     @property
     def is_unfamiliar(self) -> bool:
-        """Whether so much of the recording lies outside that the track deserves less trust."""
+        """Whether too many windows lie outside for the track to be trusted fully."""
         return self.outside is not None and self.outside > UNFAMILIAR_SHARE
 
     def as_dict(self) -> dict[str, object]:
@@ -67,14 +67,14 @@ class Familiarity:
 
     def _direction_lines(self) -> list[str]:
         turn, sigma = self.direction.turn, self.direction.sigma
-        known = f"{math.degrees(turn):.0f} (+-{math.degrees(sigma):.0f}) degrees"
+        difference = f"{math.degrees(turn):.0f} (+-{math.degrees(sigma):.0f}) degrees"
         if abs(turn) > max(_TURNED, 3.0 * sigma):
             return [
-                f"! the network's direction differs from the accelerometer's by {known}: its "
+                f"! the network's direction differs from the accelerometer's by {difference}: its "
                 "track is rotated by this angle, and fusion suffers; use other weights"
             ]
         if sigma < _VAGUE:
-            return [f"  the network's direction matches the accelerometer's: off by {known}"]
+            return [f"  the network's direction matches the accelerometer's: off by {difference}"]
         return []
 
     def _motion_lines(self) -> list[str]:
@@ -115,13 +115,13 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     ]
     observed = sum(map(direction, streams, predicted), Direction())
     speeds = np.linalg.norm(np.concatenate(predicted)[:, :2], axis=1) / WINDOW_SECONDS
-    found = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
+    medians = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))
     rates = np.concatenate([step_rates(stream.imu_N) for stream in streams])
     if len(rates):
-        found["step_rate"] = float(np.median(rates))
-    found["speed"] = float(np.median(speeds))
-    known = model.card.known_motion
-    if known is None:
-        return Familiarity(None, found, {}, observed)
-    outside = float(np.mean(known.novelty(windows) > 1.0))
-    return Familiarity(outside, found, dict(known.ranges), observed)
+        medians["step_rate"] = float(np.median(rates))
+    medians["speed"] = float(np.median(speeds))
+    training = model.card.known_motion
+    if training is None:
+        return Familiarity(None, medians, {}, observed)
+    outside = float(np.mean(training.novelty(windows) > 1.0))
+    return Familiarity(outside, medians, dict(training.ranges), observed)

@@ -27,7 +27,7 @@ _COLOURS = (
 )  # fmt: skip
 _STYLES = ("-", "--", ":")
 _MARKERS = "osD^vP"
-_AGAINST = "R-ResNet"
+_BASELINE = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> list[Path]:
@@ -83,9 +83,9 @@ def _distributions(table: NetworkTable) -> Figure:
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, network in enumerate(table.parameters):
             values = table.values(network, "network_true_attitude", metric)
-            at, share = _steps(values[np.isfinite(values)])
+            error, share = _steps(values[np.isfinite(values)])
             axes.plot(
-                at, share, _STYLES[k % 3], drawstyle="steps-post", color=_colour(k), lw=1.6,
+                error, share, _STYLES[k % 3], drawstyle="steps-post", color=_colour(k), lw=1.6,
                 label=network,
             )  # fmt: skip
         axes.set(xlabel=title, ylim=(0.0, 1.02))
@@ -137,9 +137,9 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     length = sample.truth.path_length()
     axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label=f"truth, {length:.0f} m")
     names = list(sample.tracks)
-    if _AGAINST in names:
-        ours = [name for name in names if name.startswith("StarIO")]
-        names = [_AGAINST, *(ours or [n for n in names if n != _AGAINST])]
+    if _BASELINE in names:
+        stario = [name for name in names if name.startswith("StarIO")]
+        names = [_BASELINE, *(stario or [n for n in names if n != _BASELINE])]
     for name in names[:4]:
         track, colour = sample.tracks[name].position_W, colours[name]
         ate, rte = sample.errors[name]

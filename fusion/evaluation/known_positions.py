@@ -23,11 +23,11 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     Returns:
         Root mean square [m], NaN if fewer than `LEAST` lie within the track; and their number.
     """
-    shown = placed(track, known)
-    if shown is None or len(shown) < LEAST:
-        return float("nan"), 0 if shown is None else len(shown)
-    away = shown.position_W - _track_at(track, shown.time)
-    return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), len(shown)
+    fitted = placed(track, known)
+    if fitted is None or len(fitted) < LEAST:
+        return float("nan"), 0 if fitted is None else len(fitted)
+    error = fitted.position_W - _track_at(track, fitted.time)
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), len(fitted)
 
 
 def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
@@ -47,9 +47,11 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
         return None
-    ours = _track_at(track, time)
-    moved = fit_yaw_and_position(truth[:, 0] + 1j * truth[:, 1], ours[:, 0] + 1j * ours[:, 1])
-    return PositionTrack(time, np.column_stack([moved.real, moved.imag]), known.kind)
+    estimated = _track_at(track, time)
+    fitted = fit_yaw_and_position(
+        truth[:, 0] + 1j * truth[:, 1], estimated[:, 0] + 1j * estimated[:, 1]
+    )
+    return PositionTrack(time, np.column_stack([fitted.real, fitted.imag]), known.kind)
 
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:
@@ -58,7 +60,7 @@ def _track_at(track: Track, time: FloatArray) -> FloatArray:
 
 
 def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None:
-    """Return known positions to draw next to a track, as `placed`; None with a true track."""
+    """Return the known positions as `placed`, to draw next to a track; None with true poses."""
     if sequence.truth is not None or sequence.positions is None:
         return None
     return placed(track, sequence.positions)
@@ -67,7 +69,7 @@ def shown_positions(sequence: ImuSequence, track: Track) -> PositionTrack | None
 def position_error_words(track: Track, known: PositionTrack) -> str:
     """Return the error at the known positions in words."""
     error, count = position_error(track, known)
-    of = f"{count} of {int(known.valid.sum())} {known.kind} lie within the track"
+    coverage = f"{count} of {int(known.valid.sum())} {known.kind} lie within the track"
     if np.isnan(error):
-        return f"{of}: too few to compare with"
-    return f"{of}: {error:.2f} m rms from them, after a fit of yaw and position"
+        return f"{coverage}: too few to compare with"
+    return f"{coverage}: {error:.2f} m rms from them, after a fit of yaw and position"

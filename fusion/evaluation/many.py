@@ -49,7 +49,7 @@ def compare_recordings(
     """
     done = 0
 
-    def within(share: float) -> None:
+    def report_share(share: float) -> None:
         progress((done + share) / len(paths))
 
     work = partial(
@@ -59,12 +59,12 @@ def compare_recordings(
         read=read,
         fixes=fixes,
         truth_needed=truth_needed,
-        progress=within if jobs == 1 else _unseen,
+        progress=report_share if jobs == 1 else _ignore_progress,
     )
     names: set[str] = set()
     for outcome in each(work, paths, jobs):
         done += 1
-        within(0.0)
+        report_share(0.0)
         if isinstance(outcome, Comparison):
             name = distinct_name(outcome.sequence.name, names)
             outcome = replace(outcome, sequence=replace(outcome.sequence, name=name))
@@ -102,5 +102,5 @@ def _loaded(name: str) -> DisplacementModel:
     return load_model(name)
 
 
-def _unseen(share: float) -> None:
-    """Ignore progress made in another process."""
+def _ignore_progress(share: float) -> None:
+    """Ignore progress within a recording in another process."""

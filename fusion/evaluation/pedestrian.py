@@ -38,10 +38,10 @@ NAME = "pdr"
 _STEP_BAND = (0.8, 3.0)
 """Frequency band of steps [Hz]; strides and sideways sway are below, impacts above."""
 
-_LEAST_PROMINENCE = 0.6
+_MIN_PROMINENCE = 0.6
 """Minimum prominence of a peak that counts as a step [m/s^2]."""
 
-_SHORTEST_STEP, _LONGEST_STEP = 0.25, 1.5
+_MIN_STEP_SECONDS, _MAX_STEP_SECONDS = 0.25, 1.5
 """Minimum and maximum time between steps [s]; a longer one is a pause."""
 
 _AXIS_SECONDS = 5.0
@@ -79,11 +79,11 @@ class PedestrianDeadReckoning:
 
     def predictions(self, prepared: Prepared) -> list[Predictions]:
         """Return predictions for each piece of a recording, in N."""
-        return [_answers(piece.stream) for piece in prepared.pieces]
+        return [_predictions(piece.stream) for piece in prepared.pieces]
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:
-    """Compute a recording's track, levelled from the IMU; gaps keep its position and heading.
+    """Compute a recording's track, levelled from the IMU; position and heading stay across gaps.
 
     Raises:
         InputError: there is no unbroken stretch of 2 s, or the rate is not accepted.
@@ -92,16 +92,16 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
-    places, attitudes, end, facing = [], [], 0j, 0j
+    paths, attitudes, end, facing = [], [], 0j, 0j
     for stream in streams:
         faces = stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1]
         # Each has its own initial yaw. The rotation during a gap is unknown and taken as zero.
         turn = float(np.angle(facing * np.conj(faces[0])))
-        place = end + np.exp(1j * turn) * pedestrian_path(stream)
-        places.append(place[::TICK_SAMPLES])
+        path = end + np.exp(1j * turn) * pedestrian_path(stream)
+        paths.append(path[::TICK_SAMPLES])
         attitudes.append(about_z(turn) * Rotation.from_matrix(stream.R_NB))
-        end, facing = place[-1], np.exp(1j * turn) * faces[-1]
-    xy = np.concatenate(places)
+        end, facing = path[-1], np.exp(1j * turn) * faces[-1]
+    xy = np.concatenate(paths)
     trajectory = Trajectory(
         time=np.concatenate([stream.ticks for stream in streams]),
         position_W=np.stack([xy.real, xy.imag, np.zeros(len(xy))], axis=1),
@@ -116,10 +116,10 @@ def steps_of(stream: LevelledStream) -> Steps:
     accel_N = sosfiltfilt(band, stream.imu_N[:, 3:].astype(np.float64), axis=0)
     vertical = accel_N[:, 2]
     peaks, _ = find_peaks(
-        vertical, prominence=_LEAST_PROMINENCE, distance=round(_SHORTEST_STEP * WINDOW_RATE)
+        vertical, prominence=_MIN_PROMINENCE, distance=round(_MIN_STEP_SECONDS * WINDOW_RATE)
     )
-    whole = np.diff(peaks) <= _LONGEST_STEP * WINDOW_RATE
-    begin, end = peaks[:-1][whole], peaks[1:][whole]
+    regular = np.diff(peaks) <= _MAX_STEP_SECONDS * WINDOW_RATE
+    begin, end = peaks[:-1][regular], peaks[1:][regular]
     spread = np.array([np.ptp(vertical[a:b]) for a, b in zip(begin, end, strict=True)])
     heading = _unit(stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1])
     forward_H = _forward(accel_N[:, 0] + 1j * accel_N[:, 1], vertical, heading)
@@ -131,8 +131,8 @@ def pedestrian_path(stream: LevelledStream, constant: float = WEINBERG_CONSTANT)
     """Return the horizontal position x + iy (N,) [m] in N at each sample, 0 at the first."""
     steps = steps_of(stream)
     speed = np.zeros(len(stream), dtype=complex)
-    moved = steps.lengths(constant) * steps.direction_N
-    for begin, end, step in zip(steps.begin, steps.end, moved, strict=True):
+    displacements = steps.lengths(constant) * steps.direction_N
+    for begin, end, step in zip(steps.begin, steps.end, displacements, strict=True):
         speed[begin:end] = step / (end - begin)
     return np.concatenate([[0.0], np.cumsum(speed)[:-1]])
 
@@ -147,13 +147,13 @@ def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> C
     return np.asarray(np.where((np.conj(axis) * lagging).real < 0.0, -axis, axis))
 
 
-def _answers(stream: LevelledStream) -> Predictions:
+def _predictions(stream: LevelledStream) -> Predictions:
     track = pedestrian_path(stream)
     # The window that begins at the last tick ends one sample after the stretch.
     at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
     count = stream.window_count
-    moved = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
-    displacement = np.stack([moved.real, moved.imag, np.zeros(count)], axis=1)
+    displacement_xy = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
+    displacement = np.stack([displacement_xy.real, displacement_xy.imag, np.zeros(count)], axis=1)
     return Predictions(displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
 
 

@@ -51,8 +51,10 @@ def write_run(
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    filtered = track.innovations
-    return written + _figures(folder, name, {backend: aligned}, truth, filtered, config, known)
+    filter_innovations = track.innovations
+    return written + _figures(
+        folder, name, {backend: aligned}, truth, filter_innovations, config, known
+    )
 
 
 def write_comparison(
@@ -101,8 +103,10 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
         written.append(inner / "truth.tum")
     filter_track = comparison.tracks["ekf"]
     known = shown_positions(comparison.sequence, filter_track)
-    filtered = filter_track.innovations
-    return written + _figures(inner, name, comparison.aligned(), truth, filtered, config, known)
+    filter_innovations = filter_track.innovations
+    return written + _figures(
+        inner, name, comparison.aligned(), truth, filter_innovations, config, known
+    )
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
@@ -144,7 +148,7 @@ def _figures(
     name: str,
     tracks: dict[str, Trajectory],
     truth: Trajectory | None,
-    filtered: Innovations | None,
+    filter_innovations: Innovations | None,
     config: NavigatorConfig,
     known: PositionTrack | None,
 ) -> list[Path]:
@@ -152,14 +156,14 @@ def _figures(
     if truth is not None:
         shown = {k: v for k, v in tracks.items() if k != "inertial"}
         figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")
-    if filtered is not None and len(filtered.time):
+    if filter_innovations is not None and len(filter_innovations.time):
         figures["innovations.png"] = innovations(
-            filtered.time,
-            filtered.residual_W,
-            filtered.sigma,
-            filtered.nis,
+            filter_innovations.time,
+            filter_innovations.residual_W,
+            filter_innovations.sigma,
+            filter_innovations.nis,
             3,
-            filtered.gated,
+            filter_innovations.gated,
             title=f"{name}: innovations",
             unit="m",
         )

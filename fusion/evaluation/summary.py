@@ -55,7 +55,7 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
             for metric in metrics
-            if len(values := _known(recordings, track, metric))
+            if len(values := _known_values(recordings, track, metric))
         }
         for track in TRACKS
     }
@@ -65,9 +65,9 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 def summary_table(recordings: Sequence[Scores]) -> str:
     """Return the summary as text: horizontal ATE of each track, consistency of the back ends."""
     rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
-    known = [_known(recordings, track, metric) for track, metric, _ in _COLUMNS]
+    columns = [_known_values(recordings, track, metric) for track, metric, _ in _COLUMNS]
     for name, over in (("median", np.median), ("mean", np.mean)):
-        rows.append((name, [float(over(values)) if len(values) else None for values in known]))
+        rows.append((name, [float(over(values)) if len(values) else None for values in columns]))
     cells = [[name, *(figure(value, ".2f") for value in row)] for name, row in rows]
     lines = aligned([["", *(title for _, _, title in _COLUMNS)], *cells])
     lines.append(f"ATE in m: {METRIC_WORDS['ate_m']}; NIS: {METRIC_WORDS['nis']}; ")
@@ -75,7 +75,7 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     return "\n".join(lines)
 
 
-def _known(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
+def _known_values(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
     values = [_value(scores, track, metric) for scores in recordings]
     return np.array([value for value in values if value is not None])
 

@@ -107,7 +107,7 @@ class NetworkTable:
     def mean_and_spread(
         self, network: str, protocol: str, metric: str, recording: str = ""
     ) -> tuple[float, float | None]:
-        """Return the mean over recordings, or of one, and its deviation over the weights."""
+        """Return the mean over recordings, or of one, and its standard deviation over weights."""
         chosen = [
             e
             for e in self.entries
@@ -138,7 +138,7 @@ def compare_networks(
     """Compute the tracks of every network on every recording.
 
     Args:
-        paths: recordings with truth.
+        paths: recordings with true poses.
         models: models under distinct names.
         config: configuration of the filter.
         read: function that reads a path; must be picklable.
@@ -185,7 +185,7 @@ def table_text(table: NetworkTable) -> str:
 
 def table_dict(table: NetworkTable) -> dict[str, object]:
     """Return the table as plain values."""
-    over = {
+    means = {
         network: {
             protocol: {
                 metric: dict(
@@ -203,7 +203,7 @@ def table_dict(table: NetworkTable) -> dict[str, object]:
     }
     return {
         "networks": table.parameters,
-        "over_recordings": over,
+        "over_recordings": means,
         "entries": [asdict(entry) for entry in table.entries],
         "conventions": _words(table),
     }
@@ -231,22 +231,22 @@ def _tracks(
 ) -> tuple[list[Entry], Sample]:
     sequence = read(path)
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     entries: list[Entry] = []
     shown: dict[str, Trajectory] = {}
     shown_errors: dict[str, tuple[float, float]] = {}
     for weights, model in models:
-        for protocol, track in _of_protocols(model, sequence, config):
-            found = evaluate_track(track, sequence.truth, convention=convention)
-            errors = found.ate_m, found.rte_m, found.pde
+        for protocol, track in _protocol_tracks(model, sequence, config):
+            result = evaluate_track(track, sequence.truth, convention=convention)
+            errors = result.ate_m, result.rte_m, result.pde
             entries.append(Entry(sequence.name, model.name, weights, protocol, *errors))
             if protocol == "network_true_attitude":
                 shown.setdefault(model.name, align(track, sequence.truth, "first"))
-                shown_errors.setdefault(model.name, (found.ate_m, found.rte_m))
+                shown_errors.setdefault(model.name, (result.ate_m, result.rte_m))
     return entries, Sample(sequence.name, sequence.truth, shown, shown_errors)
 
 
-def _of_protocols(
+def _protocol_tracks(
     model: DisplacementModel, sequence: ImuSequence, config: NavigatorConfig
 ) -> Iterator[tuple[str, Trajectory]]:
     navigator = Navigator(model, config)

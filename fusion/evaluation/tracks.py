@@ -71,13 +71,13 @@ def network_track(preprocessed: PreprocessedRecording) -> Track:
     assert start is not None  # observe() rejects recordings without one
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
     attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
-    known = [
+    windows = [
         (e, m[0])
         for e, m in zip(preprocessed.intervals, preprocessed.measurements, strict=True)
         if m
     ]
-    middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in known])
-    velocity = np.array([d for _, d in known]) / WINDOW_SECONDS
+    middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in windows])
+    velocity = np.array([d for _, d in windows]) / WINDOW_SECONDS
     trajectory = _chained(time, Rotation.from_matrix(attitude), middle, velocity)
     return Track(
         trajectory,
@@ -95,15 +95,17 @@ def network_track_true_attitude(
     displacements of those seconds would measure the gap and not the network.
 
     Raises:
-        InputError: the recording has no truth, or no second with valid truth.
+        InputError: the recording has no true poses, or no second of valid ones.
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
     began = perf_counter()
-    truth = _carried_through_gaps(sequence, sequence.truth)
+    truth = _propagated_through_gaps(sequence, sequence.truth)
     time, windows, heading = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
-    displacement = _along(model, time, windows, heading, config.filter.window_updates)
+    displacement = _predicted_displacements(
+        model, time, windows, heading, config.filter.window_updates
+    )
     done = perf_counter()
     middle = time + 0.5 * WINDOW_SECONDS
     ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
@@ -116,7 +118,7 @@ def network_track_true_attitude(
     )
 
 
-def _along(
+def _predicted_displacements(
     model: Predictor,
     time: FloatArray,
     windows: NDArray[np.float32],
@@ -135,13 +137,13 @@ def _along(
     return np.concatenate(displacements)
 
 
-def _carried_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
-    """Return poses at the samples from the first to the last true one, attitude without gaps."""
+def _propagated_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:
+    """Return poses at the samples within the truth, with the attitude propagated through gaps."""
     time, gyro, _ = clean_samples(sequence)
-    known = np.flatnonzero(truth.covers(time))
-    if len(known) == 0:
+    covered = np.flatnonzero(truth.covers(time))
+    if len(covered) == 0:
         raise InputError(f"{sequence.name}: truth", "no valid pose", "at least one second of them")
-    inside = slice(known[0], known[-1] + 1)
+    inside = slice(covered[0], covered[-1] + 1)
     time, gyro = time[inside], gyro[inside]
     poses = truth.at(time)
     R_WB = poses.attitude_WB.as_matrix()
@@ -171,7 +173,7 @@ def _true_windows(
 def _chained(
     time: FloatArray, attitude: Rotation, middle: FloatArray, velocity: FloatArray
 ) -> Trajectory:
-    """Integrate velocities known at the windows' middles to positions at `time`."""
+    """Return the trajectory at `time` from velocities at the windows' middles."""
     at_time = interpolated(time, middle, velocity)
     steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from stario.fusion.filter.engine import UpdateResult
 
 TARGET_NIS = 0.3
-"""Target for the median NIS per degree of freedom: the network's errors are similar for seconds, so
-that consistent innovations are smaller than single errors."""
+"""Target for the median NIS per degree of freedom: the network's errors are correlated over
+seconds, so consistent innovations are smaller than single errors."""
 
 GAIN, FIRST_GAIN = 0.05, 0.2
-"""Step of the logarithm per displacement: in the long run, and at first, when nothing is known."""
+"""Step of the logarithm per displacement: in the long run, and for the first displacement."""
 
 MAX_FACTOR = 30.0
 """Maximum factor: the accelerometer then rules out little more than jumps."""
@@ -52,6 +52,6 @@ class AccelNoiseScale:
             return self
         ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
-        moved = self.log_factor + self.gain * excess
+        log_factor = self.log_factor + self.gain * excess
         gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
-        return AccelNoiseScale(min(max(moved, 0.0), math.log(MAX_FACTOR)), gain)
+        return AccelNoiseScale(min(max(log_factor, 0.0), math.log(MAX_FACTOR)), gain)

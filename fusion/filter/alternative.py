@@ -38,7 +38,8 @@ class AlternativeHypothesis:
     Attributes:
         ekf: state of the filter under this hypothesis.
         start_time: time of the first outlier [s].
-        exclusive_fits: displacements that fitted only it, since one fitted only the filter.
+        exclusive_fits: number of displacements that fitted only the alternative since the last one
+            that fitted only the filter.
         shared_fits: number of latest displacements in a row that fitted both.
     """
 
@@ -48,10 +49,10 @@ class AlternativeHypothesis:
     shared_fits: int = 0
 
     def updated(self, fits: bool, fits_filter: bool) -> AlternativeHypothesis:
-        """Return the hypothesis after a displacement that fits it, the filter, both or neither."""
+        """Return the hypothesis after counting a displacement by what it fits."""
         if not fits:
-            alone = self.exclusive_fits if not fits_filter else 0
-            return changed(self, exclusive_fits=alone, shared_fits=0)
+            exclusive = self.exclusive_fits if not fits_filter else 0
+            return changed(self, exclusive_fits=exclusive, shared_fits=0)
         return changed(
             self,
             exclusive_fits=self.exclusive_fits + (not fits_filter),
@@ -60,17 +61,17 @@ class AlternativeHypothesis:
 
     @property
     def should_replace(self) -> bool:
-        """Whether it should replace the filter's state."""
+        """Whether the alternative should replace the filter's state."""
         return self.exclusive_fits >= _FITS_TO_REPLACE
 
     @property
     def is_obsolete(self) -> bool:
-        """Whether it can be dropped."""
+        """Whether the alternative can be dropped."""
         return self.shared_fits >= _FITS_TO_DROP or self.ekf.time - self.start_time > _MAX_SECONDS
 
 
 class HypothesisPair:
-    """A filter and, while there is one, the alternative hypothesis.
+    """A filter and its alternative hypothesis, if there is one.
 
     Args:
         ekf: the filter; its state is set aside while the alternative is updated.

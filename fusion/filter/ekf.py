@@ -63,8 +63,8 @@ class StateCloningEkf(ErrorStateEngine):
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
-        nothing = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
-        self.state = EkfState.initial(nothing, slots)
+        undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
+        self.state = EkfState.initial(undefined, slots)
         super().__init__(CORE + CLONE * slots + 1)
         self.gravity = gravity
         self.slots = slots
@@ -259,7 +259,7 @@ class StateCloningEkf(ErrorStateEngine):
     def update_bearing(
         self, m_B: FloatArray, variance: float, gate: float | None = None
     ) -> UpdateResult:
-        """Update with the bearing of a magnetic field against the state's azimuth.
+        """Update with the bearing of a magnetic field, which measures the state's azimuth.
 
         Args:
             m_B: (3,) measured field [uT]; the state must have a field (`magnetic.first_field`).

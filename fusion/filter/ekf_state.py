@@ -32,7 +32,7 @@ right-invariant error they multiply the attitude error, which leaves no digits f
 they are map coordinates."""
 
 _CHUNK = 2000
-"""Estimates converted at a time: an hour's at once would take hundreds of megabytes more."""
+"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +165,8 @@ class EkfState:
         """
         time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
         if time is None:
-            taken = [k for k, known in enumerate(self.clone_times) if known is not None]
-            raise InputError("slot", repr(slot), f"a slot that holds a clone: {taken}")
+            occupied = [k for k, t in enumerate(self.clone_times) if t is not None]
+            raise InputError("slot", repr(slot), f"a slot that holds a clone: {occupied}")
         return time
 
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
@@ -205,9 +205,9 @@ class EkfState:
             R: (3, 3) rotation about the vertical.
             shift: (3,) [m].
         """
-        moved = R @ self.origin_W + shift
-        origin_W = moved if np.linalg.norm(moved) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
-        shift = moved - origin_W  # the part that remains for the poses
+        new_origin = R @ self.origin_W + shift
+        origin_W = new_origin if np.linalg.norm(new_origin) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
+        shift = new_origin - origin_W  # the part that remains for the poses
         X = R @ self.X
         X[:, :, 4] += shift
         A = np.eye(len(self.P))
@@ -257,9 +257,9 @@ class EkfState:
         return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
 
     def _poses(self) -> list[tuple[int, int]]:
-        """First rows of theta and rho_p of the current pose and of every clone."""
-        taken = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
-        return [(0, 6), *((first, first + 3) for first in taken)]
+        """Return the first rows of theta and rho_p of the current pose and of every clone."""
+        rows = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
+        return [(0, 6), *((first, first + 3) for first in rows)]
 
 
 def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:

@@ -31,7 +31,7 @@ class UpdateResult(NamedTuple):
 
     Attributes:
         nis: normalised innovation squared under the given covariance, before any inflation;
-            not-a-number if it could not be computed.
+            NaN if it could not be computed.
         dof: dimension of the measurement, the expectation of `nis`.
         accepted: False if the state was left unchanged.
         scale: factor by which the measurement covariance was inflated (1: not gated).
@@ -145,7 +145,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         HPH: FloatArray,
         whitener: FloatArray,
     ) -> FloatArray:
-        """P - K S K^T as P - W^T W with W = L^-1 H P: symmetric, of the measurement's rank."""
+        """Return P - K S K^T, computed as P - W^T W with W = L^-1 H P, which is symmetric."""
         W = whitener @ HP
         self.R, self.S = covariance, HPH + covariance
         self.SI = whitener.T @ whitener
@@ -161,7 +161,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         return P
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> FloatArray:
-        """(I - K H) P (I - K H)^T + K R K^T: slower, but without differences of large numbers."""
+        """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
         A = np.eye(len(self.P))
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H
@@ -177,7 +177,7 @@ def _sum(terms: list[FloatArray]) -> FloatArray:
 
 
 def _whitener(covariance: FloatArray) -> FloatArray:
-    """Inverse of the lower Cholesky factor; not-a-number if there is none."""
+    """Return the inverse of the lower Cholesky factor; NaN if there is none."""
     factor, failed = dpotrf(covariance, lower=1)
     if failed:
         return np.full_like(covariance, math.nan)

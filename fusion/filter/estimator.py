@@ -109,20 +109,20 @@ class Estimator:
         factor = self._displacements.accel_noise.factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
-        self._remember(interval, displacement, fixes)
+        self._record_step(interval, displacement, fixes)
         if interval.gap or fixes:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
-        at_rest = self._update_zero_velocity(interval)
-        # Zero velocity beats a network trained on walking, which predicts 1 cm/s at rest.
-        offered = displacement if at_rest is None else None
-        taken = None if offered is None else self._update_displacement(interval, *offered)
+        zupt = self._update_zero_velocity(interval)
+        # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
+        offered = displacement if zupt is None else None
+        applied = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self._bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
-        return IntervalMeasurements(interval, offered, taken, bearing, at_rest, accepted, segment)
+        return IntervalMeasurements(interval, offered, applied, bearing, zupt, accepted, segment)
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Apply a fix from the past; return None if it is more than a window late.
@@ -146,15 +146,15 @@ class Estimator:
             accepted += self.step(step.interval, step.displacement, fixes).fixes
         return accepted
 
-    def _remember(
+    def _record_step(
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix]
     ) -> None:
         if self._streaming:
             before = changed(self.state, history=())
             step = Step(before, interval.without_window(), displacement, tuple(fixes))
             oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
-            kept = (s for s in self._history if s.interval.stop >= oldest)
-            self._history = (*kept, step)
+            recent = (s for s in self._history if s.interval.stop >= oldest)
+            self._history = (*recent, step)
 
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
@@ -162,7 +162,7 @@ class Estimator:
         """Propagate through the fixes; return the segment (None if split) and the fixes applied."""
         self.in_gap = interval.gap
         if interval.gap:
-            self._forget_window()
+            self._release_clones()
         if interval.restart is not None:
             # Fixes within a long gap are useless: nothing links them to the track after it.
             for _ in fixes:
@@ -178,7 +178,7 @@ class Estimator:
         for piece, due in split_at_fixes(interval, fixes):
             if piece is not None:
                 self._propagate_piece(piece, interval.start)
-            accepted += [taken for fix in due if (taken := self._update_fix(fix)) is not None]
+            accepted += [applied for fix in due if (applied := self._update_fix(fix)) is not None]
         return None, accepted
 
     def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:
@@ -237,7 +237,7 @@ class Estimator:
         return (d_N, result.scale * covariance_N) if result.accepted else None
 
     def _update_north(self) -> list[Accepted]:
-        """Apply the magnetic field's yaw once, if a declination is set and yaw is still unknown."""
+        """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""
         declination = self._config.filter.declination
         if declination is None or self._map_frame.state.oriented:
             return []
@@ -273,7 +273,7 @@ class Estimator:
             self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
         )
 
-    def _forget_window(self) -> None:
+    def _release_clones(self) -> None:
         """Release the clones: no displacement spans a gap."""
         for slot in self._clones:
             self.ekf.release(slot)
@@ -283,7 +283,7 @@ class Estimator:
 
     @property
     def state(self) -> EstimatorState:
-        """Everything that varies except a recording's innovations; assign one to restore it."""
+        """All that varies except a recording's innovations; assign an earlier one to restore it."""
         return EstimatorState(
             self.ekf.state,
             self._clones,
@@ -358,7 +358,7 @@ class Estimator:
         return innovations_from_rows(self._innovations)
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
-        """Return the report so far, with the sigmas of another estimator's state if given."""
+        """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
         if self._config.filter.declination is not None and not self._map_frame.state.oriented:
             note = "north could not be determined: the track starts with yaw zero"

@@ -30,10 +30,10 @@ class IntervalMeasurements(NamedTuple):
     displacement: Displacement | None
     """The same with its inflated covariance; None if it was rejected."""
     bearing: tuple[EkfState, EkfState] | None
-    """Filter state before and after a bearing of the magnetic field; None if there was none, and
-    for recordings, all of whose measurements stay in memory."""
+    """Filter state before and after the update with a bearing; None if there was none, and for
+    recordings, whose measurements all stay in memory."""
     zero_velocity: ZeroVelocity | None
-    """None if the device moved or the measurement was rejected."""
+    """Measurement at rest; None if the device moved or the measurement was rejected."""
     fixes: list[Accepted]
     """Fixes applied, in order."""
     segment: Segment | None
@@ -63,11 +63,11 @@ class EstimatorState:
         outlier_share: fraction of outliers among recent displacements.
         bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
         accel_noise: estimated scale of the accelerometer's noise.
-        alternative: state of the filter without the outliers of the last seconds; None if none.
+        alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
         in_gap: whether the last interval had no samples.
         released: newest pose that left the window, corrected by the whole window.
-        history: steps of the last second, of a stream.
+        history: steps of the last second of a stream; empty for a recording.
     """
 
     ekf: EkfState

@@ -33,7 +33,7 @@ class FrameTransform:
         R: (3, 3) rotation about the vertical.
         shift: (3,) translation [m].
         pivot: (3,) point of the new frame that an error of the turn leaves in place [m].
-        placed: whether it is the shift by a position fix, not a turn.
+        placed: whether it is a shift by a position fix rather than a turn.
         since: states before this time [s] are not transformed: they are in the map already.
         until: states from this time [s] on are not transformed either.
         yaw_sigma: standard deviation of the turn [rad].
@@ -109,18 +109,18 @@ class FrameTransform:
 
 
 def _turn_moments(variance: float) -> tuple[float, float, float]:
-    """Second moments of a turn by a normally distributed angle t, also of large variance.
+    """Return second moments of a turn by a normally distributed angle t of any variance.
 
     Returns:
-        E sin^2 t, E (1 - cos t)^2 and E t sin t: variance across an arm of unit length, along it,
-        and covariance of across with t. For a small variance: the variance, 0 and the variance.
+        E sin^2 t, E (1 - cos t)^2 and E t sin t: variances across and along an arm of unit length,
+        and covariance of t with the former. For a small variance: the variance, 0, the variance.
     """
     cos_1, cos_2 = math.exp(-0.5 * variance), math.exp(-2.0 * variance)
     return 0.5 * (1.0 - cos_2), 1.0 - 2.0 * cos_1 + 0.5 * (1.0 + cos_2), variance * cos_1
 
 
 def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> FloatArray:
-    """Covariance (15, 15) of a state due to a turn; velocity (3,) and arm (3,) from the pivot."""
+    """Return the covariance (15, 15) of a state due to a turn; the arm (3,) is from the pivot."""
     across, along, with_angle = _turn_moments(variance)
     columns = np.zeros((15, 2))  # columns: across and along
     columns[3:6, 0], columns[6:9, 0] = _E3_CROSS @ v_W, _E3_CROSS @ arm
@@ -133,7 +133,7 @@ def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> Float
 
 
 def to_final_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
-    """Return the states of a track, all in the frame in which the track ends."""
+    """Return the states of a track in its final frame."""
     for transform in transforms:
         states = [transform.state(state) for state in states]
     return states

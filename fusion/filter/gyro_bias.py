@@ -1,7 +1,7 @@
 """Width of the gyroscope bias's prior, adapted to what is known about the bias.
 
-README.md, "Noise and the gyroscope's bias". Most devices correct their bias to a thousandth of a
-radian per second, some to five, some not at all, and no single Gaussian fits all of them. The
+README.md, "Noise and the gyroscope's bias". Most devices correct their bias to 0.001 rad/s, some to
+0.005 rad/s and some not at all, and no single Gaussian fits all of them. The
 prior's width therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at
 which it could flip: wide while gravity has provided little information about the bias, narrow once
 the bias proves small, wide where it is large or where the data clearly put it outside the prior.
@@ -34,18 +34,19 @@ _SIGNIFICANT = 3.0
 
 _PRECISE_SIGMA = 5e-3
 """Sigma of the data's estimate above which it is ignored [rad/s]: it then comes from the network's
-displacements alone, whose errors are similar for long. Rest, gravity, fixes and the magnetic field
-are more precise."""
+displacements alone, whose errors stay correlated for long. Stillness, gravity, fixes and the
+magnetic field are more precise."""
 
 _WIDEST = 0.015
 """Maximum sigma to which the data widen the prior [rad/s]; a larger bias is uncorrected, which
 levelling detects sooner."""
 
-_REST_SIGMA = 2.5e-3
-"""Minimum sigma of the prior where rest measures the bias [rad/s]: a turning glide is not rest."""
+_STILLNESS_SIGMA = 2.5e-3
+"""Minimum sigma of the prior when a zero-velocity update measures the bias [rad/s]; small enough to
+reject a glide that turns."""
 
-_LONG_REST, _RAW_SIGMA = 30.0, 0.1
-"""Apparent rest of this length [s] is rest, although the gyroscope reads up to this [rad/s]:
+_LONG_STILLNESS, _RAW_SIGMA = 30.0, 0.1
+"""After apparent stillness has been rejected for this long [s], the minimum sigma is this [rad/s]:
 gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly for so long."""
 
 _TIME_TOLERANCE = 1e-6
@@ -64,7 +65,7 @@ class GyroBiasPrior:
         variance: current variance per axis [rad^2/s^2].
         uncorrected: largest bias so far in excess of what a correcting device leaves [rad/s].
         evidence: largest variance that the data have required so far [rad^2/s^2].
-        refused_seconds: for how long apparent rest has been rejected [s].
+        refused_seconds: duration for which apparent stillness has been rejected [s].
     """
 
     sigma: float
@@ -75,7 +76,7 @@ class GyroBiasPrior:
 
     @classmethod
     def first(cls, sigma: float) -> GyroBiasPrior:
-        """Create the prior used before anything is known."""
+        """Create the initial prior."""
         return cls(sigma, sigma**2)
 
     def before_levelling(self) -> GyroBiasPrior:
@@ -90,10 +91,10 @@ class GyroBiasPrior:
         P: FloatArray,
         wander: float,
     ) -> GyroBiasPrior:
-        """Return what the prior should now be, to replace this one in the filter.
+        """Return the prior that should replace this one in the filter.
 
         Args:
-            levelled: size of the bias as far as gravity determines it [rad/s].
+            levelled: magnitude of the bias as far as gravity determines it [rad/s].
             levelled_sigma: its standard deviation per level axis [rad/s].
             b_g: (3,) bias as estimated by the filter [rad/s].
             P: (3, 3) covariance of `b_g` [rad^2/s^2].
@@ -101,9 +102,9 @@ class GyroBiasPrior:
         """
         uncorrected = max(self.uncorrected, levelled - _MAX_CORRECTED_BIAS)
         evidence = max(self.evidence, min(self._variance_from_data(b_g, P, wander), _WIDEST**2))
-        known = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
+        floor = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
         return changed(
-            self, variance=max(known, evidence), uncorrected=uncorrected, evidence=evidence
+            self, variance=max(floor, evidence), uncorrected=uncorrected, evidence=evidence
         )
 
     def _variance_from_data(self, b_g: FloatArray, P: FloatArray, wander: float) -> float:
@@ -125,7 +126,7 @@ class GyroBiasPrior:
 
 
 class AdaptiveBiasPrior:
-    """The bias's prior in a filter and its alternative, adapted to what is known.
+    """Adaptive prior of the bias in a filter and its alternative.
 
     Args:
         hypotheses: the filter and its alternative.
@@ -143,7 +144,7 @@ class AdaptiveBiasPrior:
     def begin(self) -> None:
         """Widen the prior for the time before gravity provides information."""
         if self._config.filter.adaptive:
-            self._exchange(self.prior.before_levelling())
+            self._replace_prior(self.prior.before_levelling())
 
     def update(self, interval: ImuInterval) -> None:
         """Adapt the prior after an interval to what gravity and the data show about the bias."""
@@ -155,30 +156,30 @@ class AdaptiveBiasPrior:
             return
         levelled = interval.levelled_bias, interval.levelled_bias_sigma
         s = self._hypotheses.ekf.state
-        self._exchange(
+        self._replace_prior(
             self.prior.updated(*levelled, s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander)
         )
 
     def widen_for_rest(self) -> None:
-        """Widen the prior before rest measures the bias."""
-        sigma = _REST_SIGMA if self.prior.refused_seconds < _LONG_REST else _RAW_SIGMA
-        self._exchange(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
+        """Widen the prior before a zero-velocity update measures the bias."""
+        sigma = _STILLNESS_SIGMA if self.prior.refused_seconds < _LONG_STILLNESS else _RAW_SIGMA
+        self._replace_prior(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
 
     def note_refused_rest(self, seconds: float) -> None:
-        """Add to the time of rejected apparent rest [s]; 0 resets it (accepted, or moving)."""
+        """Add to the time of rejected apparent stillness [s]; 0 resets it (accepted, or moving)."""
         refused_seconds = self.prior.refused_seconds + seconds if seconds else 0.0
         if refused_seconds != self.prior.refused_seconds:
             self.prior = changed(self.prior, refused_seconds=refused_seconds)
 
-    def _exchange(self, updated: GyroBiasPrior) -> None:
-        """Replace the prior as if the new one had been used from the start."""
+    def _replace_prior(self, updated: GyroBiasPrior) -> None:
+        """Replace the prior in both filters as if the new one had been used from the start."""
         old, new = self.prior.variance + self._wander, updated.variance + self._wander
         ekf = self._hypotheses.ekf
         self._hypotheses.apply_to_both(lambda: ekf.replace_gyro_bias_prior(old, new))
         self.prior = updated
 
     def _half_seconds(self, time: float) -> int:
-        """Whole half seconds since the start: the information about a bias changes no faster."""
+        """Return the whole half seconds since the start; the information changes no faster."""
         return math.floor(2.0 * (time - self._start) + _TIME_TOLERANCE)
 
     @property
@@ -191,19 +192,19 @@ class AdaptiveBiasPrior:
 def gained_bias_information(
     before: EkfState, after: EkfState
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return what an update revealed about the gyroscope's bias, whatever it measured.
+    """Return the information about the gyroscope's bias that an update of any kind has gained.
 
-    This is the information gained about the bias alone: E^-1 = P+^-1 - P-^-1 with the mean
-    E (P+^-1 b+ - P-^-1 b-), along the axis with the largest gain.
+    For the bias alone this is E^-1 = P+^-1 - P-^-1 with the mean E (P+^-1 b+ - P-^-1 b-), along the
+    axis with the largest gain.
 
     Returns:
         Bias (3,) [rad/s] and covariance (3, 3); None if nothing was gained.
     """
-    was, now = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
-    gained, axes = np.linalg.eigh(now - was)
-    gain, axis = float(gained[-1]), axes[:, -1]
-    if gain < _MIN_GAIN * float(np.trace(was)):
+    prior, posterior = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
+    eigenvalues, axes = np.linalg.eigh(posterior - prior)
+    gain, axis = float(eigenvalues[-1]), axes[:, -1]
+    if gain < _MIN_GAIN * float(np.trace(prior)):
         return None
-    value = float(axis @ (now @ after.b_g - was @ before.b_g)) / gain
+    value = float(axis @ (posterior @ after.b_g - prior @ before.b_g)) / gain
     covariance = np.outer(axis, axis) / gain + _VAGUE_SIGMA**2 * (np.eye(3) - np.outer(axis, axis))
     return value * axis, covariance

@@ -92,7 +92,7 @@ def initialise(
 def reinitialise(
     ekf: StateCloningEkf, interval: ImuInterval, start: Start, config: NavigatorConfig
 ) -> None:
-    """Restart after a long gap: tilt from gravity, speed and yaw unknown, within walking reach."""
+    """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
     f, s = config.filter, ekf.state
     P, seconds = s.plain_covariance, interval.stop - interval.start
     covariance = np.zeros_like(P)

@@ -22,9 +22,9 @@ class UpdateCounts:
         offered: number of network measurements.
         gated: number of these that were outliers, rejected or inflated.
         refused: numbers of these that were invalid, by reason.
-        fixes: fixes applied (of these gated), and rejected by reason.
-        zero_velocity: measurements at rest, applied and rejected likewise.
-        bearings: bearings of the magnetic field likewise, and whether it determined north.
+        fixes: numbers of fixes applied (of these gated), and refused by reason.
+        zero_velocity: numbers of measurements at rest applied, and refused by reason.
+        bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         nis_sum: sum of the NIS of all valid network measurements.
         nis_count: number of valid network measurements.
     """
@@ -60,8 +60,8 @@ class UpdateCounts:
 
     def add_zero_velocity(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more measurement at rest."""
-        what = "applied" if result.accepted else result.reason
-        return changed(self, zero_velocity=incremented(self.zero_velocity, what))
+        outcome = "applied" if result.accepted else result.reason
+        return changed(self, zero_velocity=incremented(self.zero_velocity, outcome))
 
     def add_bearing(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more bearing of the magnetic field."""
@@ -75,7 +75,7 @@ class UpdateCounts:
         return changed(self, bearings=incremented(self.bearings, "north"))
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
-        """Return the report: outcomes of samples and updates, and the state's sigmas."""
+        """Return the health report: outcomes of samples and updates, and the state's sigmas."""
         sigma = np.sqrt(np.diag(state.covariance))
         groups = {
             "tilt_rad": sigma[0:2],
@@ -124,5 +124,5 @@ def is_gated(result: UpdateResult) -> bool:
 
 
 def incremented(counts: Mapping[str, int], reason: str) -> dict[str, int]:
-    """Return the counts with one more of a reason."""
+    """Return the counts with that of a reason incremented."""
     return {**counts, reason: counts.get(reason, 0) + 1}

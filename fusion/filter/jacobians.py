@@ -53,7 +53,7 @@ def displacement_jacobian(
 
 
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
-    """Return that residual's Jacobian for the network's turn: e3 x d, d (3,) displacement [m]."""
+    """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
     return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
 
 
@@ -194,7 +194,7 @@ _BIAS_SWAP[12:15, 9:12] = np.eye(3)
 
 
 def _nav_transition(dt: float, gravity: float) -> FloatArray:
-    """Transition without its bias columns, with gravity (0, 0, -gravity) in W."""
+    """Return the transition without its bias columns, for gravity (0, 0, -gravity) in W."""
     transition = _IDENTITY.copy()
     g_dt, half_g_dt2 = gravity * dt, 0.5 * gravity * dt * dt
     transition[3, 1], transition[4, 0] = g_dt, -g_dt

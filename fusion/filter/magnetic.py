@@ -8,11 +8,11 @@ The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A com
 azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the gyroscope's
 vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
 much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
-or dip for the place has less weight, as does one that the device has propagated by its own
-gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. Only
-if a declination is given, the field determines north once, as a fix of yaw.
+or dip for the place has less weight, as does one that the device has extrapolated by its own
+gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. If a
+declination is given, and only then, the field determines north once, as a fix of yaw.
 
-The field varies slowly and its errors are similar for metres: two bearings a second suffice.
+The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _WANDER_PER_SPREAD = 2.0
 OxIOD, RIDI, KIPD and tyrex."""
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
-"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and of
-other changes."""
+"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and the
+duration of other changes."""
 
 HARD_IRON_SIGMA = 10.0
 """Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
@@ -80,11 +80,11 @@ _AVERAGING_COUNT = 120
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Initial spread, as in a building, and the number of bearings it counts as."""
 
-_HELD_FACTOR = 10.0
-"""Factor on the variance of a field that the device has propagated by its own gyroscope."""
+_EXTRAPOLATED_FACTOR = 10.0
+"""Factor on the variance of a field that the device has extrapolated by its own gyroscope."""
 
 _MIN_SPEED = 0.3
-"""Speed below which the spread is not updated [m/s]: in one spot the field is always quiet."""
+"""Speed below which the spread is not updated [m/s]: in one spot the field hardly varies."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class MagneticReference:
         count: number of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
-        spread: mean distance of size (fraction) and dip [rad] from their usual values in motion.
+        spread: mean deviation of size (fraction) and dip [rad] from their usual values in motion.
         moving_count: number of bearings averaged in `spread`.
         measured: size of the last measured field, including hard iron [uT].
     """
@@ -120,7 +120,7 @@ class MagneticReference:
         return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
 
     def is_held(self, measured: float) -> bool:
-        """Return whether a field of this size [uT] is the last one, propagated by the device."""
+        """Return whether a field of this size [uT] is the last one, extrapolated by the device."""
         return abs(measured - self.measured) < HELD_CHANGE * measured
 
     def is_due(self, time: float) -> bool:
@@ -139,11 +139,11 @@ class MagneticReference:
         count = self.count + 1
         if count == 1:
             return changed(self, time=time, count=1, size=size, dip=dip)
-        share = 1.0 / min(count, _AVERAGING_COUNT)
+        mean_gain = 1.0 / min(count, _AVERAGING_COUNT)
         size_clip = 2.0 * _SIZE_TOLERANCE * self.size
-        usual_size = self.size + share * min(max(size - self.size, -size_clip), size_clip)
+        usual_size = self.size + mean_gain * min(max(size - self.size, -size_clip), size_clip)
         dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
-        usual_dip = self.dip + share * dip_change
+        usual_dip = self.dip + mean_gain * dip_change
         means = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
         if not new_place:
             return means
@@ -186,7 +186,7 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
 
 
 def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """Return the state after the azimuth has wandered for a time at the current speed.
+    """Return the state with its azimuth propagated for a time at the current speed.
 
     Args:
         s: state before.
@@ -195,9 +195,9 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """
     assert s.field is not None  # set by `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
-    kept = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.P, s.first_field + 1, kept, sigma)
-    return changed(s, P=P, field=changed(s.field, wander=kept * s.field.wander))
+    correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
+    P = gauss_markov(s.P, s.first_field + 1, correlation, sigma)
+    return changed(s, P=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 
 def update_bearing(
@@ -222,11 +222,12 @@ def update_bearing(
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
-    held = reference.is_held(measured)
-    new_place = not held and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
+    extrapolated = reference.is_held(measured)
+    new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
-    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * (_HELD_FACTOR if held else 1.0)
+    factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
+    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * factor
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

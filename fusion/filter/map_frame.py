@@ -38,20 +38,20 @@ from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
 MAX_PRIOR_YAW_SIGMA = 0.5
-"""A first yaw with a sigma up to this [rad] is kept; a coarser one is left to the fixes."""
+"""A first yaw with a sigma up to this [rad] is kept; a coarser one is replaced by the fixes'."""
 
 MAX_YAW_SIGMA = 1.0
 """A yaw coarser than this [rad] does not determine the direction: it would make the filter
 overconfident in a wrong one."""
 
 MAX_POSITION_YAW_SIGMA = 0.3
-"""Two positions determine the yaw if its sigma is then at most this [rad]; half its square, which
-the linearisation neglects, is still far smaller (NEES of yaw 1.0 to 1.2 over 40 walks)."""
+"""Maximum sigma [rad] of a yaw that two positions determine; half its square, which the
+linearisation neglects, is still far smaller (NEES of yaw 1.0 to 1.2 over 40 walks)."""
 
 _OUTLIERS_IN_A_ROW, _SAME_DIRECTION = 3, 0.8
 """Outlier positions in a row whose residuals point the same way (cosine above this) are correct,
-and the track is wrong. So are positions in a row whose distance from the pivot differs from the
-track's: then the pivot was wrong."""
+and the track is wrong. If the distances of as many positions in a row from the pivot differ from
+the track's, the pivot was wrong."""
 
 _SIGMA_RATIO = 2.0
 """A position whose sigma is smaller by this factor than that of the one that placed the track
@@ -67,7 +67,7 @@ more than this [m], beyond which the covariance keeps no digits for the fix."""
 
 @dataclass(frozen=True, eq=False)
 class MapFrameState:
-    """What is known about the map frame.
+    """State of the map frame.
 
     Attributes:
         placed: whether the track's position in it is known.
@@ -111,7 +111,7 @@ class MapFrame:
         turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
 
     Attributes:
-        state: what is known about the frame.
+        state: state of the map frame.
     """
 
     def __init__(
@@ -142,12 +142,12 @@ class MapFrame:
             reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
             return UpdateResult(math.nan, len(fix.value), False, reason=reason)
         result = self._update(ekf, fix)
-        done = self._with_uncertainty(transform, _nav_state(ekf))
-        self.state = changed(self.state, transforms=(*self.state.transforms, done))
+        completed = self._with_uncertainty(transform, _nav_state(ekf))
+        self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
 
     def lose_yaw(self, ekf: StateCloningEkf) -> None:
-        """After a gap: if the yaw is lost, leave placing and turning the track to later fixes."""
+        """If a gap has lost the yaw, let later fixes place and turn the track from here on."""
         now, s = _nav_state(ekf), self.state
         variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
         if not (s.placed or s.oriented) or variance <= MAX_PRIOR_YAW_SIGMA**2:
@@ -161,10 +161,10 @@ class MapFrame:
         )
 
     def _needs_placing(self, ekf: StateCloningEkf, fix: Fix) -> bool:
-        """Whether a position should place the track: the first, and later a much better one.
+        """Return whether a position should place the track: the first, or a much better one later.
 
         While the yaw is unknown, a position further on hardly determines where the track is; but
-        the first may have been bad, which the ones after it reveal.
+        the first may have been bad, which later ones reveal.
         """
         if not self.state.placed or self.state.oriented:
             return not self.state.placed
@@ -205,8 +205,8 @@ class MapFrame:
         now = _nav_state(ekf)
         turn, sigma = _turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself then measures the turn
-        most = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
-        if not (math.isfinite(turn) and sigma <= most):
+        max_sigma = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
+        if not (math.isfinite(turn) and sigma <= max_sigma):
             if fix.kind != "position":
                 return None
             turn, inflation = self.state.alignment.turn
@@ -216,8 +216,8 @@ class MapFrame:
         R = exp_so3(np.array([0.0, 0.0, turn]))
         drift = float(now.covariance[2, 2])
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
-        moved = ekf.state.transformed(transform.R, transform.shift)
-        ekf.state = moved.with_yaw_inflated(pivot, inflation)
+        turned = ekf.state.transformed(transform.R, transform.shift)
+        ekf.state = turned.with_yaw_inflated(pivot, inflation)
         stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
         transforms = (*self.state.transforms, *stretches)
         self.state = changed(
@@ -279,7 +279,7 @@ class MapFrame:
 
 
 def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
-    """Transform that leaves a stretch in place but marks its direction about a pivot as unknown."""
+    """Return a transform that keeps a stretch in place but makes its yaw about a pivot unknown."""
     zero = np.zeros(3)
     return FrameTransform(
         math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
@@ -291,7 +291,7 @@ def _nav_state(ekf: StateCloningEkf) -> NavState:
 
 
 def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
-    """Turn of the frame about the pivot according to a fix, and its standard deviation [rad]."""
+    """Return the frame's turn about the pivot according to a fix, and its sigma [rad]."""
     if fix.kind == "yaw":
         turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
         return turn, math.sqrt(fix.covariance[0, 0])
@@ -304,12 +304,12 @@ def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float,
 
 
 def _plane_sigma(state: NavState, first: int, fix: Fix) -> float:
-    """Largest horizontal sigma between a fix and two rows of the state, without the yaw's part."""
+    """Return the largest horizontal sigma of a fix minus two rows of the state, without yaw."""
     P = _without_yaw(state.covariance, first) + fix.covariance[:2, :2]
     return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
 
 
 def _without_yaw(P: FloatArray, first: int) -> FloatArray:
-    """Covariance (2, 2) of two rows without the yaw's part, which the fixes determine."""
+    """Return the covariance (2, 2) of two rows without yaw's part, which the fixes determine."""
     by_yaw = P[first : first + 2, 2]
     return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])

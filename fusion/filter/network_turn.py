@@ -36,7 +36,7 @@ class TurnEstimate:
 
 
 def turn_estimate(s: EkfState) -> TurnEstimate | None:
-    """Return a filter's estimate of the turn; None if it is not a state yet."""
+    """Return a filter's estimate of the turn; None while it is not estimated."""
     if not s.has_turn:
         return None
     rows = [*range(CORE), s.turn_row]

@@ -1,8 +1,8 @@
-"""Direction of the track from several position fixes together, while it is still unknown.
+"""Direction of a track from several position fixes together, while it is still unknown.
 
-A single position determines it if it is far enough from the first. In a room none is, but several
-suffice: track t_k and fixes f_k as complex numbers, each with variance s_k^2 per axis (that of the
-fix and of the track's drift since),
+A single position far enough from the first determines the direction. In a room none is, but several
+suffice: with track t_k and fixes f_k as complex numbers, each of variance s_k^2 per axis (that of
+the fix and of the track's drift since),
 
     C = sum conj(t_k - t_mean) (f_k - f_mean) / s_k^2      turn = arg C      sigma^2 = 1 / |C|
 

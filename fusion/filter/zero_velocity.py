@@ -33,8 +33,8 @@ class ZeroVelocity(NamedTuple):
     b_g: FloatArray
     """(3,) mean rate [rad/s]."""
     covariance: FloatArray
-    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; widened, since every interval applies the
-    measurement but a second counts once."""
+    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; widened, since every interval applies a
+    measurement of the whole last second."""
 
 
 def zero_velocity(stillness: StillnessDetector) -> ZeroVelocity:

@@ -56,7 +56,7 @@ class GraphBuilder:
         streaming: rely on the filter's gating of fixes, and of displacements if it weights them
             equally. A robust loss in the graph starts from the IMU's prediction: while the speed
             was still unknown it rejected correct displacements, one after the other, and in 2 of
-            100 simulated walks for good.
+            100 simulated walks permanently.
 
     Attributes:
         graph: the graph so far.
@@ -151,15 +151,15 @@ class GraphBuilder:
             return
         graph = self.graph
         pieces = self.segments[graph.last]
-        whole = pieces[0]
+        segment = pieces[0]
         if len(pieces) > 1:
             _, _, _, b_g, b_a = graph.pose(graph.last)
-            whole = segment_of_all(self._pending, b_g, b_a, self._config)
+            segment = segment_of_all(self._pending, b_g, b_a, self._config)
         if guess is None:
             _, _, _, b_g, b_a = graph.pose(graph.last)
-            guess = NavState(whole.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
+            guess = NavState(segment.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
         self._pending = []
-        self.segments[graph.add_keyframe(whole, guess)] = []
+        self.segments[graph.add_keyframe(segment, guess)] = []
 
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""
@@ -254,7 +254,7 @@ class GraphBuilder:
 
 
 def _usable(value: FloatArray, covariance: FloatArray) -> bool:
-    """Whether a measurement is finite and its covariance positive definite."""
+    """Return whether a measurement is finite and its covariance positive definite."""
     with np.errstate(invalid="ignore", over="ignore"):
         finite = math.isfinite(float(np.vdot(value, value) + np.vdot(covariance, covariance)))
     return finite and dpotrf(covariance, lower=1)[1] == 0

@@ -64,8 +64,7 @@ class Prior:
 
     Attributes:
         k: number of the first keyframe.
-        reference: n states, of keyframe k and its successors, relative to which the error is
-            defined.
+        reference: n states, of keyframe k and its successors, from which the error is measured.
         root: (m, 15 n + t) square-root information; columns of the keyframes, then of the turns.
         offset: (m,) right-hand side.
         turns: t keyframes with a network's turn, and the turn [rad] at which its error is zero.
@@ -158,7 +157,7 @@ class TurnProcess:
     Attributes:
         i: keyframe of the previous turn.
         j: keyframe of this turn.
-        correlation: of the two; 0 for the first turn, where i is j.
+        correlation: correlation of the two turns; 0 for the first turn, where i is j.
         covariance: (1, 1) covariance of n [rad^2].
     """
 

@@ -70,7 +70,7 @@ class FixedLagEstimator:
     Args:
         config: noise, filter and graph settings.
         start: time and levelled attitude of the first sample.
-        prior: prior of the first pose; None starts level, at rest, at the origin.
+        prior: prior on the first pose; None starts levelled, at rest, at the origin.
     """
 
     smoothed = None
@@ -92,15 +92,17 @@ class FixedLagEstimator:
         self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
     ) -> None:
         """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
-        taken = self._filter.step(interval, displacement, fixes)
+        applied = self._filter.step(interval, displacement, fixes)
         self._narrow_bias_prior()
         if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if taken.bearing and (bias := gained_bias_information(*taken.bearing)):
+        if applied.bearing and (bias := gained_bias_information(*applied.bearing)):
             self._add_bias_information(*bias)
-        local_fixes = [self._in_graph_frame(accepted) for accepted in taken.fixes]
-        if self._builder.step(taken.interval, taken.displacement, local_fixes, taken.zero_velocity):
+        local_fixes = [self._in_graph_frame(accepted) for accepted in applied.fixes]
+        if self._builder.step(
+            applied.interval, applied.displacement, local_fixes, applied.zero_velocity
+        ):
             self._solve()
         else:
             self._ahead.propagate(self._builder.newest)
@@ -114,8 +116,8 @@ class FixedLagEstimator:
         if self._stale or self._filter.gating_counts != gating_counts:
             self._begin(self._builder.count)
             return accepted
-        for taken in accepted:
-            if taken.fix is fix and self._builder.fix(self._in_graph_frame(taken)):
+        for applied in accepted:
+            if applied.fix is fix and self._builder.fix(self._in_graph_frame(applied)):
                 self._solve()
         return accepted
 
@@ -160,7 +162,7 @@ class FixedLagEstimator:
 
     @property
     def _stale(self) -> bool:
-        """Whether the filter has changed what the graph began from."""
+        """Whether the filter has since changed the state from which the graph began."""
         wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
         jumped = self._filter.map_frame_state.jumps != self._jumps

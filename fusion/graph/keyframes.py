@@ -100,7 +100,7 @@ class KeyframeGraph:
         return self.last
 
     def add_disconnected(self, state: NavState) -> int:
-        """Add a unconnected keyframe with its covariance as prior; return its number."""
+        """Add a disconnected keyframe with its covariance as prior; return its number."""
         self._insert(state)
         self.add(_prior(self.last, state), gated=False)
         return self.last
@@ -128,7 +128,7 @@ class KeyframeGraph:
         self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
     def solve(self, max_rounds: int = 10) -> Solution:
-        """Optimise the keyframes.
+        """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
             max_rounds: maximum number of linearisations of the measurements.
@@ -149,7 +149,7 @@ class KeyframeGraph:
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
-            raise IndeterminateError(self._state_named(str(error))) from error
+            raise IndeterminateError(self._undetermined_state(str(error))) from error
         return Solution(rounds, down_weighted)
 
     def pose(self, k: int) -> KeyframeState:
@@ -164,7 +164,7 @@ class KeyframeGraph:
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
     def marginalise(self, before: int) -> None:
-        """Marginalise the keyframes before one, keeping their information on it and its successors.
+        """Marginalise the keyframes before a given one, keeping their information on later ones.
 
         Raises:
             IndeterminateError: a marginalised state is not determined.
@@ -174,18 +174,18 @@ class KeyframeGraph:
             return
         values = self._values()
         linear = self._imu_factors(before).linearize(values)
-        reached = [before]
+        connected = [before]
         for term in self._terms:
             if term.first < before:
                 linear.push_back(term.factor(values))
-                reached += [k for k in term.term.keyframes if k > before]
+                connected += [k for k in term.term.keyframes if k > before]
         keys = [key for k in old for key in self._keys(k)]
         try:
             _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
-            raise IndeterminateError(self._state_named(str(error))) from error
+            raise IndeterminateError(self._undetermined_state(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
-        self.add(self._marginal(range(before, max(reached) + 1), remaining), gated=False)
+        self.add(self._marginal(range(before, max(connected) + 1), remaining), gated=False)
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
@@ -201,7 +201,7 @@ class KeyframeGraph:
         return values
 
     def _imu_factors(self, before: float = math.inf) -> Any:
-        """Return the factors that connect each keyframe before one to the next."""
+        """Return the factors that connect each keyframe before a given one to the next."""
         factors = gtsam.NonlinearFactorGraph()
         for i, segment in self._segments.items():
             if i < before:
@@ -209,20 +209,20 @@ class KeyframeGraph:
                 factors.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim))
         return factors
 
-    def _marginal(self, reached: range, remaining: Any) -> Prior:
+    def _marginal(self, keyframes: range, remaining: Any) -> Prior:
         """Return the prior that elimination left on the keyframes that it reached."""
-        turns = tuple((k, self._turns[k]) for k in reached if k in self._turns)
-        for k in reached:  # a window may reach only a pose; add the other columns
+        turns = tuple((k, self._turns[k]) for k in keyframes if k in self._turns)
+        for k in keyframes:  # a window may reach only a pose; add the other columns
             remaining.push_back(_uninformative_factor(k, k in self._turns))
-        keys = [key(k) for k in reached for key in (X, V, B)]
+        keys = [key(k) for k in keyframes for key in (X, V, B)]
         A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
-        reference = tuple(self.pose(k) for k in reached)
+        reference = tuple(self.pose(k) for k in keyframes)
         to_local = block_diag(
             *(np.linalg.inv(state.invariant_from_local()) for state in reference),
             np.eye(len(turns)),
         )
-        return Prior(reached[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
+        return Prior(keyframes[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
 
     def _insert(self, state: NavState) -> None:
         self.last += 1
@@ -245,10 +245,10 @@ class KeyframeGraph:
             self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
             before = self._positions(values)
             values = values.retract(self._tree.optimize())
-            moved = float(np.abs(self._positions(values) - before).max())
-            if not moved > _CONVERGED:
+            change = float(np.abs(self._positions(values) - before).max())
+            if not change > _CONVERGED:
                 break
-        if not np.isfinite(moved):
+        if not np.isfinite(change):
             raise IndeterminateError("the optimisation diverged")
         return _round + 1, values
 
@@ -272,12 +272,12 @@ class KeyframeGraph:
                     f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s is undetermined"
                 )
 
-    def _state_named(self, message: str) -> str:
-        """Name the state that gtsam's message concerns."""
-        found = re.search(r"Symbol: ([xvbt])(\d+)", message)
-        if found is None:
+    def _undetermined_state(self, message: str) -> str:
+        """Return the name and time of the state that gtsam's message concerns."""
+        match = re.search(r"Symbol: ([xvbt])(\d+)", message)
+        if match is None:
             return message.strip().splitlines()[0]
-        return f"{_NAMES[found[1]]} at {self._time[int(found[2])]:.1f} s is undetermined"
+        return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"
 
 
 def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
@@ -294,7 +294,7 @@ def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
 
 
 def _root_information(covariance: FloatArray) -> FloatArray:
-    """Return a root of the inverse; directions left without variance by rounding get a little."""
+    """Return a square root of the inverse, with eigenvalues bounded below against rounding."""
     scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     values = np.maximum(values, _MIN_EIGENVALUE)

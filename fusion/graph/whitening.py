@@ -14,8 +14,8 @@ from stario.sequences.sequence import FloatArray
 
 _OUTLIER_POWER, _DISPLACEMENT_POWER = 0.5, 0.75
 """Powers of limit / squared norm that weight outliers: a half inflates them to the limit, as the
-filter does. Wrong displacements come in a row and count less: five seconds of them off by 1 m cost
-0.08 to 0.24 m in three walks when it was chosen, 0.5 to 0.6 m with a half."""
+filter does. False displacements come in a row and count less: five seconds of them, off by 1 m,
+cost 0.08 to 0.24 m in the three walks on which this was chosen, and 0.5 to 0.6 m with a half."""
 
 
 class IndeterminateError(Exception):
@@ -32,7 +32,7 @@ class Whitened:
 
     @classmethod
     def of(cls, term: Term, limit: float) -> Whitened:
-        """Whiten a term; a squared norm of its white residual above the limit is an outlier."""
+        """Whiten a term, an outlier if the squared norm of its white residual exceeds the limit."""
         return cls(term, np.linalg.inv(np.linalg.cholesky(term.covariance)), limit)
 
     @property
@@ -61,6 +61,6 @@ class Whitened:
 
 
 def linear_factor(blocks: list[tuple[int, FloatArray]], b: FloatArray) -> Any:
-    """Return a `JacobianFactor` of white rows; in Python only a conditional takes many keys."""
+    """Return a `JacobianFactor` of white rows, by the only constructor that takes many keys."""
     unit = gtsam.noiseModel.Unit.Create(len(b))
     return gtsam.JacobianFactor(gtsam.GaussianConditional(blocks, 1, b, unit))

@@ -63,7 +63,7 @@ class WindowBuffer:
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
 
     def clear(self) -> None:
-        """Forget all samples, so that no window spans a gap."""
+        """Drop all samples, so that no window spans a gap."""
         self._blocks.clear()
         self._tail = None
 
@@ -83,13 +83,13 @@ class WindowBuffer:
         tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         start = float(time[0])
         # The first average reaches half a grid step back, into the tail.
-        known = rows if tail is None else np.concatenate([tail, rows])
-        imu_N = resample(known[:, 0], known[:, 1:], start + self._grid).astype(np.float32).T
+        samples = rows if tail is None else np.concatenate([tail, rows])
+        imu_N = resample(samples[:, 0], samples[:, 1:], start + self._grid).astype(np.float32).T
         R_NB = attitudes[0]
         self._blocks.append(Block(imu_N, R_NB, facing(R_NB), flagged))
 
     def window(self) -> Window | None:
-        """Return the second that ends with the newest interval; None before a whole one is held."""
+        """Return the second that ends with the newest interval; None if it is not complete yet."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
             return None
@@ -108,7 +108,7 @@ _MAX_FIELD_AGE = 0.11
 """Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
 
 _MAX_DELAY = 0.1
-"""A field this much older than the end of the last interval [s] is too late for any other."""
+"""A field older than the end of the last interval by more than this [s] is dropped as late."""
 
 
 class FieldBuffer:
@@ -125,7 +125,7 @@ class FieldBuffer:
             time: time of the field [s].
             field_B: (3,) magnetic field in B [uT].
             now: time of the newest sample [s]. A field far ahead of it is kept only until an
-                earlier one comes, so that one wild time does not make all later fields look late.
+                earlier one comes, so that one wild timestamp does not make later fields look late.
         """
         while (
             self._fields
@@ -135,17 +135,17 @@ class FieldBuffer:
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         newest = max(newest, self._last_query - _MAX_DELAY)
-        right = (
+        valid = (
             math.isfinite(time)
             and time > newest
             and float(np.abs(field_B).sum()) < MAX_SENSOR_VALUE
         )
-        if right:
+        if valid:
             self._fields.append((time, field_B))
-        return right
+        return valid
 
     def at(self, time: float) -> FloatArray | None:
-        """Return the newest field (3,) up to a time [s], None if too old; later fields wait."""
+        """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
         self._last_query = time
         return next(
             (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None

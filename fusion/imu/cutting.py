@@ -38,8 +38,8 @@ def split_at_fixes(
         else:
             break
         pieces[-1][1].append(fix)
-    taken = sum(len(due) for _, due in pieces)
-    return [*pieces, (rest, list(fixes[taken:]))]
+    count = sum(len(due) for _, due in pieces)
+    return [*pieces, (rest, list(fixes[count:]))]
 
 
 def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
@@ -52,9 +52,9 @@ def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterv
         second["time"] = np.append(time, interval.time[k + 1 :])
     for name in ("gyro", "accel"):
         values = getattr(interval, name)
-        at = (1.0 - weight) * values[k - 1] + weight * values[k]
-        first[name] = np.vstack([values[:k], at])
-        second[name] = np.vstack([at, values[len(values) - len(second["time"]) + 1 :]])
+        boundary = (1.0 - weight) * values[k - 1] + weight * values[k]
+        first[name] = np.vstack([values[:k], boundary])
+        second[name] = np.vstack([boundary, values[len(values) - len(second["time"]) + 1 :]])
     return changed(interval, **first, update=False, window=None, R_NB_window=None), changed(
         interval, **second
     )

@@ -129,15 +129,15 @@ class FrontEnd:
     def _drop_ahead(self, time: float) -> None:
         """Drop the waiting samples whose times are refuted by a new sample at `time`."""
         ahead = self._unconfirmed
-        known = len(ahead)
+        count = len(ahead)
         if time < ahead[0][0]:
             ahead.clear()
         while len(ahead) > 1 and ahead[-1][0] > max(time, ahead[-2][0] + MAX_IMU_GAP):
             ahead.pop()
-        self.counts.future += known - len(ahead)
+        self.counts.future += count - len(ahead)
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
-        """Hold a sample that jumps ahead in time or follows one; accept all once confirmed."""
+        """Queue a sample that jumps ahead in time or follows one; accept all once confirmed."""
         ahead = self._unconfirmed
         ahead.append(sample)
         far = ahead[0][0] - self._newest > LONG_GAP
@@ -288,7 +288,7 @@ def cut_recording(
         )
     )
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        # A wild sample time must not release all later fields at once.
+        # A wild timestamp must not release all later fields at once.
         while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
             front_end.push_field(*fields.popleft())
         try:

@@ -40,7 +40,7 @@ class ImuInterval:
         time: (n + 1,) sample times [s]; the first and the last are on the grid.
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
-        gap: whether this is a gap too long to be bridged; its samples carry no information then.
+        gap: whether this is a gap too long to be bridged; its samples then carry no information.
         restart: new start after a long gap, estimated as at the first sample; None elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
         window_flagged: whether any of the window's samples are.
@@ -107,7 +107,7 @@ class SampleCounts:
 
     Attributes:
         used: samples used.
-        not_finite: dropped: a value is not a number, infinite or absurdly large.
+        not_finite: dropped: a value is NaN, infinite or absurdly large.
         frozen: dropped: all values repeat those before, though the device is not at rest.
         duplicate: dropped: the time repeats the newest.
         out_of_order: dropped: the time is before the newest.

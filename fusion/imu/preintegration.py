@@ -69,7 +69,7 @@ class Segment:
         return self.stop - self.start
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state, with the samples as gtsam's own text archive, exact to the last bit."""
+        """Return the state, with `pim` as gtsam's own text archive, exact to the last bit."""
         return vars(self) | {"pim": self.pim.serialize()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -155,7 +155,7 @@ def gap_segment(
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     force_B = config.gravity * up_B + b_a
-    # After a single step the errors of position and velocity are dependent: no graph inverts that.
+    # After a single step, position and velocity errors are dependent: the covariance is singular.
     for _ in range(_GAP_STEPS):
         pim.integrateMeasurement(force_B, b_g, dt)
     return Segment(start, stop, config.gravity, pim)
@@ -166,8 +166,8 @@ def segment_of_all(
 ) -> Segment:
     """Preintegrate consecutive intervals, none of them a gap, each with its own noise.
 
-    Their mean noise would spread the effect of a step's impact from a tenth of a second over half a
-    second, and correlate position and speed at the end wrongly.
+    Their mean noise would spread the effect of a heel strike from a tenth of a second over half a
+    second, and correlate position and velocity at the end wrongly.
     """
     first, rest = intervals[0], intervals[1:]
 
@@ -295,5 +295,5 @@ def _set_white_noise(params: Any, noise: ImuNoise) -> None:
     params.setAccelerometerCovariance(_EYE * noise.accel_noise**2)
 
 
-# The accelerometer's factor is quantised: all values in use fit.
+# The accelerometer's factor is quantised, so the cache holds all values in use.
 _params = lru_cache(maxsize=512)(_new_params)

@@ -64,7 +64,7 @@ class StatefulInference:
         return self._stretch is not self._model
 
     def restart(self) -> None:
-        """Forget all windows before a gap."""
+        """Clear the memory of windows before a gap."""
         begin = getattr(self._model, "stateful_inference", None)
         self._stretch: Any = self._model if begin is None else begin(self._updates)
 
@@ -88,11 +88,11 @@ class StatefulInference:
 
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
         """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
-        known = getattr(getattr(self._model, "card", None), "known_motion", None)
-        if known is None:
+        known_motion = getattr(getattr(self._model, "card", None), "known_motion", None)
+        if known_motion is None:
             return 0
         moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
-        return int((moves & (known.novelty(windows) > 1.0)).sum())
+        return int((moves & (known_motion.novelty(windows) > 1.0)).sum())
 
     @property
     def memory(self) -> Any:
@@ -117,9 +117,9 @@ class StatefulInference:
 def displacements_of(
     network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
 ) -> list[Displacement]:
-    """Predict the displacements of the intervals' windows, with covariances that can be trusted.
+    """Predict the displacements of the intervals' windows, with inflated and floored covariances.
 
-    Counts the windows, and those that move unlike anything the weights were trained on.
+    Also count the windows, and those that move unlike anything the weights were trained on.
     """
     windows_N = np.stack([_window(interval) for interval in intervals])
     counts.windows += len(windows_N)

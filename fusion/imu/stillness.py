@@ -21,8 +21,8 @@ class StillnessDetector:
         scale: factor on the noise densities of a phone's IMU; 0 never detects.
 
     Attributes:
-        window: (14,) for each interval of the last second: number of samples, seconds, sums of gyro
-            and accel, sums of their squares; None if it alone moves more than a still second may.
+        window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
+            and accel, sums of their squares; None if it moves more than a still second may.
     """
 
     def __init__(self, intervals: int, scale: float) -> None:
@@ -38,8 +38,8 @@ class StillnessDetector:
             return False
         sums = None if self._moves(interval) else _sums_of(interval)
         self.window = (*self.window, sums)[-self._intervals :]
-        quiet = [sums for sums in self.window if sums is not None]
-        return len(quiet) == self._intervals and self._is_quiet(np.sum(quiet, axis=0))
+        calm = [sums for sums in self.window if sums is not None]
+        return len(calm) == self._intervals and self._is_quiet(np.sum(calm, axis=0))
 
     def mean_rates(self) -> FloatArray:
         """Return the mean rate (n, 3) of each interval of a still second [rad/s]."""
@@ -51,7 +51,7 @@ class StillnessDetector:
         return float(np.array(self.window)[:, 1].mean())
 
     def _moves(self, interval: ImuInterval) -> bool:
-        """Whether the interval's specific force alone scatters more than a still second may."""
+        """Return whether an interval's specific force scatters more than a still second's may."""
         accel = interval.accel[1:]
         count = len(accel)
         total = accel.sum(axis=0)
@@ -61,7 +61,7 @@ class StillnessDetector:
         return not looks_still(0.0, scatter, bound)
 
     def _is_quiet(self, sums: FloatArray) -> bool:
-        """Whether a second with these sums scatters no more than a still one may."""
+        """Return whether a second with these sums scatters no more than a still one may."""
         count = float(sums[0])
         scatter = sums[8:14] - np.square(sums[2:8]) / count
         bound = scatter_bound(count, float(sums[1]), self._scale)

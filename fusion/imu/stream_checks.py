@@ -116,15 +116,15 @@ _PIECE_SECONDS = 4.0
 """Length of a piece [s], as in the check of recordings."""
 
 _MIN_FAILED_PIECES = 3
-"""Failed pieces, with no calm one in between, that refuse a stream; two may share one fall, and no
-recording fails any."""
+"""Number of failed pieces, with no calm one in between, that refuse a stream: a single fall may
+cause two, and no recording has failed any."""
 
 _MIN_TURNING_PIECES = 12
-"""Turning pieces that clear the gyroscope; later failures are not due to its unit."""
+"""Number of pieces with turns after which later failures are not attributed to the unit."""
 
 _TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
 """Rates exceeded for a twentieth of a piece: the first by walks, but not by noise and bias at rest,
-even in deg/s; the second by hardly any walk (maximum recorded 4.2), but by all read as deg/s."""
+even in deg/s; the second by hardly any walk (maximum recorded 4.2), but by all given in deg/s."""
 
 
 class GyroUnitCheck:
@@ -167,11 +167,11 @@ class GyroUnitCheck:
 
 
 def _check_unit(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-    whole = [slice(0, len(time))]
+    stretches = [slice(0, len(time))]
     check_gyro(
         "stream",
         gyro,
         float(np.median(np.linalg.norm(accel, axis=1))),
-        average_force(time, gyro, accel, whole),
-        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, whole),
+        average_force(time, gyro, accel, stretches),
+        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, stretches),
     )

@@ -45,8 +45,8 @@ class DisplayedTrack:
 
     def add(self, state: NavState) -> None:
         """Append the newest state."""
-        behind_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
-        if behind_gap and state.covariance[2, 2] > MAX_PRIOR_YAW_SIGMA**2:
+        after_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
+        if after_gap and state.covariance[2, 2] > MAX_PRIOR_YAW_SIGMA**2:
             self.since = len(self.points)
         self.points.append(point_of(state))
         if len(self.points) > MOST_POINTS:

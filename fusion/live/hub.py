@@ -67,8 +67,8 @@ class Hub:
             InputError: the device is unknown, or the command is not possible now.
         """
         if device not in self.sessions:
-            known = ", ".join(self.sessions) or "none yet"
-            raise InputError("device", repr(device), f"a device that has sent data: {known}")
+            devices = ", ".join(self.sessions) or "none yet"
+            raise InputError("device", repr(device), f"a device that has sent data: {devices}")
         action = getattr(self.sessions[device], name)
         async with self._locks[device]:
             await asyncio.to_thread(action, **values)
@@ -112,7 +112,7 @@ class Hub:
 
 
 class Viewer:
-    """Record of what one viewer has received, so that only new points are sent.
+    """One viewer and the points it has received, so that only new ones are sent.
 
     Args:
         hub: hub to watch.
@@ -120,7 +120,7 @@ class Viewer:
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._known: dict[str, tuple[int, int]] = {}
+        self._sent: dict[str, tuple[int, int]] = {}
 
     def message(self) -> dict[str, Any]:
         """Return every device's status and its points since the last message.
@@ -129,15 +129,15 @@ class Viewer:
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):
-            drawn = session.drawn
-            points, revision = drawn.points, drawn.revision
-            known_revision, known = self._known.get(device, (-1, 0))
-            fresh = revision != known_revision
+            track = session.drawn
+            points, revision = track.points, track.revision
+            sent_revision, sent = self._sent.get(device, (-1, 0))
+            fresh = revision != sent_revision
             count = len(points)
-            new = points[0 if fresh else known : count]
+            new = points[0 if fresh else sent : count]
             if len(new) > MOST_SENT:
                 new = [*new[: -1 : -(-len(new) // MOST_SENT)], new[-1]]
-            self._known[device] = (revision, count)
+            self._sent[device] = (revision, count)
             devices.append(session.status() | {"fresh": fresh, "points": new})
         refused = dict(self._hub.refused)
         return {"time": time.time(), "devices": devices, "refused": refused}

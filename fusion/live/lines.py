@@ -57,7 +57,7 @@ class LineServer:
         self.port = number
         self._bound.set()
         try:
-            await self._work_off_packets()
+            await self._process_packets()
         finally:
             transport.close()
             server.close()
@@ -113,16 +113,16 @@ class LineServer:
             writer.write(json.dumps({"error": error}).encode() + b"\n")
         await writer.drain()
 
-    async def _work_off_packets(self) -> None:
+    async def _process_packets(self) -> None:
         while True:
             data, sender = await self._packets.get()
             try:
-                await self._work_off(data.split(b"\n"), sender)
+                await self._process_packet(data.split(b"\n"), sender)
             except Exception:  # no packet, whatever it holds, may stop the server
                 _log.exception("%s: a packet is skipped", sender)
                 self._hub.refuse("udp")
 
-    async def _work_off(self, lines: list[bytes], sender: str) -> None:
+    async def _process_packet(self, lines: list[bytes], sender: str) -> None:
         if self._token and not self._is_token(lines.pop(0)):
             self._hub.refuse("udp")
             return
@@ -150,8 +150,8 @@ class LineServer:
             message = json_from(line)
         except InputError:
             return False
-        shown = message.get("token") if isinstance(message, dict) else None
-        return isinstance(shown, str) and tokens_match(shown, self._token)
+        token = message.get("token") if isinstance(message, dict) else None
+        return isinstance(token, str) and tokens_match(token, self._token)
 
 
 class _Packets(asyncio.DatagramProtocol):

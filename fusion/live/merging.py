@@ -48,7 +48,7 @@ class Join:
 
     Attributes:
         late: number of values dropped because their stream already had newer ones.
-        alone: number of values of the first dropped for lack of nearby values of the second.
+        alone: number of values of the first stream dropped for lack of values of the second.
     """
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class Join:
 
     def ready(self) -> list[Sample]:
         """Return the samples that are complete so far, in time order."""
-        done: list[Sample] = []
+        complete: list[Sample] = []
         while self._first and self._second:
             time, value = self._first[0]
             while len(self._second) > 1 and self._second[1][0] <= time:
@@ -79,11 +79,11 @@ class Join:
             if other is None:
                 self.alone += 1
             else:
-                done.append((time, value, other))
+                complete.append((time, value, other))
         while self._first and self._newest[0] - self._first[0][0] > LONGEST_WAIT:
             self._first.popleft()
             self.alone += 1
-        return done
+        return complete
 
     def _at(self, time: int) -> Vector | None:
         """Return the second stream's value at a time; None outside it or in a gap."""
@@ -132,10 +132,10 @@ class Merger:
         """Sensor that a track needs but the device does not send; empty if none is missing."""
         if self._gyro or not self._waiting:
             return ""
-        seen = {reading.sensor for reading in self._waiting}
-        if not seen & set(_GYROS):
+        sensors = {reading.sensor for reading in self._waiting}
+        if not sensors & set(_GYROS):
             return "gyroscope"
-        if not any(set(names) <= seen for names in _ACCELS):
+        if not any(set(names) <= sensors for names in _ACCELS):
             return "total acceleration, or accelerometer with gravity"
         return ""
 
@@ -176,18 +176,18 @@ class Merger:
             self._join.add(1, time, value)
 
     def _choose(self) -> bool:
-        """Choose the best sensors, once the stream is long enough to have shown all."""
+        """Choose the best sensors, once the stream is long enough to contain all of them."""
         times = [reading.time_ns for reading in self._waiting]
         if not times or max(times) - min(times) < CHOOSING:
             return False
-        seen = {reading.sensor for reading in self._waiting}
-        gyro = next((name for name in _GYROS if name in seen), "")
-        accel = next((names for names in _ACCELS if set(names) <= seen), ())
+        sensors = {reading.sensor for reading in self._waiting}
+        gyro = next((name for name in _GYROS if name in sensors), "")
+        accel = next((names for names in _ACCELS if set(names) <= sensors), ())
         if not gyro or not accel:
             newest = max(times)  # bounds memory
             self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
             return False
-        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in seen
+        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in sensors
         self.upward = _cosine(
             _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
             *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),

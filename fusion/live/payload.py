@@ -33,14 +33,14 @@ MOST_ENTRIES = 50_000
 """Maximum number of samples in one push; the fastest phone takes a minute to record them."""
 
 LONGEST_SPAN = 600 * 10**9
-"""Maximum time [ns] between a push's first and last sample; beyond it a time stamp is wrong."""
+"""Maximum time [ns] between a push's first and last sample; beyond it a timestamp is wrong."""
 
-_LARGEST = 1e4
+_MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
-_LATEST = 2**63
-_LONGEST_NAME = 80
-_UNIT = 0.05
+_MAX_TIME_NS = 2**63
+_MAX_NAME_LENGTH = 80
+_NORM_TOLERANCE = 0.05
 
 GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
 TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
@@ -58,7 +58,7 @@ class Reading:
     Attributes:
         sensor: one of `SENSORS`, or `ORIENTATION`.
         time_ns: time on the device's clock [ns].
-        value: reading in rad/s, m/s^2 or uT; for an attitude, the unit vector up, in B.
+        value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B.
     """
 
     sensor: str
@@ -72,7 +72,7 @@ class Batch:
 
     Attributes:
         device: name of the device.
-        recording: its own name for the recording; empty if it has none.
+        recording: the device's name for the recording; empty if it gives none.
         readings: readings in order of arrival.
     """
 
@@ -85,12 +85,12 @@ def parse_push(body: bytes) -> Batch:
     """Parse a push of Sensor Logger.
 
     Raises:
-        InputError: the body is not such JSON; the error names the field.
+        InputError: the body does not have this form; the error names the field.
     """
     message = _object("body", json_from(body))
     payload = message.get("payload")
     if not isinstance(payload, list):
-        raise InputError("payload", _kind(payload), "a list of samples")
+        raise InputError("payload", _describe(payload), "a list of samples")
     if len(payload) > MOST_ENTRIES:
         found = f"{len(payload)} samples"
         raise InputError("payload", found, f"at most {MOST_ENTRIES}", "choose a shorter period")
@@ -101,7 +101,7 @@ def parse_push(body: bytes) -> Batch:
         for k, entry in enumerate(payload)
         if (reading := _pushed(f"payload[{k}]", _object(f"payload[{k}]", entry))) is not None
     ]
-    return Batch(device, recording, _together("payload", readings))
+    return Batch(device, recording, _checked_span("payload", readings))
 
 
 def parse_line(line: bytes, sender: str) -> Batch:
@@ -112,7 +112,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
         sender: name of the device if the line gives none.
 
     Raises:
-        InputError: the line is not such JSON; the error names the field.
+        InputError: the line does not have this form; the error names the field.
     """
     message = _object("line", json_from(line))
     if "payload" in message:
@@ -134,13 +134,13 @@ def parse_line(line: bytes, sender: str) -> Batch:
 
 def joined(batches: Iterable[Batch]) -> list[Batch]:
     """Merge consecutive batches of the same device and recording."""
-    made: list[Batch] = []
+    merged: list[Batch] = []
     for batch in batches:
-        if made and (made[-1].device, made[-1].recording) == (batch.device, batch.recording):
-            made[-1].readings.extend(batch.readings)
+        if merged and (merged[-1].device, merged[-1].recording) == (batch.device, batch.recording):
+            merged[-1].readings.extend(batch.readings)
         else:
-            made.append(batch)
-    return made
+            merged.append(batch)
+    return merged
 
 
 def json_from(text: bytes) -> Any:
@@ -161,7 +161,7 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
     """Parse one sample of a push; None for a sensor that is not used."""
     name = entry.get("name")
     if not isinstance(name, str):
-        raise InputError(f"{where}.name", _kind(name), "a sensor name")
+        raise InputError(f"{where}.name", _describe(name), "a sensor name")
     sensor = name.lower()
     values = entry.get("values", entry)
     if sensor == ORIENTATION:
@@ -176,19 +176,19 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
 
 
 def _vertical(time: Any, values: Any) -> Reading | None:
-    """Return the vertical by the phone's attitude; None if not valid, since no track needs it."""
+    """Return the vertical from the phone's attitude; None if invalid, since no track needs it."""
     try:
         x, y, z, w = (_number("q", values.get(f"q{axis}")) for axis in "xyzw")
         time_ns = _nanoseconds("time", time)
     except (InputError, AttributeError):
         return None
-    if abs(x * x + y * y + z * z + w * w - 1.0) > _UNIT:
+    if abs(x * x + y * y + z * z + w * w - 1.0) > _NORM_TOLERANCE:
         return None
     up_B = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     return Reading(ORIENTATION, time_ns, up_B)
 
 
-def _together(where: str, readings: list[Reading]) -> list[Reading]:
+def _checked_span(where: str, readings: list[Reading]) -> list[Reading]:
     times = [reading.time_ns for reading in readings]
     if times and max(times) - min(times) > LONGEST_SPAN:
         found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
@@ -198,7 +198,7 @@ def _together(where: str, readings: list[Reading]) -> list[Reading]:
 
 def _object(where: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise InputError(where, _kind(value), "an object")
+        raise InputError(where, _describe(value), "an object")
     return value
 
 
@@ -206,9 +206,9 @@ def _name(where: str, value: Any, needed: bool = True) -> str:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str) or (needed and not value.strip()):
-        raise InputError(where, _kind(value), "a name")
+        raise InputError(where, _describe(value), "a name")
     # A lone surrogate is not a character: neither the page nor a response could contain it.
-    return value.strip()[:_LONGEST_NAME].encode("utf-8", "replace").decode()
+    return value.strip()[:_MAX_NAME_LENGTH].encode("utf-8", "replace").decode()
 
 
 def _nanoseconds(where: str, value: Any) -> int:
@@ -217,8 +217,8 @@ def _nanoseconds(where: str, value: Any) -> int:
         value = int(value)
     if isinstance(value, float) and math.isfinite(value):
         value = round(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _LATEST:
-        raise InputError(where, _kind(value), "a non-negative time in nanoseconds")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _MAX_TIME_NS:
+        raise InputError(where, _describe(value), "a non-negative time in nanoseconds")
     return value
 
 
@@ -229,21 +229,21 @@ def _axes(where: str, values: Mapping[str, Any]) -> Vector:
 
 def _three(where: str, values: Any) -> Vector:
     if not isinstance(values, list) or len(values) != 3:
-        raise InputError(where, _kind(values), "a list of three numbers")
+        raise InputError(where, _describe(values), "a list of three numbers")
     x, y, z = (_reading(f"{where}[{k}]", value) for k, value in enumerate(values))
     return x, y, z
 
 
 def _reading(where: str, value: Any) -> float:
     number = _number(where, value)
-    if abs(number) > _LARGEST:
-        raise InputError(where, f"{number:.3g}", f"at most {_LARGEST:g} rad/s, m/s^2 or uT")
+    if abs(number) > _MAX_READING:
+        raise InputError(where, f"{number:.3g}", f"at most {_MAX_READING:g} rad/s, m/s^2 or uT")
     return number
 
 
 def _number(where: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(where, _kind(value), "a number")
+        raise InputError(where, _describe(value), "a number")
     try:
         number = float(value)
     except OverflowError:
@@ -253,8 +253,8 @@ def _number(where: str, value: Any) -> float:
     return number
 
 
-def _kind(value: Any) -> str:
-    """Describe a value in a few words, whatever its size."""
+def _describe(value: Any) -> str:
+    """Return a short description of a value of any size."""
     if value is None:
         return "nothing"
     if isinstance(value, (dict, list)):

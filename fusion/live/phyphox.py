@@ -1,4 +1,4 @@
-"""Client of a phone running phyphox: polls its remote interface several times a second.
+"""Client of a phone running phyphox, which polls its remote interface several times a second.
 
 The app (menu: "Allow remote access") answers `/config` with the experiment's sensors and the names
 of their buffers, and `/get?acc_time=12.3&accX=12.3|acc_time` with the values after 12.3 s. The
@@ -29,9 +29,9 @@ _SENSORS = {
     "gravity": GRAVITY,
 }
 _TIMEOUT = 3.0
-_PATIENCE = 2.0
-_LARGEST_ANSWER = 16 * 1024 * 1024
-_LARGEST_VALUE = 1e4
+_RETRY_SECONDS = 2.0
+_MAX_RESPONSE_BYTES = 16 * 1024 * 1024
+_MAX_READING = 1e4
 
 _log = logging.getLogger(__name__)
 
@@ -64,9 +64,9 @@ class Phyphox:
             OSError: the phone does not respond.
         """
         if not self._buffers:
-            self._buffers = buffers_of(self._ask("/config"))
-        answer = self._ask(f"/get?{'&'.join(self._questions())}")
-        status, buffers = answer.get("status"), answer.get("buffer")
+            self._buffers = buffers_of(self._get("/config"))
+        response = self._get(f"/get?{'&'.join(self._query())}")
+        status, buffers = response.get("status"), response.get("buffer")
         if not isinstance(status, dict) or not isinstance(buffers, dict):
             raise InputError("phyphox", "no status or no buffers", "a response of phyphox's /get")
         session = str(status.get("session", ""))
@@ -78,16 +78,16 @@ class Phyphox:
         readings = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
         return Batch(self.device, session, readings)
 
-    def _questions(self) -> list[str]:
-        questions = []
+    def _query(self) -> list[str]:
+        parts = []
         for sensor, names in self._buffers.items():
             t, *axes = map(quote, names)
             if sensor in self._newest:
                 since = repr(self._newest[sensor])
-                questions += [f"{t}={since}", *(f"{axis}={since}%7C{t}" for axis in axes)]
+                parts += [f"{t}={since}", *(f"{axis}={since}%7C{t}" for axis in axes)]
             else:
-                questions += [f"{name}=full" for name in (t, *axes)]
-        return questions
+                parts += [f"{name}=full" for name in (t, *axes)]
+        return parts
 
     def _readings(self, sensor: str, buffers: Mapping[str, Any]) -> list[Reading]:
         columns = [_column(buffers, name) for name in self._buffers[sensor]]
@@ -95,16 +95,16 @@ class Phyphox:
         if columns[0] and columns[0][-1] < self._newest.get(sensor, -1.0):
             self._newest = {}  # the experiment was cleared: its time restarts
         for t, *value in zip(*columns, strict=False):  # one column may be a sample longer
-            if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _LARGEST_VALUE:
+            if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _MAX_READING:
                 continue
             self._newest[sensor] = t
             x, y, z = value
             readings.append(Reading(sensor, round(1e9 * t), (x, y, z)))
         return readings
 
-    def _ask(self, path: str) -> dict[str, Any]:
-        with urllib.request.urlopen(self._root + path, timeout=_TIMEOUT) as answer:
-            body = answer.read(_LARGEST_ANSWER)
+    def _get(self, path: str) -> dict[str, Any]:
+        with urllib.request.urlopen(self._root + path, timeout=_TIMEOUT) as response:
+            body = response.read(_MAX_RESPONSE_BYTES)
         message = json_from(body)
         if not isinstance(message, dict):
             raise InputError("phyphox", "a different response", "a JSON object")
@@ -128,10 +128,10 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]
             t, x, y, z = (outputs[key] for key in "txyz")
             found[sensor] = (t, x, y, z)
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
-        have = ", ".join(found) or "neither"
+        present = ", ".join(found) or "neither"
         raise InputError(
             "phyphox",
-            have,
+            present,
             "gyroscope and acceleration with g in one experiment",
             "add a simple experiment with both",
         )
@@ -140,18 +140,18 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]
 
 async def follow(hub: Hub, phone: Phyphox) -> None:
     """Poll a phone for as long as the server runs; log each problem once and retry."""
-    told = ""
+    last_problem = ""
     while True:
         try:
             batch = await asyncio.to_thread(phone.fetch)
             await hub.take(batch)
-            told = ""
+            last_problem = ""
         except Exception as error:  # whatever a phone on a bad network answers, retry
-            words = str(error) or type(error).__name__
-            if words != told:
-                _log.warning("%s: %s", phone.device, words)
-                told = words
-            await asyncio.sleep(_PATIENCE)
+            problem = str(error) or type(error).__name__
+            if problem != last_problem:
+                _log.warning("%s: %s", phone.device, problem)
+                last_problem = problem
+            await asyncio.sleep(_RETRY_SECONDS)
         await asyncio.sleep(PERIOD)
 
 

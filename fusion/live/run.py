@@ -19,7 +19,7 @@ from stario.fusion.live.server import live_app
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
-_LOOKS_EVERY = 0.1
+_POLL_SECONDS = 0.1
 """Interval between checks for a signal to stop [s]."""
 
 
@@ -83,13 +83,13 @@ class LiveServer:
     def addresses(self) -> list[str]:
         """Return lines of text with the addresses to open and to send to."""
         end = f"?token={self.token}" if self.token else ""
-        here = self._host if self._host not in ("0.0.0.0", "::") else _own_address()
-        shown = f"[{here}]" if ":" in here else here
-        page = f"http://{shown}:{self.port}"
+        host = self._host if self._host not in ("0.0.0.0", "::") else _own_address()
+        url_host = f"[{host}]" if ":" in host else host
+        page = f"http://{url_host}:{self.port}"
         lines = [
             f"page:           {page}/{end}",
             f"Sensor Logger:  {page}/data{end}",
-            f"lines of JSON:  {shown} port {self.lines_port}, TCP or UDP",
+            f"lines of JSON:  {url_host} port {self.lines_port}, TCP or UDP",
             f"recordings:     {self._out}",
         ]
         if self.token:
@@ -109,7 +109,7 @@ class LiveServer:
                 await asyncio.sleep(0.01)
             started()
             while not self._server.should_exit:
-                await asyncio.sleep(_LOOKS_EVERY)
+                await asyncio.sleep(_POLL_SECONDS)
             self.hub.end()
             await web
         except OSError as error:

@@ -1,7 +1,7 @@
 """HTTP side of the live server: receives pushes, serves one page.
 
     GET  /                       the page
-    GET  /events                 its updates, as server-sent events
+    GET  /events                 updates for the page, as server-sent events
     POST /data                   a push of Sensor Logger, or lines of JSON (application/x-ndjson)
     POST /devices/{id}/{command} start, stop, zero, or fix with {"x": m, "y": m, "sigma": m}
 
@@ -46,10 +46,10 @@ LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
 
 COMMANDS = ("start", "stop", "zero", "fix")
 
-_MOST_OFTEN = 0.05
-_AT_LEAST = 1.0
+_MIN_PERIOD = 0.05
+_MAX_PERIOD = 1.0
 _COOKIE = "stario_token"
-_FURTHEST, _SIGMAS = 1e6, (0.01, 1e3)
+_MAX_COORDINATE, _SIGMA_RANGE = 1e6, (0.01, 1e3)
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 
 _log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ def live_app(hub: Hub, token: str = "") -> Starlette:
             Route("/devices/{device}/{command}", _command, methods=["POST"]),
         ],
         middleware=[guard],
-        exception_handlers={StarioError: _unusable, OSError: _no_room},
+        exception_handlers={StarioError: _bad_request, OSError: _storage_error},
     )
     app.state.hub = hub
     return app
@@ -88,7 +88,7 @@ class TokenMiddleware:
     """Middleware that rejects requests without the token.
 
     Args:
-        app: application behind it.
+        app: application that handles accepted requests.
         token: required token, not empty.
     """
 
@@ -101,10 +101,10 @@ class TokenMiddleware:
             await self._app(scope, receive, send)
             return
         request = Request(scope)
-        named = request.query_params.get("token", "")
+        query_token = request.query_params.get("token", "")
         bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
-        shown = (named, bearer, request.cookies.get(_COOKIE, ""))
-        if not any(tokens_match(one, self._token) for one in shown):
+        candidates = (query_token, bearer, request.cookies.get(_COOKIE, ""))
+        if not any(tokens_match(candidate, self._token) for candidate in candidates):
             reason = (
                 "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
@@ -112,7 +112,7 @@ class TokenMiddleware:
             return
 
         async def with_cookie(message: Any) -> None:
-            if message["type"] == "http.response.start" and tokens_match(named, self._token):
+            if message["type"] == "http.response.start" and tokens_match(query_token, self._token):
                 cookie = f"{_COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                 message["headers"] = [*message["headers"], (b"set-cookie", cookie.encode())]
             await send(message)
@@ -121,8 +121,8 @@ class TokenMiddleware:
 
 
 def tokens_match(shown: str, token: str) -> bool:
-    """Compare a token with the right one in constant time."""
-    return hmac.compare_digest(*(one.encode("utf-8", "surrogatepass") for one in (shown, token)))
+    """Return whether a token equals the required one, in constant time."""
+    return hmac.compare_digest(*(text.encode("utf-8", "surrogatepass") for text in (shown, token)))
 
 
 def accel_factor(unit: str) -> float:
@@ -157,7 +157,7 @@ async def _data(request: Request) -> Response:
 
 
 def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
-    """Parse the batches of a body, all of them or none."""
+    """Return the batches of a body; an invalid line refuses all of them."""
     if not sender_of_lines:
         return [parse_push(body)]
     lines = [(k, line) for k, line in enumerate(body.splitlines(), 1) if line.strip()]
@@ -208,10 +208,10 @@ def _fix_values(message: Any) -> dict[str, float]:
     values = {}
     for name in ("x", "y", "sigma"):
         value = message.get(name) if isinstance(message, dict) else None
-        if not isinstance(value, (int, float)) or not abs(value) <= _FURTHEST:
-            raise InputError(name, "nothing, or no number", f"a number up to {_FURTHEST:g} m")
+        if not isinstance(value, (int, float)) or not abs(value) <= _MAX_COORDINATE:
+            raise InputError(name, "nothing, or no number", f"a number up to {_MAX_COORDINATE:g} m")
         values[name] = float(value)
-    low, high = _SIGMAS
+    low, high = _SIGMA_RANGE
     if not low <= values["sigma"] <= high:
         raise InputError("sigma", f"{values['sigma']:g}", f"{low:g} to {high:g} m")
     return values
@@ -223,10 +223,10 @@ async def _events(request: Request) -> Response:
     async def messages() -> AsyncIterator[str]:
         viewer = Viewer(hub)
         while not hub.ending:
-            waiting = asyncio.create_task(hub.news(_AT_LEAST))
+            waiting = asyncio.create_task(hub.news(_MAX_PERIOD))
             yield f"data: {json.dumps(viewer.message(), separators=(',', ':'))}\n\n"
             await waiting
-            await asyncio.sleep(_MOST_OFTEN)
+            await asyncio.sleep(_MIN_PERIOD)
 
     headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
     return StreamingResponse(messages(), media_type="text/event-stream", headers=headers)
@@ -246,21 +246,21 @@ def _asset(name: str) -> Any:
 
 async def _plotly(request: Request) -> Response:
     headers = {"content-encoding": "gzip", "cache-control": "max-age=86400"}
-    content = await asyncio.to_thread(_plotly_packed)
+    content = await asyncio.to_thread(_compressed_plotly)
     return Response(content, media_type="text/javascript", headers=headers)
 
 
 @cache
-def _plotly_packed() -> bytes:
+def _compressed_plotly() -> bytes:
     from plotly.offline import get_plotlyjs
 
     return gzip.compress(get_plotlyjs().encode(), 6)
 
 
-async def _unusable(request: Request, error: Exception) -> Response:
+async def _bad_request(request: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400)
 
 
-async def _no_room(request: Request, error: Exception) -> Response:
+async def _storage_error(request: Request, error: Exception) -> Response:
     _log.error("a recording cannot be written: %s", error)
     return JSONResponse({"error": f"the recording cannot be written: {error}"}, 507)

@@ -25,12 +25,12 @@ BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
 
 _HEALTH_SECONDS = 1.0
 
-_SURE = 0.7
+_CERTAIN = 0.7
 """Cosine between the vertical and the force above which the force's sign is certain."""
 
 
 class Session:
-    """Stream of one device. Not thread-safe: the caller holds `hub`'s lock.
+    """Stream of one device. Not thread-safe: the caller must hold the hub's lock for the device.
 
     Args:
         device: name of the device.
@@ -55,7 +55,7 @@ class Session:
         self._recording, self._merger = recording, Merger()
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
-        self._words_at = -math.inf
+        self._health_time = -math.inf
         self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
         self.problem, self.words = "", []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
@@ -76,7 +76,7 @@ class Session:
             accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
 
         Returns:
-            Number of samples taken.
+            Number of samples processed.
         """
         self.received = received
         if not self.running:
@@ -101,12 +101,12 @@ class Session:
             self._first_ns = samples[0][0]
         self._file.append(samples, received, fields)
         self._unwritten = [], []
-        coming = deque(fields)
+        pending = deque(fields)
         for time_ns, gyro, accel in samples:
-            while coming and coming[0][0] <= time_ns:
-                self._push_field(*coming.popleft())
+            while pending and pending[0][0] <= time_ns:
+                self._push_field(*pending.popleft())
             self._push((time_ns - self._first_ns) / 1e9, gyro, accel)
-        for time_ns, field in coming:  # ahead of the samples, which wait for the accelerometer
+        for time_ns, field in pending:  # ahead of the samples, which wait for the accelerometer
             self._push_field(time_ns, field)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
@@ -161,7 +161,7 @@ class Session:
         problem = self.problem
         if not problem and self._merger.missing:
             problem = f"no samples of {self._merger.missing}: enable it in the logger"
-        if not problem and self._factor * self._merger.upward < -_SURE:
+        if not problem and self._factor * self._merger.upward < -_CERTAIN:
             other = "-m/s2" if self._factor > 0 else "m/s2"
             problem = (
                 "the accelerometer points down where the phone's own attitude points up, as on an "
@@ -207,9 +207,9 @@ class Session:
         self._update_health(state.time)
 
     def _update_health(self, time: float) -> None:
-        if time - self._words_at < _HEALTH_SECONDS:
+        if time - self._health_time < _HEALTH_SECONDS:
             return
-        self._words_at = time
+        self._health_time = time
         found = findings(self._navigator.health)
         self.words = [{"level": f.level, "text": f.text, "advice": f.advice} for f in found]
 

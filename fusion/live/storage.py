@@ -52,7 +52,7 @@ class LiveFile:
             found = f"{folder}: {error.strerror or error}"
             raise InputError("out", found, "a writable folder") from error
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
-        self._between = ",,,," if magnetic else ","
+        self._empty_columns = ",,,," if magnetic else ","
         self._file.write((MAGNETIC_HEADER if magnetic else HEADER).encode())
 
     def append(
@@ -61,12 +61,12 @@ class LiveFile:
         """Append samples and magnetic fields received at a time [s since 1970].
 
         Raises:
-            OSError: they could not all be written, in which case none is.
+            OSError: they could not all be written; the file is then unchanged.
         """
         end = f"{received:.3f}\n"
         rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
         rows += [
-            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r}{self._between}{end}"
+            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r}{self._empty_columns}{end}"
             for time, g, a in samples
         ]
         _write_whole(self._file, "".join(rows).encode())

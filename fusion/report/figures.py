@@ -31,7 +31,7 @@ def map_figure(
     Args:
         tracks: tracks by name.
         truth: ground truth in the same frame, or None.
-        known: positions or waypoints in the same frame, in place of a true track, or None.
+        known: positions or waypoints in the same frame, if there is no true track, or None.
     """
     figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
@@ -118,8 +118,8 @@ def _axis() -> dict[str, object]:
 def _path(name: str, series: Series, width: float) -> go.Scatter:
     label, colour, dash = style(name)
     sigma = series.horizontal_sigma
-    known = np.full(len(series.time), np.nan) if sigma is None else sigma
-    words = "" if sigma is None else "<br>sigma %{customdata[1]:.2f} m"
+    sigma_column = np.full(len(series.time), np.nan) if sigma is None else sigma
+    sigma_text = "" if sigma is None else "<br>sigma %{customdata[1]:.2f} m"
     return go.Scatter(
         x=series.position[:, 0].round(4),
         y=series.position[:, 1].round(4),
@@ -127,14 +127,14 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
         legendgroup=name,
         mode="lines",
         line={"color": colour, "dash": dash, "width": width},
-        customdata=np.column_stack([series.time, known, series.speed]).round(3),
-        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{words}"
+        customdata=np.column_stack([series.time, sigma_column, series.speed]).round(3),
+        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{sigma_text}"
         "<br>speed %{customdata[2]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
     )
 
 
 def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
-    """Draw some outlines in one trace, separated by nan; skip any too large for the map.
+    """Draw some outlines in one trace, separated by NaN; skip any too large for the map.
 
     Args:
         name: name of the track.
@@ -143,8 +143,8 @@ def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
     """
     _, colour, _ = style(name)
     assert series.position_covariance is not None  # called only where there is one
-    known = np.flatnonzero(np.isfinite(series.position[:, 0]))
-    rows = np.unique(known[np.linspace(0, len(known) - 1, _ELLIPSES).round().astype(int)])
+    valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
+    rows = np.unique(valid[np.linspace(0, len(valid) - 1, _ELLIPSES).round().astype(int)])
     outlines = [(k, ellipse(series.position_covariance[k])) for k in rows]
     parts = [
         np.vstack([series.position[k, :2] + outline, [[np.nan] * 2]])
@@ -167,11 +167,11 @@ def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
 
 def _ends(name: str, series: Series) -> go.Scatter:
     """Mark the start with an open circle and the end with a square."""
-    known = np.flatnonzero(np.isfinite(series.position[:, 0]))
-    at = series.position[known[[0, -1]], :2]
+    valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
+    ends = series.position[valid[[0, -1]], :2]
     return go.Scatter(
-        x=at[:, 0],
-        y=at[:, 1],
+        x=ends[:, 0],
+        y=ends[:, 1],
         legendgroup=name,
         mode="markers",
         marker={
@@ -198,12 +198,12 @@ def _known(known: PositionTrack) -> go.Scatter:
 
 
 def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
-    """Return limits (2, 2) of x and y that fit the truth and all but the inertial-only track."""
-    own = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
-    at = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + own])
+    """Return limits (2, 2) of x and y that fit all tracks except the inertial-only one."""
+    bounded = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
+    points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]
-        at = np.clip(at, low - (high - low).max(), high + (high - low).max())
-    low, high = np.nanmin(at, axis=0), np.nanmax(at, axis=0)
+        points = np.clip(points, low - (high - low).max(), high + (high - low).max())
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = 0.08 * max(1.0, float((high - low).max()))
     return np.stack([low - margin, high + margin], axis=1)

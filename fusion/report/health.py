@@ -25,7 +25,7 @@ GATED_SHARE = 0.1
 """Share of updates treated as outliers above which to warn."""
 
 NIS_RATIO = 2.0
-"""Factor between the mean NIS and its expectation, either way, above which to report it."""
+"""Factor between mean NIS and expectation, in either direction, above which to report it."""
 
 YAW_SIGMA = math.radians(15.0)
 """Standard deviation of yaw [rad] above which the track bends."""
@@ -113,16 +113,16 @@ def _samples(health: Health) -> list[Finding]:
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
     if any(map(_is_set_back, health.notes)):
         dropped.pop("out_of_order", None)  # explained by that note
-    gone = sum(dropped.values())
-    share = gone / max(1, used + gone)
+    count = sum(dropped.values())
+    share = count / max(1, used + count)
     found = []
     if dropped:
         reasons = _counted(dropped)
         advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
-        bad = share > DROPPED_SHARE
+        many = share > DROPPED_SHARE
         amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
         text = f"{amount} of the samples were dropped ({reasons})."
-        found.append(Finding("warning" if bad else "note", text, advice if bad else ""))
+        found.append(Finding("warning" if many else "note", text, advice if many else ""))
     return found
 
 
@@ -141,8 +141,8 @@ def _flagged(health: Health) -> list[Finding]:
 def _gaps(health: Health) -> list[Finding]:
     if not health.gap_count:
         return []
-    several = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
-    text = f"{several} in the samples (longest: {health.longest_gap:.2f} s)."
+    amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
+    text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
     if health.longest_gap < LONG_GAP:
         return [Finding("note", text)]
     advice = (
@@ -171,7 +171,7 @@ def _updates(health: Health) -> list[Finding]:
     elif ratio < 1.0 / NIS_RATIO:
         text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
         advice = (
-            "Innovations say little about the track's sigmas: persistent errors keep them small."
+            "Innovations reveal little about the track's sigmas: persistent errors keep them small."
         )
         found.append(Finding("note", text, advice))
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")
@@ -180,9 +180,9 @@ def _updates(health: Health) -> list[Finding]:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
         advice = "`stario inspect` reports its magnitude, unit and problems."
         found.append(Finding("note", text, advice))
-    left_out = _counted(health.refused)
-    if left_out:
-        found.append(Finding("note", f"Displacements not used: {left_out}."))
+    refused = _counted(health.refused)
+    if refused:
+        found.append(Finding("note", f"Displacements not used: {refused}."))
     return found
 
 
@@ -195,8 +195,8 @@ def _fixes(health: Health) -> list[Finding]:
     if not other:
         return [Finding("note", f"{text}.")]
     reasons = _counted(other)
-    early = ("gated", "waiting", "yaw not known")
-    refused = sum(n for name, n in other.items() if name not in early)
+    harmless = ("gated", "waiting", "yaw not known")
+    refused = sum(n for name, n in other.items() if name not in harmless)
     wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
     if not wrong and other.get("yaw not known", 0) > applied:

@@ -103,11 +103,11 @@ def report_html(
         )
         for name, track in tracks.items()
     }
-    known = None if truth is None else trajectory_series(truth, start)
+    true_series = None if truth is None else trajectory_series(truth, start)
     main = main_track(tracks)
     # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
-    steady = {name: s for name, s in series.items() if name != "inertial"} or series
-    panels = motion_panels(steady, known) + bias_panels(main, series[main])
+    drawn = {name: s for name, s in series.items() if name != "inertial"} or series
+    panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
     innovations = tracks[main].innovations or next(
         (t.innovations for t in tracks.values() if t.innovations), None
     )
@@ -116,7 +116,9 @@ def report_html(
     figures = {
         "map": json.loads(
             map_figure(
-                steady if truth is None else series, known, shown_positions(sequence, tracks[main])
+                drawn if truth is None else series,
+                true_series,
+                shown_positions(sequence, tracks[main]),
             ).to_json()
         ),
         "time": json.loads(time_figure(panels).to_json()),
@@ -132,7 +134,7 @@ def report_html(
             "TABLE": "" if truth is None else _table(metrics, alignment),
             "STYLE": asset("report.css"),
             "SCRIPT": asset("report.js"),
-            "DATA": _script_json({**figures, "cursors": _cursors(steady, main), "main": main}),
+            "DATA": _script_json({**figures, "cursors": _cursors(drawn, main), "main": main}),
             "PLOTLY": get_plotlyjs(),
         }
     )
@@ -174,7 +176,7 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
         facts.append((f"{series.yaw_sigma[-1]:.1f} deg", "final yaw, 1 sigma"))
     end = track.trajectory.position_W[-1] - track.trajectory.position_W[0]
     facts.append((f"{float(np.hypot(*end[:2])):.1f} m", "between start and end"))
-    return "".join(f"<div><b>{value}</b><span>{what}</span></div>" for value, what in facts)
+    return "".join(f"<div><b>{value}</b><span>{label}</span></div>" for value, label in facts)
 
 
 def _legend(names: Sequence[str]) -> str:
@@ -216,11 +218,11 @@ def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
         cells = []
         for key, (_, digits) in _COLUMNS.items():
             value = figures.get(key)
-            known = value is not None and np.isfinite(value)
-            cells.append(f"<td>{value:.{digits}f}</td>" if known else "<td>-</td>")
+            finite = value is not None and np.isfinite(value)
+            cells.append(f"<td>{value:.{digits}f}</td>" if finite else "<td>-</td>")
         rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
     words = metric_words(alignment)
-    told = "".join(
+    explanations = "".join(
         f"<li><b>{title.split()[0]}</b> {html.escape(words[key])}.</li>"
         for key, (title, _) in _COLUMNS.items()
     )
@@ -228,7 +230,7 @@ def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
     return (
         "<h2>Accuracy against ground truth</h2><div class='wide'><table>"
         f"<tr><th></th>{head}</tr>{''.join(rows)}</table></div>"
-        f"<ul class='words'>{told}{aligned}</ul>"
+        f"<ul class='words'>{explanations}{aligned}</ul>"
     )
 
 

@@ -51,7 +51,7 @@ def style(name: str) -> tuple[str, str, str]:
 
 
 def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
-    """Return panels of height, speed and yaw of every track, and of error if there is truth."""
+    """Return panels of height, speed and yaw, and of position error if there is ground truth."""
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     panels = [] if truth is None else [_error_panel(tracks, truth)]
     columns: tuple[tuple[str, str, Column, Column], ...] = (
@@ -82,9 +82,9 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
             continue
         label, traces = style(name)[0], []
         for k, axis in enumerate("xyz"):
-            look = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
+            line_style = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
             value, sigma = bias[0][:, k], bias[1][:, k]
-            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, look)
+            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, line_style)
         words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
         panels.append(Panel(words, traces, {"range": _limits(traces)}))
     return panels
@@ -156,9 +156,9 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
     traces = []
     for name, series in tracks.items():
         inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
-        known = np.isfinite(truth.position[:, 0])
-        at = interpolated(series.time, truth.time[known], truth.position[known, :2])
-        error = np.linalg.norm(series.position[:, :2] - at, axis=1)
+        valid = np.isfinite(truth.position[:, 0])
+        true_position = interpolated(series.time, truth.time[valid], truth.position[valid, :2])
+        error = np.linalg.norm(series.position[:, :2] - true_position, axis=1)
         traces += curve(name, series.time, np.where(inside, error, np.nan), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
 
@@ -167,7 +167,7 @@ def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
 ) -> list[go.Scatter]:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    quiet: dict[str, Any] = {
+    common: dict[str, Any] = {
         "x": _rounded(time),
         "mode": "lines",
         "line": {"width": 0},
@@ -177,8 +177,8 @@ def _band(
     }
     fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
     return [
-        go.Scatter(y=_rounded(value - 3.0 * sigma), **quiet),
-        go.Scatter(y=_rounded(value + 3.0 * sigma), **quiet, **fill),
+        go.Scatter(y=_rounded(value - 3.0 * sigma), **common),
+        go.Scatter(y=_rounded(value + 3.0 * sigma), **common, **fill),
     ]
 
 
@@ -188,7 +188,7 @@ def _dots(
     gated: BoolArray,
     unit: str,
 ) -> list[go.Scatter]:
-    looks: Sequence[tuple[Any, str, dict[str, Any]]] = (
+    marker_styles: Sequence[tuple[Any, str, dict[str, Any]]] = (
         (~gated, "used", {"color": "#0072B2", "size": 3}),
         (gated, "gated", {"color": "#D55E00", "size": 7, "symbol": "x-thin-open"}),
     )
@@ -202,7 +202,7 @@ def _dots(
             marker=marker,
             hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
         )
-        for rows, name, marker in looks
+        for rows, name, marker in marker_styles
         if rows.any()
     ]
 
@@ -220,7 +220,7 @@ def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
 
 
 def _limits(traces: Sequence[go.Scatter]) -> list[float]:
-    """Return axis limits that fit all curves, and the bands except where briefly wide."""
+    """Return axis limits that fit all curves, and the bands except for brief wide parts."""
     curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
     bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
     low, high = np.nanmin(curves), np.nanmax(curves)
@@ -238,5 +238,5 @@ def _whole_turns(yaw: FloatArray, reference: FloatArray) -> float:
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    """Round to screen precision, to keep the file small."""
+    """Return values rounded to screen precision, to keep the file small."""
     return np.round(values, 5).astype(np.float32)

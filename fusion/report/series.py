@@ -17,16 +17,16 @@ MOST_POINTS = 1500
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A track as columns of N rows, nan where poses are not valid.
+    """A track as columns of N rows, NaN where poses are not valid.
 
     Attributes:
-        time: time since the recording's first sample [s].
+        time: (N,) time since the recording's first sample [s].
         position: (N, 3) [m].
-        speed: [m/s].
-        yaw: [deg], unwrapped.
+        speed: (N,) [m/s].
+        yaw: (N,) [deg], unwrapped.
         position_covariance: (N, 3, 3) [m^2], or None.
-        speed_sigma: [m/s], or None.
-        yaw_sigma: [deg], or None.
+        speed_sigma: (N,) [m/s], or None.
+        yaw_sigma: (N,) [deg], or None.
         gyro_bias: (N, 3) [deg/s] and its sigma, or None.
         accel_bias: (N, 3) [m/s^2] and its sigma, or None.
     """
@@ -142,13 +142,13 @@ def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _speed_of(trajectory: Trajectory) -> FloatArray:
-    """Take central differences over half a second either way, to suppress noise of poses."""
+    """Return the speed (N,) by central differences over one second, to suppress noise of poses."""
     t, half = trajectory.time, 0.5
-    known = np.flatnonzero(trajectory.valid)
-    if len(known) < 2:
+    valid = np.flatnonzero(trajectory.valid)
+    if len(valid) < 2:
         return np.full(len(t), np.nan)
-    first, last = t[known[0]], t[known[-1]]
+    first, last = t[valid[0]], t[valid[-1]]
     before, after = (np.clip(t + sign * half, first, last) for sign in (-1.0, 1.0))
-    ends = [interpolated(at, t[known], trajectory.position_W[known]) for at in (before, after)]
+    ends = [interpolated(at, t[valid], trajectory.position_W[valid]) for at in (before, after)]
     span = np.maximum(after - before, 1e-9)
     return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / span)

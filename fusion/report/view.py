@@ -77,15 +77,15 @@ def _log_path(
     rr: Any, stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
 ) -> None:
     """Log a whole path at once, broken where poses are not valid."""
-    known = trajectory.valid
-    cuts = np.flatnonzero(np.diff(known.astype(int))) + 1
+    valid = trajectory.valid
+    cuts = np.flatnonzero(np.diff(valid.astype(int))) + 1
     parts = np.split(trajectory.position_W, cuts)
-    strips = [p for p, ok in zip(parts, np.split(known, cuts), strict=True) if ok.all() and len(p)]
+    strips = [p for p, ok in zip(parts, np.split(valid, cuts), strict=True) if ok.all() and len(p)]
     stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
 
 
 def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
-    """Log the device's axes at its position, and the ellipsoid of its position."""
+    """Log the device's axes at its position, with the 3-sigma ellipsoid of the position."""
     index = _times(rr, trajectory.time[trajectory.valid] - start)
     position = trajectory.position_W[trajectory.valid]
     columns = rr.Transform3D.columns(
@@ -111,13 +111,13 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
 
 
 def _log_sensors(rr: Any, stream: Any, sequence: ImuSequence, start: float) -> None:
-    known = np.isfinite(sequence.time)
-    index = _times(rr, sequence.time[known] - start)
+    finite = np.isfinite(sequence.time)
+    index = _times(rr, sequence.time[finite] - start)
     for name, values in (
         ("gyroscope [rad/s]", sequence.gyro),
         ("specific force [m/s^2]", sequence.accel),
     ):
-        _log_lines(rr, stream, ("sensors", name), index, values[known], "xyz")
+        _log_lines(rr, stream, ("sensors", name), index, values[finite], "xyz")
 
 
 def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
@@ -138,8 +138,8 @@ def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
             _log_lines(rr, stream, ("estimate", name), index, values, labels)
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        at, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
-        _log_lines(rr, stream, ("estimate", "NIS [1]"), at, nis, ["NIS"])
+        update_index, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
+        _log_lines(rr, stream, ("estimate", "NIS [1]"), update_index, nis, ["NIS"])
 
 
 def _log_lines(

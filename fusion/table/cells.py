@@ -1,7 +1,7 @@
 """One cell of the table: a network on a data set with a seed, filled once and kept as files.
 
 `<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
-done, then `errors.json` and `tracks.npz`. Filling a cell again does only what is missing.
+done, then `errors.json` and `tracks.npz`. Filling a cell again adds only what is missing.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Cell:
 
     Attributes:
         dataset: data set, with the recordings of each part.
-        network: architecture to train; otherwise `pdr` or weights as `load_model` accepts them.
+        network: architecture to train, or `pdr`, or weights as `load_model` accepts them.
         seed: seed of the training.
         recipe: training recipe; None where nothing is trained.
     """
@@ -58,7 +58,7 @@ class Cell:
     @property
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
-        test = [str(one.path) for one in self.dataset.test]
+        test = [str(entry.path) for entry in self.dataset.test]
         trained = "" if self.recipe is None else recipe_digest(self.recipe, self.dataset)
         return hashlib.sha256(json.dumps([self.network, trained, test]).encode()).hexdigest()
 
@@ -134,7 +134,7 @@ def _evaluate(cell: Cell, folder: Path, reading: ReaderConfig) -> None:
         "seed": cell.seed,
         "seconds": process_time() - began,
         "recordings": found,
-        "skipped": [asdict(one) for one in skipped],
+        "skipped": [asdict(failure) for failure in skipped],
     }
     write_json(folder / "errors.json", content)
 

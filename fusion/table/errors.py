@@ -32,7 +32,7 @@ TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
 
-_SHOWN = 4
+_MAX_DRAWN = 4
 """Number of recordings per cell whose tracks are kept for figures."""
 
 
@@ -62,19 +62,19 @@ def test_errors(
     found: list[dict[str, object]] = []
     shown: dict[str, Shown] = {}
     skipped: list[Skipped] = []
-    paths = [one.path for one in test]
+    paths = [entry.path for entry in test]
     outcomes = prepared_recordings(paths, reading.read, reading.options, reading.cache, 1)
-    for one, outcome in zip(test, outcomes, strict=True):
+    for entry, outcome in zip(test, outcomes, strict=True):
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
             continue
         try:
             row, track = _recording(model, outcome, reading)
         except StarioError as error:
-            skipped.append(Skipped(str(one.path), str(error)))
+            skipped.append(Skipped(str(entry.path), str(error)))
             continue
-        found.append({"path": str(one.path), "group": one.group, **row})
-        if track is not None and len(shown) < _SHOWN:
+        found.append({"path": str(entry.path), "group": entry.group, **row})
+        if track is not None and len(shown) < _MAX_DRAWN:
             shown[outcome.name] = track
     return found, shown, skipped
 
@@ -98,11 +98,11 @@ def _recording(
     assert sequence.truth is not None  # guaranteed by its kind
     tracks = _tracks(model, sequence)
     row["tracks"] = {name: _errors(track, sequence.truth) for name, track in tracks.items()}
-    known = tracks.get(TRUE_ATTITUDE)
-    if known is None:
+    true_attitude = tracks.get(TRUE_ATTITUDE)
+    if true_attitude is None:
         return row, None
-    blocks["ate"] = _blocks(known, sequence.truth)
-    return row, _shown(known, sequence.truth)
+    blocks["ate"] = _blocks(true_attitude, sequence.truth)
+    return row, _shown(true_attitude, sequence.truth)
 
 
 def _tracks(model: Model, sequence: ImuSequence) -> dict[str, Trajectory]:
@@ -131,8 +131,8 @@ def _blocks(track: Trajectory, truth: Trajectory) -> list[list[float]]:
     time = errors.estimate.time
     block = np.floor((time - time[0]) / BLOCK_SECONDS).astype(int)
     rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
-    kept: list[list[float]] = rows[rows[:, 1] > 0].tolist()
-    return kept
+    blocks: list[list[float]] = rows[rows[:, 1] > 0].tolist()
+    return blocks
 
 
 def _shown(track: Trajectory, truth: Trajectory) -> Shown:

@@ -1,4 +1,4 @@
-"""The tables and figures that are written next to the cells."""
+"""Tables and figures written next to the cells."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from stario.sequences.sequence import FloatArray, Trajectory
 def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
     """Return parameters, FLOPs, memory and time, measured once per folder and network."""
     path = out / "costs.json"
-    known = {}
+    measured = {}
     if path.exists():
         rows = [ModelRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
-        known = {row.name: row for row in rows}
-    missing = [name for name in names if name not in known]
+        measured = {row.name: row for row in rows}
+    missing = [name for name in names if name not in measured]
     if missing:
-        known |= {row.name: row for row in survey(missing)}
-        write_json(path, [row.as_dict() for row in known.values()])
-    return [known[name] for name in names]
+        measured |= {row.name: row for row in survey(missing)}
+        write_json(path, [row.as_dict() for row in measured.values()])
+    return [measured[name] for name in names]
 
 
 def write_results(
@@ -98,11 +98,11 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
     )
     for name in names:
         for seed, content in filled[name].items():
-            for one in content["recordings"]:
-                for protocol, errors in one["tracks"].items():
+            for recording in content["recordings"]:
+                for protocol, errors in recording["tracks"].items():
                     values = (_number(errors[metric]) for metric in METRICS)
                     table.entries.append(
-                        Entry(one["recording"], name, f"seed {seed}", protocol, *values)
+                        Entry(recording["recording"], name, f"seed {seed}", protocol, *values)
                     )
     return table
 
@@ -114,7 +114,7 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
         content = filled.get(cell.network, {}).get(cell.seed)
         if cell.recipe is None or cell.seed != 0 or content is None:
             continue
-        found = {one["recording"]: one["tracks"] for one in content["recordings"]}
+        found = {recording["recording"]: recording["tracks"] for recording in content["recordings"]}
         for name, shown in read_tracks(cell, out).items():
             track = _level(shown.time, shown.position_W)
             truth = _level(shown.time, shown.truth_W)
@@ -126,7 +126,7 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
 
 
 def _number(value: float | None) -> float:
-    """Replace None, which stands for nan in JSON."""
+    """Return a number; NaN for None, which stands for it in JSON."""
     return float("nan") if value is None else value
 
 

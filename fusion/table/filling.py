@@ -1,4 +1,4 @@
-"""The cells of the table, the most important first, and filling them in parallel."""
+"""Cells of the table, the most important first, and their filling in parallel."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def table_cells(
     def filled(dataset: DataSet, members: Sequence[str], seed: int) -> list[Cell]:
         return [Cell(dataset, n, seed, cell_recipe(recipe, n, seed, steps)) for n in members]
 
-    first = [one for one in sets if one.name in FIRST]
-    others = [one for one in sets if one.name not in FIRST]
+    first = [dataset for dataset in sets if dataset.name in FIRST]
+    others = [dataset for dataset in sets if dataset.name not in FIRST]
     leading = [name for name in names if name in LEADING]
     cells = []
     for part in (first, others):
@@ -83,14 +83,14 @@ def backend(name: str) -> AbstractContextManager[object]:
         ConfigError: the name is unknown.
         InputError: the backend's package is not installed.
     """
-    known: dict[str, Callable[[], AbstractContextManager[object]]] = {
+    backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
         "loky": nullcontext,
         "dask": _dask,
         "ray": _ray,
     }
-    if name not in known:
-        raise ConfigError("--backend", repr(name), f"one of {', '.join(known)}")
-    return known[name]()
+    if name not in backends:
+        raise ConfigError("--backend", repr(name), f"one of {', '.join(backends)}")
+    return backends[name]()
 
 
 @contextmanager

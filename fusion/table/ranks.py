@@ -52,21 +52,21 @@ def ranks(
     if not common:
         return {}
     names = list(networks)
-    whole = np.array([np.mean([_score(one, common) for one in networks[n]]) for n in names])
-    drawn = np.stack(
-        [np.mean([_drawn(one, common, seed) for one in networks[n]], axis=0) for n in names]
+    scores = np.array([np.mean([_score(run, common) for run in networks[n]]) for n in names])
+    replicates = np.stack(
+        [np.mean([_replicates(run, common, seed) for run in networks[n]], axis=0) for n in names]
     )
     tail = 50.0 * (1.0 - CONFIDENCE)
-    places = drawn.argsort(axis=0).argsort(axis=0) + 1
+    places = replicates.argsort(axis=0).argsort(axis=0) + 1
     low, high = np.percentile(places, [tail, 100.0 - tail], axis=1, method="nearest")
-    rank = whole.argsort().argsort() + 1
+    rank = scores.argsort().argsort() + 1
     found = {}
     for k, name in enumerate(names):
         ratio = None
         if against in networks and name != against:
-            other = names.index(against)
-            bounds = np.percentile(drawn[k] - drawn[other], [tail, 100.0 - tail])
-            values = np.exp([whole[k] - whole[other], *bounds])
+            reference = names.index(against)
+            bounds = np.percentile(replicates[k] - replicates[reference], [tail, 100.0 - tail])
+            values = np.exp([scores[k] - scores[reference], *bounds])
             ratio = Interval(*(float(value) for value in values))
         found[name] = Rank(int(rank[k]), int(low[k]), int(high[k]), ratio)
     return found
@@ -74,10 +74,10 @@ def ranks(
 
 def _common(networks: Mapping[str, Sequence[Recordings]]) -> dict[str, list[str]]:
     """Return the names of the recordings that every network has errors on, by set."""
-    runs = [one for seeds in networks.values() for one in seeds]
-    known = [{(stratum, name) for stratum, name, _ in one} for one in runs]
+    runs = [run for seeds in networks.values() for run in seeds]
+    recordings = [{(stratum, name) for stratum, name, _ in run} for run in runs]
     strata: dict[str, list[str]] = {}
-    for stratum, name in sorted(set.intersection(*known)) if known else []:
+    for stratum, name in sorted(set.intersection(*recordings)) if recordings else []:
         strata.setdefault(stratum, []).append(name)
     return strata
 
@@ -92,7 +92,7 @@ def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
     return float(np.mean(means))
 
 
-def _drawn(run: Recordings, common: Mapping[str, Sequence[str]], seed: int) -> FloatArray:
+def _replicates(run: Recordings, common: Mapping[str, Sequence[str]], seed: int) -> FloatArray:
     """Return the score of every replicate (R,); draws depend only on seed and recordings."""
     blocks = {(stratum, name): value for stratum, name, value in run}
     strata = []

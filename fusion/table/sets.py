@@ -84,14 +84,14 @@ def development_sets(
     Raises:
         InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
-    known = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
+    available = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
     for name in chosen or ():
-        if name not in known:
-            raise InputError("--sets", repr(name), f"one of {', '.join(known)}")
+        if name not in available:
+            raise InputError("--sets", repr(name), f"one of {', '.join(available)}")
     recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
-        _together(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
-        for name in known
+        _combined(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
+        for name in available
         if chosen is None or name in chosen
     ]
 
@@ -107,7 +107,7 @@ def folder_set(name: str, folder: Path, seed: int) -> DataSet:
 
 
 def _single(name: str, recordings: Iterable[ListEntry], seed: int) -> DataSet:
-    return _split(name, [one for one in recordings if _set_of(one) in _MEMBERS[name]], seed)
+    return _split(name, [entry for entry in recordings if _set_of(entry) in _MEMBERS[name]], seed)
 
 
 def _split(name: str, recordings: Sequence[ListEntry], seed: int) -> DataSet:
@@ -116,55 +116,57 @@ def _split(name: str, recordings: Sequence[ListEntry], seed: int) -> DataSet:
     split = random_split(walks, seed)
 
     def members(part: tuple[Path, ...]) -> list[ListEntry]:
-        return [one for walk in part for one in walks[walk]]
+        return [entry for walk in part for entry in walks[walk]]
 
     return DataSet(
         name,
-        tuple(one.path for one in members(split.training)),
-        tuple(one.path for one in members(split.validation)),
-        tuple(ListEntry(one.path, _set_of(one)) for one in members(split.test)),
+        tuple(entry.path for entry in members(split.training)),
+        tuple(entry.path for entry in members(split.validation)),
+        tuple(ListEntry(entry.path, _set_of(entry)) for entry in members(split.test)),
         f"random 8:1:1 split by recording, seed {seed}",
     )
 
 
-def _walk(one: ListEntry) -> Path:
+def _walk(entry: ListEntry) -> Path:
     """Return the walk: KIPD's S9 and S20 recordings of one name are two phones on one walk."""
-    return one.path.with_name(re.sub(r"(?<=\w)S(9|20)$", "", one.path.name))
+    return entry.path.with_name(re.sub(r"(?<=\w)S(9|20)$", "", entry.path.name))
 
 
-def _together(data: Path, seed: int, per_group: int) -> DataSet:
+def _combined(data: Path, seed: int, per_group: int) -> DataSet:
     """Combine all sets, tested on people, devices and places unseen in training."""
     held_out = read_packaged_list("holdout", data)
-    held = {one.path for one in held_out}
-    outside = [one for one in read_packaged_list("all", data) if one.path not in held]
+    held_paths = {entry.path for entry in held_out}
+    outside = [entry for entry in read_packaged_list("all", data) if entry.path not in held_paths]
     rng = np.random.default_rng(seed)
     validation = {
-        one.path
+        entry.path
         for members in _by(outside, _set_of).values()
-        for walk in _some(list(_by(members, _walk).values()), rng)
-        for one in walk
+        for walk in _validation_walks(list(_by(members, _walk).values()), rng)
+        for entry in walk
     }
     test = [
-        ListEntry(one.path, name)
-        for name, members in _by(held_out, lambda one: one.group).items()
-        for one in _spread(members, per_group)
+        ListEntry(entry.path, name)
+        for name, members in _by(held_out, lambda entry: entry.group).items()
+        for entry in _spread(members, per_group)
     ]
     return DataSet(
         ALL,
-        tuple(one.path for one in outside if one.path not in validation),
-        tuple(one.path for one in outside if one.path in validation),
-        tuple(ListEntry(one.path, _set_of(one)) for one in test),
+        tuple(entry.path for entry in outside if entry.path not in validation),
+        tuple(entry.path for entry in outside if entry.path in validation),
+        tuple(ListEntry(entry.path, _set_of(entry)) for entry in test),
         f"tested on people, devices and places of the list `holdout`, at most {per_group} "
         f"recordings of each; validated on a random {_VALIDATION_SHARE:.0%} of each set's other "
         f"walks, seed {seed}",
     )
 
 
-def _set_of(one: ListEntry) -> str:
-    return one.group.split(" ")[0]
+def _set_of(entry: ListEntry) -> str:
+    return entry.group.split(" ")[0]
 
 
-def _some(walks: list[list[ListEntry]], rng: np.random.Generator) -> list[list[ListEntry]]:
+def _validation_walks(
+    walks: list[list[ListEntry]], rng: np.random.Generator
+) -> list[list[ListEntry]]:
     """Return those used for validation."""
     count = max(1, round(_VALIDATION_SHARE * len(walks)))
     return [walks[k] for k in rng.permutation(len(walks))[:count]]
@@ -174,16 +176,16 @@ def _by(
     recordings: Iterable[ListEntry], key: Callable[[ListEntry], Key]
 ) -> dict[Key, list[ListEntry]]:
     parts: dict[Key, list[ListEntry]] = {}
-    for one in recordings:
-        parts.setdefault(key(one), []).append(one)
+    for entry in recordings:
+        parts.setdefault(key(entry), []).append(entry)
     return parts
 
 
-def _spread(members: Sequence[ListEntry], most: int) -> list[ListEntry]:
+def _spread(members: Sequence[ListEntry], maximum: int) -> list[ListEntry]:
     """Return up to `most` of them, evenly spaced from the first to the last."""
-    count = min(most, len(members))
-    at = np.linspace(0, len(members) - 1, count).round().astype(int)
-    return [members[k] for k in at]
+    count = min(maximum, len(members))
+    indices = np.linspace(0, len(members) - 1, count).round().astype(int)
+    return [members[k] for k in indices]
 
 
 def learned_from(data: Path) -> dict[str, frozenset[Path]]:
@@ -192,6 +194,6 @@ def learned_from(data: Path) -> dict[str, frozenset[Path]]:
     Raises:
         InputError: a recording of the packaged lists is missing.
     """
-    known = frozenset(one.path for one in read_packaged_list("all", data))
-    held = frozenset(one.path for one in read_packaged_list("holdout", data))
-    return {"default": known, "first-stage": known - held}
+    everything = frozenset(entry.path for entry in read_packaged_list("all", data))
+    held_out = frozenset(entry.path for entry in read_packaged_list("holdout", data))
+    return {"default": everything, "first-stage": everything - held_out}

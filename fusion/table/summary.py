@@ -31,7 +31,7 @@ class Column:
 
     Attributes:
         title: title of the column.
-        value: function that returns a recording's value; nan if it has none.
+        value: function that returns a recording's value; NaN if it has none.
     """
 
     title: str
@@ -39,16 +39,16 @@ class Column:
 
 
 def _track(track: str, metric: str, scale: float = 1.0) -> Callable[[Recording], float]:
-    def value(one: Recording) -> float:
-        found = one["tracks"].get(track, {}).get(metric)
+    def value(recording: Recording) -> float:
+        found = recording["tracks"].get(track, {}).get(metric)
         return float("nan") if found is None else scale * float(found)
 
     return value
 
 
 def _figure(kind: str, figure: str) -> Callable[[Recording], float]:
-    def value(one: Recording) -> float:
-        found = one["figures"].get(figure) if one["kind"] == kind else None
+    def value(recording: Recording) -> float:
+        found = recording["figures"].get(figure) if recording["kind"] == kind else None
         return float("nan") if found is None else float(found)
 
     return value
@@ -149,28 +149,34 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
         filled: contents of its filled cells.
         learned: recordings that packaged weights were trained on, by the weights' name.
     """
-    poses = all(one["kind"] == "poses" for c in _contents(filled) for one in c["recordings"])
+    poses = all(
+        recording["kind"] == "poses" for c in _contents(filled) for recording in c["recordings"]
+    )
     measure = "ate" if poses else "10"
     blocks = {name: _blocks(seeds, measure) for name, seeds in filled.items()}
-    placed = ranks({name: runs for name, runs in blocks.items() if all(runs)}, REFERENCE_NETWORK)
+    network_ranks = ranks(
+        {name: runs for name, runs in blocks.items() if all(runs)}, REFERENCE_NETWORK
+    )
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
-    test = {one.path for one in dataset.test}
+    test = {entry.path for entry in dataset.test}
     rows = [
-        _row(name, filled[name], placed.get(name), len(test & learned.get(name, frozenset())))
+        _row(
+            name, filled[name], network_ranks.get(name), len(test & learned.get(name, frozenset()))
+        )
         for name in order
     ]
     first = next(iter(_contents(filled)), None)
     recordings = first["recordings"] if first else []
     skipped = [
-        f"{one['item']}: {one['reason']}"
+        f"{failure['item']}: {failure['reason']}"
         for c in _contents(filled)
-        for one in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
+        for failure in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
     ]
     return SetTable(
         dataset,
         len(recordings),
-        float(sum(one["path_m"] for one in recordings)),
+        float(sum(recording["path_m"] for recording in recordings)),
         rows,
         "position error under the paper's protocol"
         if poses
@@ -207,37 +213,40 @@ def _contents(filled: Filled) -> Iterable[Content]:
 def _row(name: str, seeds: Mapping[int, Content], rank: Rank | None, learned: int) -> Row:
     figures = {}
     for key, column in COLUMNS.items():
-        means = [_mean([column.value(one) for one in c["recordings"]]) for c in seeds.values()]
+        means = [
+            _mean([column.value(recording) for recording in c["recordings"]])
+            for c in seeds.values()
+        ]
         found = _over_seeds(means)
         if found is not None:
             figures[key] = found
     trained = [c["trained"] for c in seeds.values() if "trained" in c]
     errors = [
-        _over_seeds([one[key] for one in trained])
+        _over_seeds([recording[key] for recording in trained])
         for key in ("training_error_m2", "validation_error_m2")
     ]
     return Row(name, sorted(seeds), figures, errors[0], errors[1], rank, learned)
 
 
 def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else float("nan")
 
 
 def _over_seeds(values: Sequence[float]) -> Mean | None:
-    known = [value for value in values if np.isfinite(value)]
-    if not known:
+    finite = [value for value in values if np.isfinite(value)]
+    if not finite:
         return None
-    error = float(np.std(known, ddof=1) / np.sqrt(len(known))) if len(known) > 1 else None
-    return Mean(float(np.mean(known)), error)
+    error = float(np.std(finite, ddof=1) / np.sqrt(len(finite))) if len(finite) > 1 else None
+    return Mean(float(np.mean(finite)), error)
 
 
 def _blocks(seeds: Mapping[int, Content], measure: str) -> list[Recordings]:
     return [
         [
-            (one["group"], one["path"], np.array(one["blocks"][measure]))
-            for one in content["recordings"]
-            if one["blocks"].get(measure)
+            (recording["group"], recording["path"], np.array(recording["blocks"][measure]))
+            for recording in content["recordings"]
+            if recording["blocks"].get(measure)
         ]
         for content in seeds.values()
     ]

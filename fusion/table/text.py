@@ -95,8 +95,10 @@ def _set_text(table: SetTable) -> str:
         cells += [_cell(row.figures.get(key)) for key in keys]
         cells += [*_rank(row.rank), _cell(row.training_error), _cell(row.validation_error)]
         if paper:
-            known = published(dataset.name, row.network)
-            cells.append("" if known is None else f"{known[0]:.3f}, {known[1]:.3f}")
+            paper_errors = published(dataset.name, row.network)
+            cells.append(
+                "" if paper_errors is None else f"{paper_errors[0]:.3f}, {paper_errors[1]:.3f}"
+            )
         lines.append(f"| {' | '.join(cells)} |")
     if table.skipped:
         lines += ["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
@@ -108,8 +110,8 @@ def _title(row: Row, tested: int) -> str:
         return "pedestrian dead reckoning (`pdr`)"
     if row.network in ARCHITECTURES:
         return row.network
-    known = f", trained on {row.learned} of these {tested}" if row.learned else ""
-    return f"weights `{row.network}`{known}"
+    note = f", trained on {row.learned} of these {tested}" if row.learned else ""
+    return f"weights `{row.network}`{note}"
 
 
 def _rank(rank: Rank | None) -> tuple[str, str]:
@@ -145,11 +147,11 @@ def _cost_text(costs: Sequence[ModelRow], work: Work) -> str:
             "" if speed != speed else f"{speed:.0f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    whole = [sum(times[k] for times in work.values()) / 3600.0 for k in (0, 1)]
+    totals = [sum(times[k] for times in work.values()) / 3600.0 for k in (0, 1)]
     lines += [
         "",
-        f"Total: {sum(whole):.2f} core hours, {whole[0]:.2f} for training and {whole[1]:.2f} for "
-        "evaluation. Time per window: on this machine, one thread per core that PyTorch uses; "
+        f"Total: {sum(totals):.2f} core hours, {totals[0]:.2f} for training and {totals[1]:.2f} "
+        "for evaluation. Time per window: on this machine, one thread per core that PyTorch uses; "
         "memory: weights and results of one inference (`stario check models`).",
     ]
     return "\n".join(lines)

@@ -43,7 +43,7 @@ class ReaderConfig:
     Attributes:
         read: function that reads the recording at a path; must be picklable.
         options: what `read` depends on besides the path, as plain values.
-        cache: folder that keeps windows for the next cell.
+        cache: folder that caches windows for later cells.
     """
 
     read: Callable[[Path], ImuSequence]
@@ -69,8 +69,8 @@ def cell_recipe(
     steps = recipe.steps if steps is None else steps
     epochs = max(1, math.ceil(steps / _EPOCH_STEPS))
     per_epoch = max(1, round(steps / epochs))
-    timed = {"epochs": epochs, "epoch_windows": per_epoch * recipe.batch, "patience": epochs}
-    return training_config({**values, "architecture": network, "seed": seed, **timed})
+    lengths = {"epochs": epochs, "epoch_windows": per_epoch * recipe.batch, "patience": epochs}
+    return training_config({**values, "architecture": network, "seed": seed, **lengths})
 
 
 def train_cell(
@@ -88,9 +88,9 @@ def train_cell(
     streams, skipped = _streams(dataset.training, recipe, reading)
     held_out, missing = _streams(dataset.validation, recipe, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
-    poses = any(isinstance(s, WorldStream) for one in streams for s in one.streams)
+    poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
     material = mix_sources(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
-    kept = mix_sources(held_out, [])
+    validation_data = mix_sources(held_out, [])
     clock = _Clock(folder / TEMPORARY_FILES[1])
 
     def finished(report: EpochReport) -> None:
@@ -101,14 +101,15 @@ def train_cell(
         recipe,
         material.streams,
         material.weights,
-        [s.part(0, _VALIDATION_SAMPLES) for s in kept.streams] or simulated(_VALIDATION_WALKS, 1),
+        [s.part(0, _VALIDATION_SAMPLES) for s in validation_data.streams]
+        or simulated(_VALIDATION_WALKS, 1),
         folder,
         on_step=lambda step, error: clock.step(),
         on_epoch=finished,
         trained_on=material.words,
         legs=material.legs,
-        validation_legs=kept.legs,
-        chosen_by_legs=not kept.streams,
+        validation_legs=validation_data.legs,
+        chosen_by_legs=not validation_data.streams,
     )
     clock.keep()
     history = json.loads((folder / "log.json").read_text(encoding="utf-8"))
@@ -120,17 +121,17 @@ def train_cell(
         "training_error_m2": history[-1]["training_error"],
         "validation_error_m2": history[-1]["validation_error"],
         "recipe": asdict(recipe),
-        "skipped": [asdict(one) for one in skipped + missing],
+        "skipped": [asdict(failure) for failure in skipped + missing],
     }
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
-    """Return the digest of all that a cell's training depends on except the code."""
-    told = [
+    """Return the digest of everything that a cell's training depends on except the code."""
+    inputs = [
         asdict(recipe),
         [[str(path) for path in part] for part in (dataset.training, dataset.validation)],
     ]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
 def _streams(
@@ -138,21 +139,25 @@ def _streams(
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of each recording; later cells of the same set reuse them."""
     key = (tuple(files), recipe.attitude, reading.cache)
-    if key not in _open:
+    if key not in _open_streams:
         outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, recipe.attitude)
         found = list(zip(files, outcomes, strict=True))
-        known = [RecordingStreams(path, one) for path, one in found if not isinstance(one, Skipped)]
-        skipped = [one for _, one in found if isinstance(one, Skipped)]
-        while len(_open) >= _MOST_OPEN:
-            _open.pop(next(iter(_open)))
-        _open[key] = known, skipped
-    return _open[key]
+        streams = [
+            RecordingStreams(path, outcome)
+            for path, outcome in found
+            if not isinstance(outcome, Skipped)
+        ]
+        skipped = [outcome for _, outcome in found if isinstance(outcome, Skipped)]
+        while len(_open_streams) >= _MAX_OPEN:
+            _open_streams.pop(next(iter(_open_streams)))
+        _open_streams[key] = streams, skipped
+    return _open_streams[key]
 
 
-_MOST_OPEN = 2
+_MAX_OPEN = 2
 """Maximum parts of sets whose streams a process keeps open: the two of one cell."""
 
-_open: dict[object, tuple[list[RecordingStreams], list[Skipped]]] = {}
+_open_streams: dict[object, tuple[list[RecordingStreams], list[Skipped]]] = {}
 
 
 def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
@@ -179,7 +184,7 @@ class _Clock:
 
     @property
     def step_seconds(self) -> float:
-        """Mean over the steps that were timed from start to end; nan if there are none."""
+        """Mean over the steps that were timed from start to end; NaN if there are none."""
         return sum(self._steps) / len(self._steps) if self._steps else float("nan")
 
     def step(self) -> None:

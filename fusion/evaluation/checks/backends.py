@@ -65,14 +65,14 @@ def score_walk(seed: int, seconds: float) -> Score:
         gyro_turn_on=PHONE_IMU.gyro_turn_on,
         accel_turn_on=PHONE_IMU.accel_turn_on,
     )
-    known = FilterConfig(
+    matched = FilterConfig(
         update_rate=1,
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         adaptive=False,
     )
-    config = NavigatorConfig(noise=errors.noise, filter=known)
+    config = NavigatorConfig(noise=errors.noise, filter=matched)
     walk = generate_walk(seed, seconds)
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
     preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
@@ -84,10 +84,10 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
     """Score a recording, measured by a network.
 
     Raises:
-        InputError: it has no truth, is too short, or its units or rate are wrong.
+        InputError: it has no true poses, is too short, or its units or rate are wrong.
     """
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     preprocessed = Navigator(model, config).observe(sequence)
     return _scored(sequence.name, preprocessed, sequence.truth, config)
 
@@ -134,10 +134,10 @@ def score_table(scores: Sequence[Score]) -> str:
 
 
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the geometric mean (3,) over recordings of the ratio of errors (N, 3) to the EKF's.
+    """Return the geometric mean (3,) of the ratios of errors (N, 3) to the EKF's, and its error.
 
-    Its standard error (3,) is returned as well; without it two similar estimators seem to differ:
-    the ratio of their medians changes by a tenth with another twenty walks.
+    Without the standard error (3,), two similar estimators seem to differ: the ratio of their
+    medians changes by a tenth with another twenty walks.
     """
     logs = np.log(ate / ate[:, :1])
     mean = np.exp(logs.mean(axis=0))

@@ -74,15 +74,15 @@ class FilterSpeed:
 
 
 def filter_speed() -> FilterSpeed:
-    """Time the filter on a swaying device measured by displacements."""
+    """Time the filter and its dense counterpart on a swaying device with displacements."""
     data, slots = _SwayingDevice(), round(_UPDATE_RATE * _WINDOW) + 1
     engines = [StateCloningEkf(slots), DenseEkf(slots)]
     best = np.full(3, np.inf)
     for _ in range(_RUNS):
         seconds = [_timed(data.run, ekf) for ekf in engines]
         best = np.minimum(best, [*seconds, _timed(data.preintegrate)])
-    structured, dense, folding = (best * 60.0 / _DURATION).tolist()
-    return FilterSpeed(structured, dense, folding, engines[0].dim_x)
+    structured, dense, preintegration = (best * 60.0 / _DURATION).tolist()
+    return FilterSpeed(structured, dense, preintegration, engines[0].dim_x)
 
 
 class _SwayingDevice:
@@ -108,13 +108,13 @@ class _SwayingDevice:
         zero = np.zeros(3)
         ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, np.eye(CORE) * 1e-4))
         covariance = np.eye(3) * 0.01 * self.per_window
-        held = [ekf.clone()]
+        clones = [ekf.clone()]
         for k, displacement in enumerate(self.displacements):
             ekf.propagate(self._segment(k * self.per_segment, ekf.state.b_g, ekf.state.b_a))
-            held.append(ekf.clone())
-            if len(held) > self.per_window:
-                ekf.update_displacement(held[0], held[-1], displacement, covariance, gate=16.3)
-                ekf.release(held.pop(0))
+            clones.append(ekf.clone())
+            if len(clones) > self.per_window:
+                ekf.update_displacement(clones[0], clones[-1], displacement, covariance, gate=16.3)
+                ekf.release(clones.pop(0))
 
     def _segment(self, first: int, b_g: FloatArray, b_a: FloatArray) -> Segment:
         part = slice(first, first + self.per_segment + 1)

@@ -46,7 +46,7 @@ NEES of the first minute is 19 instead of 16."""
 
 @dataclass(frozen=True)
 class Consistency:
-    """Averages over the runs, and the bounds a consistent filter keeps in 95 of 100 trials.
+    """Averages over the runs, and bounds that a consistent filter meets in 95 of 100 trials.
 
     Attributes:
         runs: number of runs.
@@ -91,7 +91,7 @@ def consistency(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Consistency:
-    """Run the filter on simulated walks with errors as large as its configuration states.
+    """Run the filter on simulated walks with errors drawn from its configured standard deviations.
 
     Args:
         config: configuration of the filter and noise of the simulated IMU.
@@ -197,7 +197,7 @@ def _run(
     """Return NEES, squared yaw error and yaw variance (M, 3) at every second, and the mean NIS."""
     rng = np.random.default_rng(seed)
     walk = analytic_walk(seconds, rng, config.gravity)
-    prior, b_g, b_a = _first_errors(walk, config, yaw_sigma, rng)
+    prior, b_g, b_a = _drawn_start(walk, config, yaw_sigma, rng)
     white, noise = math.sqrt(RATE), config.noise
     for bias, density in ((b_g, noise.gyro_walk), (b_a, noise.accel_walk)):
         bias += density * rng.normal(size=bias.shape).cumsum(axis=0) / white
@@ -209,7 +209,7 @@ def _run(
     estimator = Estimator(config, front_end.start, prior)
     rows = []
     for count, interval in enumerate(intervals, 1):
-        estimator.step(interval, _seen(walk, interval, config, rng))
+        estimator.step(interval, _drawn_displacement(walk, interval, config, rng))
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
             now = estimator.estimate()
@@ -217,10 +217,10 @@ def _run(
     return np.array(rows), float(estimator.innovations().nis.mean())
 
 
-def _first_errors(
+def _drawn_start(
     walk: AnalyticWalk, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
-    """Draw the prior of the first pose, and return it with the true biases (N, 3)."""
+    """Draw the prior on the first pose and the true biases (N, 3)."""
     f = config.filter
     tilt, yaw, velocity, position = f.tilt_sigma, yaw_sigma, f.velocity_sigma, _POSITION_SIGMA
     theta = np.array([tilt, tilt, yaw]) * rng.normal(size=3)
@@ -239,7 +239,7 @@ def _first_errors(
     return prior, b_g, b_a
 
 
-def _seen(
+def _drawn_displacement(
     walk: AnalyticWalk, interval: ImuInterval, config: NavigatorConfig, rng: np.random.Generator
 ) -> Displacement | None:
     """Draw a window's displacement in its levelled frame, with the noise the filter assumes."""

@@ -1,4 +1,4 @@
-"""Faults to put into a recording: each changes its samples or its measured displacements."""
+"""Faults to inject into a recording: each modifies its samples or its measured displacements."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 
 ModifySamples = Callable[[ImuSequence, np.random.Generator], ImuSequence]
 ModifyPredictions = Callable[[FloatArray, FloatArray, FloatArray, np.random.Generator], None]
-"""Changes measured displacements (M, 3) and covariances (M, 3, 3) in place; the first argument is
-the share (M,) of all windows that are complete at each one's end."""
+"""Function that modifies displacements (M, 3) and covariances (M, 3, 3) in place. Its first
+argument is the fraction (M,) of all windows up to and including each."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault.
+    """A fault of the samples or of the network's predictions.
 
     Attributes:
         name: name in the table.
-        modify_samples: change to the recording; None for none.
-        modify_predictions: change to the network's predictions; None for none.
+        modify_samples: function that returns the recording with the fault; None for no change.
+        modify_predictions: function that modifies the predictions; None for no change.
     """
 
     name: str
@@ -44,8 +44,8 @@ def faults(duration: float) -> list[Fault]:
         *(Fault(f"{rate:g} Hz", _resampled(rate)) for rate in (190.0, 500.0)),
         Fault("accelerometer clipped", _clipped(0.98)),
         *(Fault(f"one NaN in {field}", _one_nan(field)) for field in ("time", "gyro", "accel")),
-        Fault("one NaN from the network", modify_predictions=_nan_answer(0)),
-        Fault("one NaN in the covariance", modify_predictions=_nan_answer(1)),
+        Fault("one NaN from the network", modify_predictions=_nan_prediction(0)),
+        Fault("one NaN in the covariance", modify_predictions=_nan_prediction(1)),
         Fault("1 % duplicated, 1 % swapped", _reordered(0.01)),
         Fault("three wild timestamps", _wild_times(3)),
         Fault("ten spikes", _spikes(10)),
@@ -54,35 +54,35 @@ def faults(duration: float) -> list[Fault]:
 
 def _offset_block(share: float, metres: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
-        mean[(over > 0.5) & (over <= 0.5 + share), 0] += metres
+        mean[(fraction > 0.5) & (fraction <= 0.5 + share), 0] += metres
 
     return modify_predictions
 
 
 def _outliers(share: float, metres: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
-        hit = rng.random(len(mean)) < share
-        mean[hit] += rng.choice([-metres, metres], (int(hit.sum()), 3)) / np.sqrt(3.0)
+        selected = rng.random(len(mean)) < share
+        mean[selected] += rng.choice([-metres, metres], (int(selected.sum()), 3)) / np.sqrt(3.0)
 
     return modify_predictions
 
 
 def _overconfident(factor: float) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         covariance *= factor
 
     return modify_predictions
 
 
-def _nan_answer(which: int) -> ModifyPredictions:
+def _nan_prediction(which: int) -> ModifyPredictions:
     def modify_predictions(
-        over: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
+        fraction: FloatArray, mean: FloatArray, covariance: FloatArray, rng: np.random.Generator
     ) -> None:
         (mean, covariance)[which][len(mean) // 2] = np.nan
 

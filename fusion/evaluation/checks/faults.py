@@ -45,10 +45,10 @@ class FaultResult:
         backend: "ekf" or "graph".
         error_without: absolute trajectory error without the fault [m].
         error_with: absolute trajectory error with it [m].
-        end_error: distance from the truth at the end [m].
-        end_sigma: the track's own estimate of it, root of the covariance's trace [m].
+        end_error: distance from the ground truth at the end [m].
+        end_sigma: its standard deviation as reported, root of the covariance's trace [m].
         finite: whether every state, covariance included, is finite.
-        reported: what the health report states about it.
+        reported: faults counted in the health report, in words.
     """
 
     fault: str
@@ -67,14 +67,14 @@ def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, Na
     errors = ImuErrors(noise=noise, gyro_turn_on=5e-4, accel_turn_on=0.02)
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(seed, seconds, style=style)
-    known = FilterConfig(
+    matched = FilterConfig(
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         adaptive=False,
     )
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
-    return sequence, NavigatorConfig(noise=noise, filter=known)
+    return sequence, NavigatorConfig(noise=noise, filter=matched)
 
 
 def run_faults(
@@ -88,7 +88,7 @@ def run_faults(
     """Run a recording with each fault through each back end.
 
     Args:
-        sequence: a recording with truth.
+        sequence: a recording with true poses.
         config: configuration of the navigator.
         model: network; None for the true displacements under white noise.
         seed: seed of the random faults.
@@ -96,10 +96,10 @@ def run_faults(
         only: faults to run; None for all of them.
 
     Raises:
-        InputError: the recording has no truth, or is too short.
+        InputError: the recording has no true poses, or is too short.
     """
     if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with truth")
+        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     results: list[FaultResult] = []
     for backend in backends:
         without = _error(_run(Fault(""), sequence, config, model, seed, backend), sequence)
@@ -115,8 +115,8 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
         rows.append([r.fault, r.backend, *(f"{value:.3f}" for value in figures)])
-    told = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
-    lines = zip(aligned(rows), ["reported", *told], strict=True)
+    reports = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
+    lines = zip(aligned(rows), ["reported", *reports], strict=True)
     return "\n".join(f"{line}   {words}" for line, words in lines)
 
 
@@ -139,9 +139,9 @@ def _run(
     backend: BackendName,
 ) -> Track:
     rng = np.random.default_rng(seed)
-    spoilt = sequence if fault.modify_samples is None else fault.modify_samples(sequence, rng)
+    faulty = sequence if fault.modify_samples is None else fault.modify_samples(sequence, rng)
     navigator = Navigator(model or DummyPredictor(), config, backend=backend)
-    preprocessed = navigator.observe(spoilt)
+    preprocessed = navigator.observe(faulty)
     if model is None and sequence.truth is not None:
         preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
     if fault.modify_predictions is not None:
@@ -165,30 +165,32 @@ def with_true_displacements(
     seed: int,
     noise: float = WHITE_NOISE,
 ) -> PreprocessedRecording:
-    """Replace a prepared recording's measurements by its true displacements under white noise.
+    """Replace a preprocessed recording's displacements by the true ones with white noise.
 
-    Like a network's, they are given in each window's frame, rotated by the yaw of the attitude the
-    window was prepared with. Their covariance is the true one after the filter's scaling.
+    Like a network's, they are given in each window's levelled frame, in which the window itself is
+    given. After the filter's scaling, their covariance is the true one.
 
     Args:
-        preprocessed: the prepared recording.
+        preprocessed: the preprocessed recording.
         truth: its true poses.
         config: configuration of the navigator.
-        seed: seed of the noise; a window's noise does not depend on what happened before it.
+        seed: seed of the noise; a window's noise does not depend on earlier windows.
         noise: standard deviation per axis [m].
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
-    known = [k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None]
-    intervals = [preprocessed.intervals[k] for k in known]
+    with_window = [
+        k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None
+    ]
+    intervals = [preprocessed.intervals[k] for k in with_window]
     stop = np.array([interval.stop for interval in intervals])
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
-    seen = [interval.R_NB_window for interval in intervals if interval.R_NB_window is not None]
-    R_NB = Rotation.from_matrix(np.stack(seen))
+    attitudes = [interval.R_NB_window for interval in intervals if interval.R_NB_window is not None]
+    R_NB = Rotation.from_matrix(np.stack(attitudes))
     turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
     displacement_N = turn.apply(last.position_W - first.position_W)
     measurements = list(preprocessed.measurements)
-    for k, d_N, time in zip(known, displacement_N, stop - truth.time[0], strict=True):
+    for k, d_N, time in zip(with_window, displacement_N, stop - truth.time[0], strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
         measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
     return replace(preprocessed, measurements=measurements)
@@ -200,14 +202,14 @@ def _corrupted(
     rng: np.random.Generator,
 ) -> PreprocessedRecording:
     """Apply a fault to all measurements at once."""
-    known = [
+    measured = [
         k for k, measurement in enumerate(preprocessed.measurements) if measurement is not None
     ]
     pairs = [measurement for measurement in preprocessed.measurements if measurement is not None]
     mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
     modify((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
     measurements = list(preprocessed.measurements)
-    for k, d_N, cov_N in zip(known, mean, covariance, strict=True):
+    for k, d_N, cov_N in zip(measured, mean, covariance, strict=True):
         measurements[k] = (d_N, cov_N)
     return replace(preprocessed, measurements=measurements)
 

@@ -28,7 +28,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 LEAST_SIGMA = 3.0
-"""Number of standard deviations that the yaw error of a consistent track stays within."""
+"""Maximum yaw error of a consistent track, in standard deviations."""
 
 GOOD_YAW = math.radians(10.0)
 """Maximum acceptable yaw error at the end [rad]."""
@@ -36,7 +36,7 @@ GOOD_YAW = math.radians(10.0)
 
 @dataclass(frozen=True)
 class FusionGain:
-    """Errors of one recording with and without the fusion.
+    """Errors of one recording with and without fusion.
 
     Attributes:
         recording: name of the recording.
@@ -45,9 +45,9 @@ class FusionGain:
         fused_m: error by back end [m].
         nis: mean NIS of the first back end; 3 is expected.
         position_nees: median NEES of the first back end's position; 2.4 is expected for three axes,
-            nan without true attitude.
-        yaw_error: its yaw error at the end relative to the start [rad]; nan without true attitude.
-        yaw_sigma: reported standard deviation of this yaw [rad].
+            NaN without true attitude.
+        yaw_error: its yaw error at the end relative to the start [rad]; NaN without true attitude.
+        yaw_sigma: reported standard deviation of the yaw at the end [rad]; NaN likewise.
     """
 
     recording: str
@@ -72,13 +72,13 @@ def fusion_gain(
     Raises:
         InputError: it has no ground truth or too few known positions, or cannot be run.
     """
-    known: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
-    if known is None:
+    reference: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
+    if reference is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     preprocessed = Navigator(model, config).observe(sequence)
     tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
     first = tracks[backends[0]]
-    network_m = _error(network_track(preprocessed), known)
+    network_m = _error(network_track(preprocessed), reference)
     if math.isnan(network_m):
         raise InputError(
             f"{sequence.name}: positions",
@@ -90,7 +90,7 @@ def fusion_gain(
         sequence.name,
         group,
         network_m,
-        {name: _error(track, known) for name, track in tracks.items()},
+        {name: _error(track, reference) for name, track in tracks.items()},
         math.nan if first.nis is None else first.nis,
         _nees(first, sequence.truth),
         error,
@@ -107,36 +107,36 @@ def fusion_gain_table(found: Sequence[FusionGain]) -> str:
     rows = [[*head, "NIS", "NEES", "yaw deg", "< 10 deg", "< 3 sigma"]]
     for group, part in by_group(found):
         rows.append(_row(group, part, names))
-    words = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
-    more = (
+    note = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
+    consistency_note = (
         "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
         "relative to the start"
     )
-    return "\n".join([*aligned(rows), words, more])
+    return "\n".join([*aligned(rows), note, consistency_note])
 
 
 def _row(group: str, part: Sequence[FusionGain], names: Sequence[str]) -> list[str]:
-    row = [group, str(len(part)), f"{np.median([one.network_m for one in part]):.2f}"]
+    row = [group, str(len(part)), f"{np.median([result.network_m for result in part]):.2f}"]
     for name in names:
-        ratio = np.log([one.fused_m[name] / one.network_m for one in part])
+        ratio = np.log([result.fused_m[name] / result.network_m for result in part])
         figures = np.exp([ratio.mean(), np.quantile(ratio, 0.95), ratio.max()])
         row += [f"{value:.2f}" for value in figures]
-    row.append(f"{np.nanmean([one.nis for one in part]):.1f}")
-    yaw = np.array([(one.yaw_error, one.yaw_sigma) for one in part])
+    row.append(f"{np.nanmean([result.nis for result in part]):.1f}")
+    yaw = np.array([(result.yaw_error, result.yaw_sigma) for result in part])
     yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
     if len(yaw) == 0:
         return [*row, "-", "-", "-", "-"]
     good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]
-    row += [f"{np.nanmedian([one.position_nees for one in part]):.1f}"]
+    row += [f"{np.nanmedian([result.position_nees for result in part]):.1f}"]
     row += [f"{np.degrees(np.median(yaw[:, 0])):.1f}"]
     return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]
 
 
-def _error(track: Track, known: Trajectory | PositionTrack) -> float:
+def _error(track: Track, reference: Trajectory | PositionTrack) -> float:
     """Return the horizontal error after a fit of yaw and position [m]."""
-    if isinstance(known, Trajectory):
-        return evaluate_track(track.trajectory, known, alignment="yaw").ate_m
-    return position_error(track, known)[0]
+    if isinstance(reference, Trajectory):
+        return evaluate_track(track.trajectory, reference, alignment="yaw").ate_m
+    return position_error(track, reference)[0]
 
 
 def _nees(track: Track, truth: Trajectory | None) -> float:

@@ -18,7 +18,7 @@ Result = TypeVar("Result", bound=Grouped)
 
 
 def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:
-    """Return each group with its results, sorted by name; several are followed by all together."""
-    groups = sorted({one.group for one in found})
-    parts = [(group, [one for one in found if one.group == group]) for group in groups]
+    """Return each group with its results, sorted by name, and all results if there are several."""
+    groups = sorted({result.group for result in found})
+    parts = [(group, [result for result in found if result.group == group]) for group in groups]
     return [*parts, ("all", list(found))] if len(groups) > 1 else parts

@@ -1,4 +1,4 @@
-"""How far a track's end moves if samples are missing: results must not depend on a few samples.
+"""Shift of a track's end if samples are missing: results must not depend on a few samples.
 
 A recording is run unmodified, with a short gap at each of several instants, and with samples
 dropped at random; all tracks begin in the same pose, so their ends are compared without alignment.
@@ -28,12 +28,12 @@ GAP_SECONDS, DROPPED = 0.1, 0.05
 """Length of a gap [s], and the share of samples that is dropped."""
 
 INSTANTS = 6
-"""Number of instants for a gap, one gap per run."""
+"""Number of instants at which a gap is placed, in a run each."""
 
 MOST_METRES, MOST_DEGREES = 0.01, 3.0
 """Maximum acceptable shift of the end: in metres per metre of the path, and in yaw."""
 
-_SHORTEST_PATH = 1.0
+_MIN_PATH = 1.0
 """Minimum path [m]: shifts are relative to the path."""
 
 
@@ -45,8 +45,8 @@ class EndShift:
         recording: name of the recording.
         group: group that it is counted in.
         fault: what was missing.
-        metres: horizontal distance between the ends over the length of the track.
-        degrees: difference of their yaws [deg].
+        metres: horizontal distance between the ends, divided by the length of the track.
+        degrees: absolute difference of their yaws [deg].
     """
 
     recording: str
@@ -70,43 +70,43 @@ def end_shifts(
         InputError: the recording cannot be run, or its track is shorter than a metre.
     """
 
-    def run(spoilt: ImuSequence) -> Track:
-        return Navigator(model, config, backend=backend).run(spoilt)
+    def run(faulty: ImuSequence) -> Track:
+        return Navigator(model, config, backend=backend).run(faulty)
 
-    whole = run(sequence)
-    steps = np.diff(whole.trajectory.position_W[:, :2], axis=0)
+    unmodified = run(sequence)
+    steps = np.diff(unmodified.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())
-    if path < _SHORTEST_PATH:
+    if path < _MIN_PATH:
         raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
-    faults = [(f"gap at {at:.0f} s", gap(float(at), GAP_SECONDS)) for at in instants]
+    faults = [(f"gap at {instant:.0f} s", gap(float(instant), GAP_SECONDS)) for instant in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
     return [
-        EndShift(sequence.name, group, name, *_between(whole, run(spoilt), path))
+        EndShift(sequence.name, group, name, *_end_shift(unmodified, run(faulty), path))
         for name, modify_samples in faults
-        for spoilt in (modify_samples(sequence, np.random.default_rng(seed)),)
+        for faulty in (modify_samples(sequence, np.random.default_rng(seed)),)
     ]
 
 
-def _between(whole: Track, other: Track, path: float) -> tuple[float, float]:
-    a, b = whole.trajectory, other.trajectory
+def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, float]:
+    a, b = unmodified.trajectory, other.trajectory
     metres = float(np.linalg.norm(a.position_W[-1, :2] - b.position_W[-1, :2])) / path
     turn = (b.attitude_WB[-1] * a.attitude_WB[-1].inv()).as_matrix()
     return metres, abs(math.degrees(yaw_twist(turn)))
 
 
 def end_shift_table(found: Sequence[EndShift]) -> str:
-    """Return a row for each group: how many ends stay within limits, and how far ends move."""
+    """Return a row for each group: share of the ends within limits, and how far ends move."""
     head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
     for group, part in by_group(found):
-        metres = np.array([one.metres for one in part])
-        degrees = np.array([one.degrees for one in part])
-        stay = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
+        metres = np.array([shift.metres for shift in part])
+        degrees = np.array([shift.degrees for shift in part])
+        within = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
         figures = [
             f"{value:.2f}"
             for values in (100.0 * metres, degrees)
             for value in np.quantile(values, (0.5, 0.95, 1.0))
         ]
-        rows.append([group, str(len(part)), f"{stay:.0%}", *figures])
+        rows.append([group, str(len(part)), f"{within:.0%}", *figures])
     return "\n".join(aligned(rows))

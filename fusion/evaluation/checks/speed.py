@@ -1,4 +1,4 @@
-"""Speed of filter, network and whole run: medians and ratios from one run of the benchmark."""
+"""Speed of filter, network and whole run, measured together as medians of interleaved runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Consistency of a track with fixes: its error against its reported uncertainty.
+"""Consistency of a track with fixes: its error compared with its reported uncertainty.
 
 Fixes are the true positions at equal intervals with white errors. Only the second half of each
 track counts: by then several fixes have determined the direction.
@@ -24,7 +24,7 @@ from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 
-_FEWEST = 4
+_MIN_FIXES = 4
 """Minimum number of fixes for a track to be evaluated."""
 
 
@@ -55,13 +55,18 @@ class FixConsistency:
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
     """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
-    at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
-    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(at.time), 3))
+    truth_at_fixes = truth.at(np.arange(truth.time[0], truth.time[-1], every))
+    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(truth_at_fixes.time), 3))
     covariance = sigma**2 * np.eye(3)
     return [
         position_fix(float(time), position, covariance)
-        for time, position, known in zip(at.time, at.position_W + noise, at.valid, strict=True)
-        if known
+        for time, position, valid in zip(
+            truth_at_fixes.time,
+            truth_at_fixes.position_W + noise,
+            truth_at_fixes.valid,
+            strict=True,
+        )
+        if valid
     ]
 
 
@@ -83,22 +88,22 @@ def track_with_fixes(
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses")
     fixes = true_fixes(sequence.truth, every, sigma, seed)
-    if len(fixes) < _FEWEST:
-        raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_FEWEST} or more")
+    if len(fixes) < _MIN_FIXES:
+        raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")
     track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
     assert track.covariance is not None  # both back ends give it
     assert track.health is not None
     errors = pose_errors(track.trajectory, sequence.truth)
     middle = 0.5 * (sequence.truth.time[0] + sequence.truth.time[-1])
-    late = errors.estimate.time > middle
-    known = np.searchsorted(track.time, errors.estimate.time[late])
-    P, off, yaw = track.covariance[known], errors.position_W[late], errors.yaw[late]
+    second_half = errors.estimate.time > middle
+    rows = np.searchsorted(track.time, errors.estimate.time[second_half])
+    P, error, yaw = track.covariance[rows], errors.position_W[second_half], errors.yaw[second_half]
     return FixConsistency(
         sequence.name,
         group,
         track.health.fixes.get("applied", 0) / len(fixes),
-        float(np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())),
-        float(np.median(nees(off, P[:, 6:9, 6:9]))),
+        float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
+        float(np.median(nees(error, P[:, 6:9, 6:9]))),
         float(np.sqrt((yaw**2).mean())),
         float((yaw**2 / P[:, 2, 2]).mean()),
         float((np.abs(yaw) < LEAST_SIGMA * np.sqrt(P[:, 2, 2])).mean()),
@@ -106,19 +111,19 @@ def track_with_fixes(
 
 
 def fixes_table(found: Sequence[FixConsistency]) -> str:
-    """Return a row for each group: medians of its recordings, and how often yaw is covered."""
+    """Return a row for each group: medians over recordings, and share of yaw errors in 3 sigma."""
     head = ["group", "n", "fixes applied", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
     rows = [head]
     for group, part in by_group(found):
         rows.append(
             [
-                *(group, str(len(part)), f"{np.mean([one.applied for one in part]):.0%}"),
-                f"{np.median([one.position_rms for one in part]):.2f}",
-                f"{np.median([one.position_nees for one in part]):.1f}",
-                f"{np.degrees(np.median([one.yaw_rms for one in part])):.1f}",
-                f"{np.median([one.yaw_nees for one in part]):.1f}",
-                f"{np.mean([one.yaw_covered for one in part]):.1%}",
+                *(group, str(len(part)), f"{np.mean([result.applied for result in part]):.0%}"),
+                f"{np.median([result.position_rms for result in part]):.2f}",
+                f"{np.median([result.position_nees for result in part]):.1f}",
+                f"{np.degrees(np.median([result.yaw_rms for result in part])):.1f}",
+                f"{np.median([result.yaw_nees for result in part]):.1f}",
+                f"{np.mean([result.yaw_covered for result in part]):.1%}",
             ]
         )
-    words = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
-    return "\n".join([*aligned(rows), words])
+    note = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
+    return "\n".join([*aligned(rows), note])

@@ -19,7 +19,7 @@ REPLICATES = 1000
 CONFIDENCE = 0.95
 
 Blocks = tuple[FloatArray, FloatArray]
-"""Sums of squared errors of one recording's blocks: ours (B,), and theirs, the baseline's (B,)."""
+"""Sums of squared errors of a recording's blocks: evaluated network (B,) and baseline (B,)."""
 
 Groups = Mapping[str, Sequence[Blocks]]
 """Recordings of each group."""
@@ -27,7 +27,7 @@ Groups = Mapping[str, Sequence[Blocks]]
 
 @dataclass(frozen=True)
 class Interval:
-    """Geometric mean of the ratios of root mean square errors, ours over theirs, and its bounds."""
+    """Geometric mean of the ratios of root mean square errors to the baseline's, and its bounds."""
 
     ratio: float
     low: float
@@ -45,11 +45,13 @@ def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None
         The ratio and its interval; None if there is no recording.
     """
     rng = np.random.default_rng(seed)
-    known = [drawn for groups in strata.values() if (drawn := _stratum(groups, rng)) is not None]
-    if not known:
+    results = [
+        result for groups in strata.values() if (result := _stratum(groups, rng)) is not None
+    ]
+    if not results:
         return None
-    estimate = float(np.mean([whole for whole, _ in known]))
-    replicates = np.mean([drawn for _, drawn in known], axis=0)
+    estimate = float(np.mean([mean for mean, _ in results]))
+    replicates = np.mean([result for _, result in results], axis=0)
     tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(replicates, [tail, 100.0 - tail])
     return Interval(*(float(np.exp(value)) for value in (estimate, low, high)))
@@ -57,23 +59,27 @@ def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None
 
 def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray] | None:
     """Return the mean log ratio over groups, and its replicates (R,)."""
-    known = [_group(recordings, rng) for recordings in groups.values() if recordings]
-    if not known:
+    results = [_group(recordings, rng) for recordings in groups.values() if recordings]
+    if not results:
         return None
-    drawn = np.stack([replicates for _, replicates in known])
-    return float(np.mean([whole for whole, _ in known])), _means_of_draws(drawn, rng)
+    group_replicates = np.stack([replicates for _, replicates in results])
+    return float(np.mean([mean for mean, _ in results])), _means_of_draws(group_replicates, rng)
 
 
 def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[float, FloatArray]:
-    whole = float(np.mean([0.5 * np.log(ours.sum() / theirs.sum()) for ours, theirs in recordings]))
-    drawn = np.stack([_recording(ours, theirs, rng) for ours, theirs in recordings])
-    return whole, _means_of_draws(drawn, rng)
+    mean = float(
+        np.mean(
+            [0.5 * np.log(evaluated.sum() / baseline.sum()) for evaluated, baseline in recordings]
+        )
+    )
+    replicates = np.stack([_recording(*blocks, rng) for blocks in recordings])
+    return mean, _means_of_draws(replicates, rng)
 
 
-def _recording(ours: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _recording(evaluated: FloatArray, baseline: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return log ratios (R,) of a recording, its blocks drawn with replacement."""
-    rows = rng.integers(len(ours), size=(REPLICATES, len(ours)))
-    return np.asarray(0.5 * np.log(ours[rows].sum(axis=1) / theirs[rows].sum(axis=1)))
+    rows = rng.integers(len(evaluated), size=(REPLICATES, len(evaluated)))
+    return np.asarray(0.5 * np.log(evaluated[rows].sum(axis=1) / baseline[rows].sum(axis=1)))
 
 
 def _means_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -54,7 +54,7 @@ class Direction:
 
     @property
     def turn(self) -> float:
-        """Yaw from the network's direction to the accelerometer's [rad]; nan without motion."""
+        """Yaw from the network's direction to the accelerometer's [rad]; NaN without motion."""
         return math.atan2(self.product.imag, self.product.real) if self.product else math.nan
 
     @property
@@ -77,16 +77,18 @@ def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
     accel_N = stream.windows()[:, 3:5].astype(np.float64)
     if len(accel_N) <= 3 * _SECOND:
         return Direction()
-    told = accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
-    told = told[:-_SECOND] + told[_SECOND:]
-    moved = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
-    a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (told, moved))
-    apart = len(d) / (3.0 * _SECOND)  # a change spans three seconds
-    return Direction(complex(np.vdot(d, a)), _square(d), _square(a), apart)
+    accel_change = (
+        accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
+    )
+    accel_change = accel_change[:-_SECOND] + accel_change[_SECOND:]
+    network_change = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
+    a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (accel_change, network_change))
+    count = len(d) / (3.0 * _SECOND)  # a change spans three seconds
+    return Direction(complex(np.vdot(d, a)), _square(d), _square(a), count)
 
 
 def _without_slow(changes: Any) -> Complex:
-    """Subtract the mean of each 20 s."""
+    """Return the changes minus their mean over each 20 s."""
     parts = np.array_split(changes, max(1, len(changes) // _STRETCH))
     return np.concatenate([part - part.mean() for part in parts])
 

@@ -1,7 +1,7 @@
 """Errors of a network alone on one recording, for any kind of ground truth.
 
-All positions are horizontal and written x + iy. The track lives in N, whose yaw relative to the
-world is unknown; how it is resolved depends on the truth:
+All positions are horizontal and written x + iy. The track is given in N, whose yaw relative to the
+world is unknown; how it is determined depends on the truth:
 
 - poses: displacements over a horizon are rotated by the true yaw at the horizon's start; the track
   as a whole is fitted in yaw and position, or aligned with the first pose.
@@ -33,7 +33,7 @@ BLOCK_SECONDS = 30.0
 STRETCH_SECONDS = 20
 """Length of the stretches over which `stretch_percent` is computed."""
 
-_LEAST_PAIRS = 20
+_MIN_DISPLACEMENTS = 20
 """Minimum number of displacements for a piece to count in the error over a horizon."""
 
 _LEG = round(2.0 / TICK_SECONDS)
@@ -59,7 +59,7 @@ FIGURES = {
     "(expected: 3)",
     "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), if requested",
 }
-"""Figures of a recording and their meaning; nan if its kind of truth does not provide one."""
+"""Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +92,16 @@ class _Sums:
     blocks: dict[str, list[FloatArray]] = field(default_factory=dict)
 
     def add(self, measure: str, errors: FloatArray) -> None:
-        known = errors[np.isfinite(errors)]
-        self.squares.setdefault(measure, []).append((float(np.sum(known**2)), len(known)))
+        finite = errors[np.isfinite(errors)]
+        self.squares.setdefault(measure, []).append((float(np.sum(finite**2)), len(finite)))
 
     def rms(self, measure: str) -> float:
         total, count = np.sum(self.squares.get(measure, [(0.0, 0.0)]), axis=0)
         return float(np.sqrt(total / count)) if count else float("nan")
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
-        """Add errors (K,) by start tick, nan where unknown."""
-        if np.isfinite(errors).sum() < _LEAST_PAIRS:
+        """Add errors (K,) by start tick, NaN where unknown."""
+        if np.isfinite(errors).sum() < _MIN_DISPLACEMENTS:
             return
         self.add(measure, errors)
         per_block = round(BLOCK_SECONDS / TICK_SECONDS)
@@ -120,11 +120,11 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
         found: predictions on each of its pieces.
     """
     sums = _Sums()
-    judge = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
-    towards = Direction()
-    for piece, answer in zip(prepared.pieces, found, strict=True):
-        judge(piece, answer, sums)
-        towards += direction(piece.stream, answer.displacement_N)
+    add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
+    total_direction = Direction()
+    for piece, predictions in zip(prepared.pieces, found, strict=True):
+        add_errors(piece, predictions, sums)
+        total_direction += direction(piece.stream, predictions.displacement_N)
     fitted = sums.rms("fit")
     figures = {
         "ate_fit_m": fitted,
@@ -133,7 +133,7 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
         "length_ratio": _ratio(sums.length, sums.path),
         **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
         "stretch_percent": 100.0 * sums.rms("stretch"),
-        "direction_deg": abs(np.degrees(towards.turn)),
+        "direction_deg": abs(np.degrees(total_direction.turn)),
         "nis": sums.rms("nis") ** 2,
         "nis_ekf": float("nan"),
     }
@@ -141,68 +141,70 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
     return RecordingErrors(prepared.name, prepared.kind, sums.path, figures, blocks)
 
 
-def _poses(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
-    track, truth, breaks = _at_ticks(piece, answer)
+def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+    track, truth, breaks = _at_ticks(piece, predictions)
     turn = np.exp(1j * piece.yaw_WN[: len(track)])
-    known = np.isfinite(truth)
-    if known.sum() < 2:
+    finite = np.isfinite(truth)
+    if finite.sum() < 2:
         return
-    fitted = fit_yaw_and_position(track[known], truth[known])
-    sums.add("fit", np.abs(fitted - truth[known]))
-    first = np.flatnonzero(known)[0]
+    fitted = fit_yaw_and_position(track[finite], truth[finite])
+    sums.add("fit", np.abs(fitted - truth[finite]))
+    first = np.flatnonzero(finite)[0]
     on_first = truth[first] + turn[first] * (track - track[first])
-    sums.add("first", np.abs(on_first - truth)[known])
+    sums.add("first", np.abs(on_first - truth)[finite])
     _lengths(track, truth, breaks, sums)
     for horizon in HORIZONS:
-        moved, true, start = _displacements(track, truth, breaks, horizon)
+        estimated, true, start = _displacements(track, truth, breaks, horizon)
         if horizon == 1:  # the windows themselves
-            moved = _windows_xy(answer)[start]
+            estimated = _windows_xy(predictions)[start]
         errors = np.full(len(track), np.nan)
-        errors[start] = np.abs(turn[start] * moved - true)
+        errors[start] = np.abs(turn[start] * estimated - true)
         sums.add_blocks(str(horizon), errors)
     _stretches(track, truth, breaks, sums)
     _, true, start = _displacements(track, truth, breaks, 1)
-    _nis(answer, start, np.conj(turn[start]) * true, sums)
+    _nis(predictions, start, np.conj(turn[start]) * true, sums)
 
 
-def _positions(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
-    track, truth, breaks = _at_ticks(piece, answer)
+def _positions(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+    track, truth, breaks = _at_ticks(piece, predictions)
     _lengths(track, truth, breaks, sums)
     for horizon in HORIZONS:
         errors = np.full(len(track), np.nan)
         turn = _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
-        moved, true, start = _displacements(track, truth, breaks, horizon)
+        estimated, true, start = _displacements(track, truth, breaks, horizon)
         if horizon == 1:
-            moved = _windows_xy(answer)[start]
-        errors[start] = np.abs(turn[start] * moved - true)
+            estimated = _windows_xy(predictions)[start]
+        errors[start] = np.abs(turn[start] * estimated - true)
         sums.add_blocks(str(horizon), errors)
         if horizon == 1:
             fitted = np.isfinite(turn[start])
-            _nis(answer, start[fitted], np.conj(turn[start])[fitted] * true[fitted], sums)
+            _nis(predictions, start[fitted], np.conj(turn[start])[fitted] * true[fitted], sums)
     _stretches(track, truth, breaks, sums)
 
 
-def _waypoints(piece: PreparedPiece, answer: Predictions, sums: _Sums) -> None:
-    track = answer.track()[: len(piece.position_W)]
+def _waypoints(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+    track = predictions.track()[: len(piece.position_W)]
     ticks = piece.stream.ticks[: len(track)]
     inside = piece.waypoint_time <= ticks[-1]
     time, truth = piece.waypoint_time[inside], piece.waypoint_W[inside]
     if len(time) < 3:
         return
-    at = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
-    errors = np.abs(fit_yaw_and_position(at, truth) - truth)
+    estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
+    errors = np.abs(fit_yaw_and_position(estimated, truth) - truth)
     sums.add("fit", errors)
     sums.path += float(np.abs(np.diff(truth)).sum())
-    sums.length += float(np.abs(np.diff(at)).sum())
+    sums.length += float(np.abs(np.diff(estimated)).sum())
     block = np.floor((time - ticks[0]) / BLOCK_SECONDS).astype(int)
     counted = [np.bincount(block, weights) for weights in (errors**2, np.ones(len(errors)))]
     rows: FloatArray = np.stack(counted, axis=1).astype(np.float64)
     sums.blocks.setdefault("10", []).append(rows[rows[:, 1] > 0])
 
 
-def _at_ticks(piece: PreparedPiece, answer: Predictions) -> tuple[Complex, Complex, np.ndarray]:
+def _at_ticks(
+    piece: PreparedPiece, predictions: Predictions
+) -> tuple[Complex, Complex, np.ndarray]:
     """Return track, truth and its breaks at the ticks common to all."""
-    track = answer.track()
+    track = predictions.track()
     count = min(len(track), len(piece.position_W))
     return track[:count], piece.position_W[:count], piece.breaks[:count]
 
@@ -227,28 +229,28 @@ def _displacements(
 
 
 def _unbroken(truth: Complex, breaks: np.ndarray, span: int) -> BoolArray:
-    """Return at which ticks (n - span,) the next `span` ticks contain neither gap nor jump."""
+    """Return whether the `span` ticks after each tick (n - span,) contain neither gap nor jump."""
     ends = np.isfinite(truth[:-span]) & np.isfinite(truth[span:])
     return np.asarray(ends & (breaks[:-span] == breaks[span:]))
 
 
 def _lengths(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
-    moved, true, start = _displacements(track, truth, breaks, 2)
+    estimated, true, start = _displacements(track, truth, breaks, 2)
     legs = start % _LEG == 0
     sums.path += float(np.abs(true[legs]).sum())
-    sums.length += float(np.abs(moved[legs]).sum())
+    sums.length += float(np.abs(estimated[legs]).sum())
 
 
 def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, seconds: int) -> Complex:
-    """Return exp(i yaw) (n,) that best fits the legs from each tick on; nan if broken."""
+    """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
     span = round(seconds / TICK_SECONDS)
     turn = np.full(len(track), complex(np.nan, np.nan))
     if span >= len(track):
         return turn
-    whole = np.flatnonzero(_unbroken(truth, breaks, span))
+    unbroken = np.flatnonzero(_unbroken(truth, breaks, span))
     product = np.conj(track[_LEG:] - track[:-_LEG]) * np.nan_to_num(truth[_LEG:] - truth[:-_LEG])
     total = np.concatenate([[0.0], np.cumsum(product)])
-    turn[whole] = np.exp(1j * np.angle(total[whole + span - _LEG + 1] - total[whole]))
+    turn[unbroken] = np.exp(1j * np.angle(total[unbroken + span - _LEG + 1] - total[unbroken]))
     return turn
 
 
@@ -257,9 +259,9 @@ def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) 
     span = round(STRETCH_SECONDS / TICK_SECONDS)
     if span >= len(track):
         return
-    whole = _unbroken(truth, breaks, span)
-    for start in range(0, len(whole), span // 2):
-        if not whole[start]:
+    unbroken = _unbroken(truth, breaks, span)
+    for start in range(0, len(unbroken), span // 2):
+        if not unbroken[start]:
             continue
         part = slice(start, start + span + 1)
         path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
@@ -269,17 +271,17 @@ def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) 
         sums.add("stretch", errors / path)
 
 
-def _nis(answer: Predictions, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
+def _nis(predictions: Predictions, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
     """Add the NIS of the horizontal error, scaled from two axes to three."""
-    error = _windows_xy(answer)[start] - true_N
+    error = _windows_xy(predictions)[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
-    covariance = answer.covariance_N[start, :2, :2]
+    covariance = predictions.covariance_N[start, :2, :2]
     nis = np.einsum("ni,ni->n", vector, np.linalg.solve(covariance, vector[..., None])[..., 0])
     sums.add("nis", np.sqrt(1.5 * nis))
 
 
-def _windows_xy(answer: Predictions) -> Complex:
-    return np.asarray(answer.displacement_N[:, 0] + 1j * answer.displacement_N[:, 1])
+def _windows_xy(predictions: Predictions) -> Complex:
+    return np.asarray(predictions.displacement_N[:, 0] + 1j * predictions.displacement_N[:, 1])
 
 
 def _ratio(value: float, by: float) -> float:

@@ -59,8 +59,8 @@ class Row:
         recordings: number of recordings compared; those with fewer than three waypoints are not.
         path_km: total length of their true paths.
         medians: medians over recordings, by name of the weights and by figure.
-        ratios: ratios of errors over 1, 10 and 30 s, ours over theirs, by figure; empty without
-            weights to compare with. For waypoints, the residuals replace the 10 s errors.
+        ratios: ratios of errors over 1, 10 and 30 s to those of the weights compared with, by
+            figure; empty without these. For waypoints, the residuals replace the 10 s errors.
         pooled: whether the row covers all groups.
     """
 
@@ -106,12 +106,14 @@ def judge(
         if isinstance(prepared, Skipped):
             skipped.append(prepared)
         else:
-            named = labels(prepared.path, prepared.attributes, groups.get(prepared.path, ""))
+            recording_labels = labels(
+                prepared.path, prepared.attributes, groups.get(prepared.path, "")
+            )
             errors = {
-                name: _errors(model(named["group"]), prepared, read)
+                name: _errors(model(recording_labels["group"]), prepared, read)
                 for name, model in models.items()
             }
-            judged.append(RecordingResult(prepared.path, named, errors))
+            judged.append(RecordingResult(prepared.path, recording_labels, errors))
         progress(done)
     return judged, skipped
 
@@ -130,7 +132,7 @@ def _errors(
 
 
 def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | None) -> list[Row]:
-    """Return a row for each group, sorted, and one over all if there are several.
+    """Return a row for each group, sorted by name, and one over all if there are several.
 
     Args:
         judged: the recordings.
@@ -138,8 +140,8 @@ def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | 
         ours: name of the weights under evaluation.
         theirs: name of the weights to compare them with, if any.
     """
-    names = sorted({one.labels[by] for one in judged})
-    parts = [(name, [one for one in judged if one.labels[by] == name]) for name in names]
+    names = sorted({result.labels[by] for result in judged})
+    parts = [(name, [result for result in judged if result.labels[by] == name]) for name in names]
     rows = [_row(name, part, ours, theirs) for name, part in parts]
     if len(rows) > 1:
         rows.append(replace(_row(POOLED, judged, ours, theirs), pooled=True))
@@ -149,8 +151,11 @@ def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | 
 def _row(name: str, part: Sequence[RecordingResult], ours: str, theirs: str | None) -> Row:
     weights = [ours] if theirs is None else [ours, theirs]
     medians = {
-        one: {figure: _median([j.errors[one].figures[figure] for j in part]) for figure in FIGURES}
-        for one in weights
+        weights_name: {
+            figure: _median([result.errors[weights_name].figures[figure] for result in part])
+            for figure in FIGURES
+        }
+        for weights_name in weights
     }
     ratios = {}
     for horizon in HORIZONS if theirs is not None else ():
@@ -158,7 +163,7 @@ def _row(name: str, part: Sequence[RecordingResult], ours: str, theirs: str | No
         found = paired_ratio(_strata(part, str(horizon), ours, theirs))
         if found is not None:
             ratios[f"rms_{horizon}s_m"] = found
-    paths = [j.errors[ours].path_m for j in part]
+    paths = [result.errors[ours].path_m for result in part]
     return Row(name, sum(path > 0.0 for path in paths), sum(paths) / 1e3, medians, ratios)
 
 
@@ -166,12 +171,12 @@ def _strata(
     part: Sequence[RecordingResult], measure: str, ours: str, theirs: str
 ) -> dict[str, dict[str, list[Blocks]]]:
     strata: dict[str, dict[str, list[Blocks]]] = {}
-    for one in part:
-        pair = [one.errors[name].blocks.get(measure) for name in (ours, theirs)]
+    for result in part:
+        pair = [result.errors[name].blocks.get(measure) for name in (ours, theirs)]
         blocks = tuple(each[:, 0] for each in pair if each is not None and len(each))
         if len(blocks) == 2 and all(each.sum() > 0.0 for each in blocks):
-            groups = strata.setdefault(one.labels["set"], {})
-            groups.setdefault(one.labels["group"], []).append((blocks[0], blocks[1]))
+            groups = strata.setdefault(result.labels["set"], {})
+            groups.setdefault(result.labels["group"], []).append((blocks[0], blocks[1]))
     return strata
 
 
@@ -188,11 +193,11 @@ def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dic
     """
     file, member = split_name(path)
     folder = "oxiod" if file.parent.name == "syn" else file.parent.name
-    named = group.split(" ")[0] if group else file.stem if member else folder
-    known = {key: str(attributes.get(key) or "unknown") for key in get_args(By)[2:]}
-    return {"set": named, "group": group or named, **known}
+    set_name = group.split(" ")[0] if group else file.stem if member else folder
+    attribute_labels = {key: str(attributes.get(key) or "unknown") for key in get_args(By)[2:]}
+    return {"set": set_name, "group": group or set_name, **attribute_labels}
 
 
 def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.median(known)) if known else float("nan")
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float("nan")

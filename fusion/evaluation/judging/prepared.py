@@ -1,7 +1,7 @@
 """Recordings prepared for judging networks: windows and ground truth at ticks, cached on disk.
 
-Everything here depends on the recording alone, so several sets of weights share it, and a second
-call finds it in the cache.
+Everything here depends on the recording alone, so several sets of weights share it, and later calls
+read it from the cache.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _ARRAYS = (
 
 @dataclass(frozen=True, eq=False)
 class PreparedPiece:
-    """An unbroken stretch of a recording with its known truth at the stream's K ticks.
+    """An unbroken stretch of a recording with its ground truth at the stream's K ticks.
 
     Attributes:
         stream: IMU, levelled without the truth.
-        position_W: (K,) horizontal position x + iy [m]; nan where unknown, and for waypoints.
+        position_W: (K,) horizontal position x + iy [m]; NaN where unknown, and for waypoints.
         breaks: (K,) number of gaps and jumps of the truth before each tick: a displacement between
             two ticks is known if both have the same number.
-        yaw_WN: (K,) yaw [rad] that rotates N to the true world; nan where the attitude is unknown.
+        yaw_WN: (K,) yaw [rad] that rotates N to the true world; NaN where the attitude is unknown.
         waypoint_time: (W,) times of the waypoints [s].
         waypoint_W: (W,) positions x + iy of the waypoints [m].
     """
@@ -114,11 +114,11 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         pieces = [build(stream, sequence.positions) for stream in streams]
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _KEPT}
+    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _ATTRIBUTES}
     return Prepared(path, sequence.name, kind, attributes, pieces)
 
 
-_KEPT = ("person", "device", "place", "carry", "grade", "magnets_near")
+_ATTRIBUTES = ("person", "device", "place", "carry", "grade", "magnets_near")
 
 
 def prepared_recordings(
@@ -137,11 +137,11 @@ def prepared_recordings(
         folder: folder of the cache.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
     """
-    work = partial(_kept, read=read, options=options, folder=folder)
+    work = partial(_cached, read=read, options=options, folder=folder)
     yield from each(work, paths, jobs)
 
 
-def _kept(
+def _cached(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
 ) -> Prepared:
     key = recording_key(path, {**options, "preparation": _code()})
@@ -200,7 +200,7 @@ def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPie
 
 @cache
 def _code() -> str:
-    """Return a digest of this module, so that files of other versions of it are not reused."""
+    """Return a digest of this module, so that files of its other versions are not reused."""
     return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 
@@ -209,13 +209,13 @@ def _store(file: Path, prepared: Prepared) -> None:
     for k, piece in enumerate(prepared.pieces):
         for name, value in _arrays(piece).items():
             arrays[f"{k}.{name}"] = value
-    told = {
+    description = {
         "name": prepared.name,
         "kind": prepared.kind,
         "attributes": prepared.attributes,
         "pieces": len(prepared.pieces),
     }
-    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(told)})
+    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(file, "wb") as target:
@@ -229,15 +229,17 @@ def _load(file: Path, path: Path) -> Prepared | None:
         return None
     try:
         with safetensors.safe_open(file, "numpy") as source:
-            told = json.loads(source.metadata()["recording"])
+            description = json.loads(source.metadata()["recording"])
             pieces = [
                 _piece({name: source.get_tensor(f"{k}.{name}") for name in _ARRAYS})
-                for k in range(told["pieces"])
+                for k in range(description["pieces"])
             ]
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
         log.warning("%s: unreadable, prepared again: %s", file, error)
         return None
-    return Prepared(path, told["name"], told["kind"], told["attributes"], pieces)
+    return Prepared(
+        path, description["name"], description["kind"], description["attributes"], pieces
+    )
 
 
 def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:

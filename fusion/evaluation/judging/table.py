@@ -28,8 +28,8 @@ _COLUMNS = {
     "nis_ekf": ("EKF NIS", ".2f"),
 }
 
-_DECIDES = "rms_10s_m"
-_WORST = 1.1
+_DECISIVE = "rms_10s_m"
+_MAX_GROUP_RATIO = 1.1
 
 WORDS = {
     **FIGURES,
@@ -59,9 +59,9 @@ class JudgingResult:
 
 
 def judgement_text(found: JudgingResult) -> str:
-    """Return the table as text: theirs, ours and the ratio below each other for every group."""
-    known = {"theirs": found.theirs, "ours": found.ours}
-    labels = {label: name for label, name in known.items() if name is not None}
+    """Return the table as text: for every group rows "theirs" and "ours", then the ratios."""
+    weights = {"theirs": found.theirs, "ours": found.ours}
+    labels = {label: name for label, name in weights.items() if name is not None}
     table = [["", "", "n", "km", *(title for title, _ in _COLUMNS.values())]]
     for row in found.rows:
         for label, name in labels.items():
@@ -74,34 +74,34 @@ def judgement_text(found: JudgingResult) -> str:
         for key, interval in row.ratios.items():
             title = _COLUMNS[key][0].split(" [")[0]
             lines.append(f"{row.name}: ratio over {title}: {_interval(interval)}")
-    if told := verdict(found.rows):
-        lines.append(told)
+    if conclusion := verdict(found.rows):
+        lines.append(conclusion)
     names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
     return "\n".join([*lines, *names, *(f"{key}: {text}." for key, text in WORDS.items())])
 
 
-_LEAST_GROUPS = 3
+_MIN_GROUPS = 3
 """Minimum number of groups for a verdict: intervals from fewer do not generalise to others."""
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """Return whether ours should replace theirs; empty without a comparison over several groups.
+    """Return the verdict on replacing the weights compared with; empty without several groups.
 
-    Ours are accepted if the pooled interval is below 1 and no group is worse by more than a tenth.
+    Weights are accepted if the pooled interval is below 1 and no group is worse by over a tenth.
     """
-    told = [row for row in rows if _DECIDES in row.ratios]
-    ratios = {row.name: row.ratios[_DECIDES] for row in told if not row.pooled}
-    pooled = next((row.ratios[_DECIDES] for row in told if row.pooled), None)
+    compared = [row for row in rows if _DECISIVE in row.ratios]
+    ratios = {row.name: row.ratios[_DECISIVE] for row in compared if not row.pooled}
+    pooled = next((row.ratios[_DECISIVE] for row in compared if row.pooled), None)
     if pooled is None:
         return ""
     worst = max(ratios, key=lambda name: ratios[name].ratio)
-    taken = pooled.high < 1.0 and ratios[worst].ratio <= _WORST
-    if len(ratios) < _LEAST_GROUPS:
+    accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
+    if len(ratios) < _MIN_GROUPS:
         return (
             f"not decided, {len(ratios)} groups are too few: pooled {_interval(pooled)} over 10 s"
         )
     words = f"pooled {_interval(pooled)} over 10 s, worst {worst} {_interval(ratios[worst])}"
-    return f"{'accepted' if taken else 'not accepted'}: {words}"
+    return f"{'accepted' if accepted else 'not accepted'}: {words}"
 
 
 def judgement_dict(found: JudgingResult) -> dict[str, object]:
@@ -111,7 +111,7 @@ def judgement_dict(found: JudgingResult) -> dict[str, object]:
         "theirs": found.theirs,
         "verdict": verdict(found.rows),
         "groups": [asdict(row) for row in found.rows],
-        "recordings": [_recording(one) for one in found.judged],
+        "recordings": [_recording(result) for result in found.judged],
         "words": WORDS,
     }
 
@@ -126,10 +126,10 @@ def write_judgement(folder: Path, found: JudgingResult) -> list[Path]:
         for name, figures in row.medians.items()
     ]
     single = [
-        {"recording": one.path.name, **one.labels, "weights": name, "path_m": errors.path_m}
+        {"recording": result.path.name, **result.labels, "weights": name, "path_m": errors.path_m}
         | errors.figures
-        for one in found.judged
-        for name, errors in one.errors.items()
+        for result in found.judged
+        for name, errors in result.errors.items()
     ]
     written = [folder / name for name in ("groups.csv", "recordings.csv", "groups.json")]
     for path, content in zip(written, (rows, single), strict=False):
@@ -139,10 +139,10 @@ def write_judgement(folder: Path, found: JudgingResult) -> list[Path]:
     return [*written, folder / "groups.png"]
 
 
-def _recording(one: RecordingResult) -> dict[str, object]:
-    figures = {name: errors.figures for name, errors in one.errors.items()}
-    kind, path_m = next((e.kind, e.path_m) for e in one.errors.values())
-    return {"recording": str(one.path), **one.labels, "truth": kind, "path_m": path_m} | {
+def _recording(result: RecordingResult) -> dict[str, object]:
+    figures = {name: errors.figures for name, errors in result.errors.items()}
+    kind, path_m = next((e.kind, e.path_m) for e in result.errors.values())
+    return {"recording": str(result.path), **result.labels, "truth": kind, "path_m": path_m} | {
         "figures": figures
     }
 
