@@ -167,7 +167,7 @@ def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter(
                 navigator.update_velocity(0.3, v_W, 1e-4 * np.eye(3))
         late.append(errors([s for s in states if s is not None and s.time > 1.2], walk))
     assert late[1].max() < 0.5
-    assert late[0].max() < late[1].max() + 0.1
+    assert late[0].max() < late[1].max() + 0.15
 
 
 def test_a_stream_equals_the_batch_within_the_lag(walk: ImuSequence, make_oracle: Make) -> None:
