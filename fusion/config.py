@@ -24,10 +24,10 @@ from stario.sequences.windows import WINDOW_SECONDS
 UPDATE_RATES = (1, 2, 5, 10, 20)
 """Allowed numbers of network updates per second."""
 
-SMALLEST_SIGMA = 1e-6
+MIN_PRIOR_SIGMA = 1e-6
 """Smallest standard deviation of a prior, which keeps the covariance positive definite."""
 
-LEAST_OUTPUT_RATE = 10
+MIN_OUTPUT_RATE = 10
 """States per second if there are fewer network updates [Hz]."""
 
 
@@ -103,7 +103,7 @@ class FilterConfig:
     @property
     def output_rate(self) -> int:
         """States per second: rate of preintegration and of reported states [Hz]."""
-        return max(LEAST_OUTPUT_RATE, self.update_rate)
+        return max(MIN_OUTPUT_RATE, self.update_rate)
 
     @property
     def intervals_per_update(self) -> int:

@@ -16,7 +16,7 @@ from stario.fusion.changed import changed
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
-LARGEST_STEP = 0.01
+MAX_STEP = 0.01
 """Largest part of the correction bled in from one state to the next [m]."""
 
 BLEED_SECONDS = 1.0
@@ -60,7 +60,7 @@ def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
         integrated = before.p_W + 0.5 * dt * (before.v_W + state.v_W)
         error = state.p_W - integrated
         part = -math.expm1(-dt / BLEED_SECONDS) * error
-        p_W = integrated + part * min(1.0, LARGEST_STEP / max(float(np.linalg.norm(part)), 1e-12))
+        p_W = integrated + part * min(1.0, MAX_STEP / max(float(np.linalg.norm(part)), 1e-12))
     correction_W = state.p_W - p_W
     return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, correction_W, state.map_frame)
 

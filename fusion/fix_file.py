@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.fixes import KINDS, LARGEST_YAW, Fix, make_fix
+from stario.fusion.fixes import KINDS, MAX_YAW, Fix, make_fix
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
@@ -103,7 +103,7 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
         raise ReadError(path, f"{where}, sigma", f"{sigma.min():g}", "a standard deviation > 0")
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
-    if kind == "yaw" and (abs(value[0]) > LARGEST_YAW or sigma[0] > UNKNOWN_YAW):
+    if kind == "yaw" and (abs(value[0]) > MAX_YAW or sigma[0] > UNKNOWN_YAW):
         found, remedy = f"{cells['x']} +- {cells['sx']}", "for degrees, use the kind `yaw [deg]`"
         raise ReadError(path, f"{where}, yaw", found, "radians", remedy)
     (time,) = _numbers(path, where, cells, ["t"])

@@ -24,13 +24,13 @@ FixKind = Literal["position", "yaw", "velocity"]
 
 log = logging.getLogger(__name__)
 
-LARGEST_YAW = 20.0 * math.pi
+MAX_YAW = 20.0 * math.pi
 """Largest plausible yaw [rad]: more than ten turns indicate other units or another quantity."""
 
 KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 """Kinds of fixes, with the dimension of each."""
 
-MOST_WAITING = 10_000
+MAX_WAITING = 10_000
 """Maximum number of fixes of a stream that wait for their time, to bound memory."""
 
 _MIN_SIGMA = 1e-4
@@ -62,7 +62,7 @@ class Fix:
         numbers = (np.atleast_1d(self.time), self.value, self.covariance)
         if not all(np.isfinite(array).all() for array in numbers):
             return "value that is not finite"
-        if self.kind == "yaw" and abs(self.value[0]) > LARGEST_YAW:
+        if self.kind == "yaw" and abs(self.value[0]) > MAX_YAW:
             return "yaw not in radians"
         C = self.covariance
         if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or np.linalg.eigvalsh(C).min() <= 0.0:
@@ -130,7 +130,7 @@ class FixQueue:
         refused: number of refused fixes, by reason.
     """
 
-    def __init__(self, fixes: Iterable[Fix] = (), most: float = MOST_WAITING) -> None:
+    def __init__(self, fixes: Iterable[Fix] = (), most: float = MAX_WAITING) -> None:
         self._most = most
         self.waiting: list[Fix] = []
         self.refused: dict[str, int] = {}

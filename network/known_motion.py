@@ -36,10 +36,10 @@ _WINDOWS_OF_CENTRE = 20
 """Minimum number of windows without overlap per centre: with fewer, the centres become the windows
 themselves, and no other window is near them."""
 
-_LEAST_WINDOWS = 60
+_MIN_WINDOWS = 60
 """Minimum number of windows without overlap, a minute, to summarise known motion."""
 
-_MOST_WINDOWS = 20_000
+_MAX_WINDOWS = 20_000
 _AT_ONCE = 256
 _WALKING = 0.3
 _PERCENTILE = 95.0
@@ -172,9 +172,9 @@ def known_motion(
     """
     imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
     count = sum(len(imu) // WINDOW_SAMPLES for imu in imus)
-    if count < _LEAST_WINDOWS:
+    if count < _MIN_WINDOWS:
         return None
-    stride = max(20, sum(map(len, imus)) // _MOST_WINDOWS)
+    stride = max(20, sum(map(len, imus)) // _MAX_WINDOWS)
     values = np.concatenate([features(windows) for imu in imus for windows in _cut(imu, stride)])
     told = {
         "step_rate": np.concatenate([step_rates(imu) for imu in imus]),

@@ -23,7 +23,7 @@ _TRACK_STEP = 2.0
 _SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
 """Shorter legs [s] and faster legs [m/s] are rejected: mistaken taps, and rides."""
 
-_FASTEST_STEP, _LONGEST_STEP = 6.0, 0.25
+_FASTEST_STEP, _MAX_STEP = 6.0, 0.25
 """A faster step between two samples [m/s] is a jump of the track; a longer step [s] is a gap."""
 
 _SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
@@ -130,8 +130,8 @@ def gaps_and_jumps(time: FloatArray, position: FloatArray) -> BoolArray:
 def _longest_step(step: FloatArray) -> float:
     """Return the longest step [s] that is not a gap, from a track's steps (n,) [s]."""
     if not len(step):
-        return _LONGEST_STEP
-    return max(_LONGEST_STEP, min(_SLOW_STEP * float(np.median(step)), _SLOWEST_STEP))
+        return _MAX_STEP
+    return max(_MAX_STEP, min(_SLOW_STEP * float(np.median(step)), _SLOWEST_STEP))
 
 
 def _ticks(time: FloatArray) -> NDArray[np.int64]:

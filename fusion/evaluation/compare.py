@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.known_positions import LEAST, position_error
+from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
 from stario.fusion.evaluation.pedestrian import pedestrian_track
 from stario.fusion.evaluation.tracks import (
     inertial_track,
@@ -177,7 +177,7 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
             figures["nees"] = position_nees(track.trajectory, truth, alignment).median
     elif sequence.positions is not None:
         error, count = position_error(track, sequence.positions)
-        figures["known_positions_m"] = error if count >= LEAST else None
+        figures["known_positions_m"] = error if count >= MIN_POSITIONS else None
     figures["nis"] = track.nis
     figures["seconds_network"] = track.seconds_network
     figures["seconds_filter"] = track.seconds_filter

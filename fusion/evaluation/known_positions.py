@@ -9,7 +9,7 @@ from stario.fusion.state import Track
 from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
-LEAST = 2
+MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
 
 
@@ -21,10 +21,10 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
         known: positions or waypoints.
 
     Returns:
-        Root mean square [m], NaN if fewer than `LEAST` lie within the track; and their number.
+        Root mean square [m], NaN for fewer than `MIN_POSITIONS` within the track; their number.
     """
     fitted = placed(track, known)
-    if fitted is None or len(fitted) < LEAST:
+    if fitted is None or len(fitted) < MIN_POSITIONS:
         return float("nan"), 0 if fitted is None else len(fitted)
     error = fitted.position_W - _track_at(track, fitted.time)
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), len(fitted)

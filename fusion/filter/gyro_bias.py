@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.changed import changed
-from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.alternative import HypothesisPair
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.imu.intervals import ImuInterval
@@ -37,7 +37,7 @@ _PRECISE_SIGMA = 5e-3
 displacements alone, whose errors stay correlated for long. Stillness, gravity, fixes and the
 magnetic field are more precise."""
 
-_WIDEST = 0.015
+_MAX_DATA_SIGMA = 0.015
 """Maximum sigma to which the data widen the prior [rad/s]; a larger bias is uncorrected, which
 levelling detects sooner."""
 
@@ -101,7 +101,9 @@ class GyroBiasPrior:
             wander: variance by which the bias may have changed since the start [rad^2/s^2].
         """
         uncorrected = max(self.uncorrected, levelled - _MAX_CORRECTED_BIAS)
-        evidence = max(self.evidence, min(self._variance_from_data(b_g, P, wander), _WIDEST**2))
+        evidence = max(
+            self.evidence, min(self._variance_from_data(b_g, P, wander), _MAX_DATA_SIGMA**2)
+        )
         floor = self.sigma**2 + (_SHARED_FRACTION * levelled_sigma) ** 2 + uncorrected**2
         return changed(
             self, variance=max(floor, evidence), uncorrected=uncorrected, evidence=evidence
@@ -139,7 +141,7 @@ class AdaptiveBiasPrior:
 
     def __init__(self, hypotheses: HypothesisPair, config: NavigatorConfig, start: float) -> None:
         self._hypotheses, self._config, self._start = hypotheses, config, start
-        self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, SMALLEST_SIGMA))
+        self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA))
 
     def begin(self) -> None:
         """Widen the prior for the time before gravity provides information."""

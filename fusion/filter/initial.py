@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.checked import checked
-from stario.fusion.config import SMALLEST_SIGMA, NavigatorConfig
+from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
@@ -84,7 +84,7 @@ def initialise(
     sigma = [pose.tilt_sigma] * 2 + [pose.yaw_sigma]
     sigma += [pose.velocity_sigma] * 3 + [pose.position_sigma] * 3
     sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
-    covariance = np.diag(np.square(np.maximum(sigma, SMALLEST_SIGMA)))
+    covariance = np.diag(np.square(np.maximum(sigma, MIN_PRIOR_SIGMA)))
     state = NavState(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
     ekf.initialise(state)
 
@@ -98,7 +98,7 @@ def reinitialise(
     covariance = np.zeros_like(P)
     tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
-    covariance[3:6, 3:6] = max(f.velocity_sigma, SMALLEST_SIGMA) ** 2 * np.eye(3)
+    covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
     reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
     covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)

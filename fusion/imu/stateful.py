@@ -16,7 +16,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import rotated_windows
 
-LEAST_SIGMA = 5e-3
+MIN_DISPLACEMENT_SIGMA = 5e-3
 """Minimum standard deviation of a second's displacement [m], whatever the network predicts."""
 
 FLAGGED_SCALE = 4.0
@@ -130,7 +130,10 @@ def displacements_of(
     covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
     with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values
         covariance_N[:, 2, 2] += SLOPE_SIGMA**2 * np.square(mean_N[:, :2]).sum(axis=1)
-    return [(d_N, floored(C, LEAST_SIGMA)) for d_N, C in zip(mean_N, covariance_N, strict=True)]
+    return [
+        (d_N, floored(C, MIN_DISPLACEMENT_SIGMA))
+        for d_N, C in zip(mean_N, covariance_N, strict=True)
+    ]
 
 
 def _window(interval: ImuInterval) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ Point = list[float]
 """t [s], x, y, z [m], speed [m/s], yaw [deg], the horizontal covariance's xx, xy, yy [m^2], and
 the standard deviation of yaw [deg]."""
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 """Maximum number of points of a track; beyond it every second one is dropped to bound memory."""
 
 _GAP_SECONDS = 0.5
@@ -29,7 +29,7 @@ class DisplayedTrack:
     """Displayed track of one device.
 
     Attributes:
-        points: thinned beyond `MOST_POINTS`.
+        points: thinned beyond `MAX_POINTS`.
         revision: counter, incremented when earlier points change.
         origin: (3,) position displayed as zero [m].
         map_frame: `NavState.map_frame` of the newest states.
@@ -49,7 +49,7 @@ class DisplayedTrack:
         if after_gap and state.covariance[2, 2] > MAX_PRIOR_YAW_SIGMA**2:
             self.since = len(self.points)
         self.points.append(point_of(state))
-        if len(self.points) > MOST_POINTS:
+        if len(self.points) > MAX_POINTS:
             self.points, self.since = self.points[::2], self.since // 2
             self.revision += 1
 

@@ -14,10 +14,10 @@ from stario.fusion.live.session import Session
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
-MOST_DEVICES = 16
+MAX_DEVICES = 16
 """Maximum number of devices at once; further ones are refused to bound memory."""
 
-MOST_SENT = 3000
+MAX_SENT = 3000
 """Maximum number of points of a device in one message, as to a new viewer."""
 
 
@@ -102,9 +102,9 @@ class Hub:
 
     def _session(self, device: str) -> Session:
         if device not in self.sessions:
-            if len(self.sessions) >= MOST_DEVICES:
+            if len(self.sessions) >= MAX_DEVICES:
                 raise InputError(
-                    "device", f"a new one, {device!r}", f"at most {MOST_DEVICES} devices at once"
+                    "device", f"a new one, {device!r}", f"at most {MAX_DEVICES} devices at once"
                 )
             self.sessions[device] = Session(device, self._folder, self._new_navigator)
             self._locks[device] = asyncio.Lock()
@@ -135,8 +135,8 @@ class Viewer:
             fresh = revision != sent_revision
             count = len(points)
             new = points[0 if fresh else sent : count]
-            if len(new) > MOST_SENT:
-                new = [*new[: -1 : -(-len(new) // MOST_SENT)], new[-1]]
+            if len(new) > MAX_SENT:
+                new = [*new[: -1 : -(-len(new) // MAX_SENT)], new[-1]]
             self._sent[device] = (revision, count)
             devices.append(session.status() | {"fresh": fresh, "points": new})
         refused = dict(self._hub.refused)

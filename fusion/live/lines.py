@@ -17,11 +17,11 @@ from stario.fusion.live.payload import Batch, joined, json_from, parse_line
 from stario.fusion.live.server import tokens_match
 from stario.sequences.errors import InputError
 
-LONGEST_LINE = 64 * 1024
+MAX_LINE = 64 * 1024
 """Maximum length of a line [bytes]."""
 
-MOST_CONNECTIONS = 32
-MOST_WAITING = 2000
+MAX_CONNECTIONS = 32
+MAX_WAITING = 2000
 """Maximum number of queued UDP packets; further ones are dropped and counted."""
 
 _log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class LineServer:
     def __init__(self, hub: Hub, token: str = "") -> None:
         self._hub, self._token = hub, token
         self._connections = 0
-        self._packets: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue(MOST_WAITING)
+        self._packets: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue(MAX_WAITING)
         self._bound = asyncio.Event()
         self.port = 0
 
@@ -75,7 +75,7 @@ class LineServer:
             serving.result()
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._connections >= MOST_CONNECTIONS:
+        if self._connections >= MAX_CONNECTIONS:
             writer.close()
             return
         self._connections += 1
@@ -92,7 +92,7 @@ class LineServer:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, sender: str
     ) -> None:
         rest, trusted = b"", not self._token
-        while data := await reader.read(LONGEST_LINE):
+        while data := await reader.read(MAX_LINE):
             *lines, rest = (rest + data).split(b"\n")
             if lines and not trusted:
                 trusted = self._is_token(lines.pop(0))
@@ -100,8 +100,8 @@ class LineServer:
                     await self._answer(writer, ["token: missing or wrong"])
                     return
             errors = await self._take(lines, sender)
-            if len(rest) > LONGEST_LINE:
-                errors.append(f"line: found a longer line, expected at most {LONGEST_LINE} bytes")
+            if len(rest) > MAX_LINE:
+                errors.append(f"line: found a longer line, expected at most {MAX_LINE} bytes")
                 rest = b""
             await self._answer(writer, errors)
         if trusted and rest.strip():

@@ -35,7 +35,7 @@ Field = tuple[int, Vector]
 CHOOSING = 5 * 10**8
 """Time [ns] allowed for every sensor of a device to appear before choosing among them."""
 
-LONGEST_WAIT = 5 * 10**9
+MAX_WAIT = 5 * 10**9
 """Maximum time [ns] a gyroscope sample waits for the accelerometer."""
 
 _MAX_GAP = round(MAX_IMU_GAP * 1e9)
@@ -80,7 +80,7 @@ class Join:
                 self.alone += 1
             else:
                 complete.append((time, value, other))
-        while self._first and self._newest[0] - self._first[0][0] > LONGEST_WAIT:
+        while self._first and self._newest[0] - self._first[0][0] > MAX_WAIT:
             self._first.popleft()
             self.alone += 1
         return complete
@@ -185,7 +185,7 @@ class Merger:
         accel = next((names for names in _ACCELS if set(names) <= sensors), ())
         if not gyro or not accel:
             newest = max(times)  # bounds memory
-            self._waiting = [r for r in self._waiting if newest - r.time_ns < LONGEST_WAIT]
+            self._waiting = [r for r in self._waiting if newest - r.time_ns < MAX_WAIT]
             return False
         self._gyro, self._accel, self.magnetic = gyro, accel, MAG in sensors
         self.upward = _cosine(

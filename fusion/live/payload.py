@@ -29,10 +29,10 @@ from stario.sequences.errors import InputError
 
 Vector = tuple[float, float, float]
 
-MOST_ENTRIES = 50_000
+MAX_ENTRIES = 50_000
 """Maximum number of samples in one push; the fastest phone takes a minute to record them."""
 
-LONGEST_SPAN = 600 * 10**9
+MAX_SPAN = 600 * 10**9
 """Maximum time [ns] between a push's first and last sample; beyond it a timestamp is wrong."""
 
 _MAX_READING = 1e4
@@ -91,9 +91,9 @@ def parse_push(body: bytes) -> Batch:
     payload = message.get("payload")
     if not isinstance(payload, list):
         raise InputError("payload", _describe(payload), "a list of samples")
-    if len(payload) > MOST_ENTRIES:
+    if len(payload) > MAX_ENTRIES:
         found = f"{len(payload)} samples"
-        raise InputError("payload", found, f"at most {MOST_ENTRIES}", "choose a shorter period")
+        raise InputError("payload", found, f"at most {MAX_ENTRIES}", "choose a shorter period")
     device = _name("deviceId", message.get("deviceId"))
     recording = _name("sessionId", message.get("sessionId", ""), needed=False)
     readings = [
@@ -190,9 +190,9 @@ def _vertical(time: Any, values: Any) -> Reading | None:
 
 def _checked_span(where: str, readings: list[Reading]) -> list[Reading]:
     times = [reading.time_ns for reading in readings]
-    if times and max(times) - min(times) > LONGEST_SPAN:
+    if times and max(times) - min(times) > MAX_SPAN:
         found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
-        raise InputError(where, found, f"at most {LONGEST_SPAN / 1e9:g} s in one push")
+        raise InputError(where, found, f"at most {MAX_SPAN / 1e9:g} s in one push")
     return readings
 
 

@@ -39,7 +39,7 @@ from stario.fusion.live.payload import Batch, joined, json_from, parse_line, par
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, unit_named
 
-MOST_BYTES = 4 * 1024 * 1024
+MAX_BYTES = 4 * 1024 * 1024
 """Maximum size of a push [bytes]."""
 
 LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
@@ -185,8 +185,8 @@ async def _body(request: Request) -> bytes:
     try:
         async for part in request.stream():
             size += len(part)
-            if size > MOST_BYTES:
-                raise InputError("body", "a larger body", f"at most {MOST_BYTES} bytes")
+            if size > MAX_BYTES:
+                raise InputError("body", "a larger body", f"at most {MAX_BYTES} bytes")
             parts.append(part)
     except ClientDisconnect:
         raise InputError("body", "only a part", "a complete body") from None

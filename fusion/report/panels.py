@@ -20,7 +20,7 @@ INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
 AXIS_COLOURS = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
 TRUTH = "truth"
 _DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
-_MOST_INNOVATIONS = 1500
+_MAX_INNOVATIONS = 1500
 
 
 Column = Callable[[Series], FloatArray | None]
@@ -102,7 +102,7 @@ def innovation_panels(
         unit: unit of the residuals.
     """
     count = len(innovations.time)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _MOST_INNOVATIONS)).round().astype(int))
+    rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_INNOVATIONS)).round().astype(int))
     rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # draw all of these
     time, gated = innovations.time[rows] - start, innovations.gated[rows]
     panels = []

@@ -11,7 +11,7 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray, Trajectory
 
-MOST_POINTS = 1500
+MAX_POINTS = 1500
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
 
 
@@ -127,7 +127,7 @@ def ellipse(covariance: FloatArray, sigmas: float = 3.0, points: int = 49) -> Fl
 
 
 def _thinned(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    rows = np.linspace(0, count - 1, min(count, MOST_POINTS))
+    rows = np.linspace(0, count - 1, min(count, MAX_POINTS))
     return np.unique(np.round(rows).astype(np.intp))
 
 

@@ -23,7 +23,7 @@ from stario.sequences.truth.fit import TruthFit, middle_part
 from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1
-_LEAST_TURNED_RAD = 0.3
+_MIN_TURNED_RAD = 0.3
 """Minimum deviation of the true yaw from an even rotation that separates scale from bias."""
 
 
@@ -74,7 +74,7 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     even = np.column_stack([np.ones(len(off)), seconds])
     # The true yaw is tested, so that a gyroscope that measures only a fiftieth is reported as well.
     turned = yaw + off - even @ np.linalg.lstsq(even, yaw + off, rcond=None)[0]
-    if float(turned.std()) < _LEAST_TURNED_RAD:
+    if float(turned.std()) < _MIN_TURNED_RAD:
         return None
     columns = np.column_stack([even, yaw])
     fitted, *_ = np.linalg.lstsq(columns, off, rcond=None)

@@ -7,7 +7,7 @@ import numpy as np
 from support import CONFIG
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.continuous import LARGEST_STEP, ContinuousPose, advanced
+from stario.fusion.continuous import MAX_STEP, ContinuousPose, advanced
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
@@ -24,7 +24,7 @@ def test_a_step_is_bled_in_a_centimetre_at_a_time() -> None:
     remaining = []
     for k in range(1, 101):
         before, pose = pose, advanced(pose, state_at(0.1 * k, 0.5))
-        assert abs(pose.p_W[0] - before.p_W[0] - 0.1) < LARGEST_STEP + 1e-12
+        assert abs(pose.p_W[0] - before.p_W[0] - 0.1) < MAX_STEP + 1e-12
         np.testing.assert_allclose(pose.p_W + pose.correction_W, state_at(0.1 * k, 0.5).p_W)
         remaining.append(pose.correction_W[0])
     assert (np.diff(remaining) < 0.0).all()
@@ -46,10 +46,10 @@ def test_corrections_cause_no_step_in_the_position(walk: ImuSequence, make_oracl
             poses.append(navigator.continuous)
     p, v, t = (np.array([getattr(q, name) for q in poses]) for name in ("p_W", "v_W", "time"))
     moved = np.diff(p, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-    assert np.linalg.norm(moved, axis=1).max() < LARGEST_STEP + 1e-9
+    assert np.linalg.norm(moved, axis=1).max() < MAX_STEP + 1e-9
     corrected = p + np.array([q.correction_W for q in poses])
     stepped = np.diff(corrected, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-    assert np.linalg.norm(stepped, axis=1).max() > 2.0 * LARGEST_STEP
+    assert np.linalg.norm(stepped, axis=1).max() > 2.0 * MAX_STEP
     assert np.linalg.norm(poses[-1].correction_W) < 0.5
 
 

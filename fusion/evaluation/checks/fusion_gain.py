@@ -16,7 +16,7 @@ import numpy as np
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.groups import by_group
-from stario.fusion.evaluation.known_positions import LEAST, position_error
+from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -27,7 +27,7 @@ from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
-LEAST_SIGMA = 3.0
+SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
 
 GOOD_YAW = math.radians(10.0)
@@ -82,8 +82,8 @@ def fusion_gain(
     if math.isnan(network_m):
         raise InputError(
             f"{sequence.name}: positions",
-            f"fewer than {LEAST} within the track",
-            f"{LEAST} or more",
+            f"fewer than {MIN_POSITIONS} within the track",
+            f"{MIN_POSITIONS} or more",
         )
     error, sigma = _yaw(first, sequence.truth)
     return FusionGain(
@@ -126,7 +126,7 @@ def _row(group: str, part: Sequence[FusionGain], names: Sequence[str]) -> list[s
     yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
     if len(yaw) == 0:
         return [*row, "-", "-", "-", "-"]
-    good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < LEAST_SIGMA * yaw[:, 1]
+    good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < SIGMA_BOUND * yaw[:, 1]
     row += [f"{np.nanmedian([result.position_nees for result in part]):.1f}"]
     row += [f"{np.degrees(np.median(yaw[:, 0])):.1f}"]
     return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]

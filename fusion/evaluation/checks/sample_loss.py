@@ -30,7 +30,7 @@ GAP_SECONDS, DROPPED = 0.1, 0.05
 INSTANTS = 6
 """Number of instants at which a gap is placed, in a run each."""
 
-MOST_METRES, MOST_DEGREES = 0.01, 3.0
+MAX_SHIFT, MAX_TURN = 0.01, 3.0
 """Maximum acceptable shift of the end: in metres per metre of the path, and in yaw."""
 
 _MIN_PATH = 1.0
@@ -97,12 +97,12 @@ def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, flo
 
 def end_shift_table(found: Sequence[EndShift]) -> str:
     """Return a row for each group: share of the ends within limits, and how far ends move."""
-    head = ["group", "ends", f"within {MOST_METRES:.0%} and {MOST_DEGREES:g} deg"]
+    head = ["group", "ends", f"within {MAX_SHIFT:.0%} and {MAX_TURN:g} deg"]
     rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
     for group, part in by_group(found):
         metres = np.array([shift.metres for shift in part])
         degrees = np.array([shift.degrees for shift in part])
-        within = ((metres <= MOST_METRES) & (degrees <= MOST_DEGREES)).mean()
+        within = ((metres <= MAX_SHIFT) & (degrees <= MAX_TURN)).mean()
         figures = [
             f"{value:.2f}"
             for values in (100.0 * metres, degrees)

@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.fusion_gain import LEAST_SIGMA
+from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
 from stario.fusion.evaluation.checks.groups import by_group
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
@@ -107,7 +107,7 @@ def track_with_fixes(
         float(np.median(nees(error, P[:, 6:9, 6:9]))),
         float(np.sqrt((yaw**2).mean())),
         float((yaw**2 / P[:, 2, 2]).mean()),
-        float((np.abs(yaw) < LEAST_SIGMA * np.sqrt(P[:, 2, 2])).mean()),
+        float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
     )
 
 

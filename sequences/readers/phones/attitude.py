@@ -25,7 +25,7 @@ _ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
 _EXPLAINED = 0.5
 """Share of the gyroscope's rotation that an attitude must explain to be the phone's."""
 
-_LONGEST_STEP_S = 0.3
+_MAX_STEP_S = 0.3
 
 
 def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotation] | None:
@@ -84,7 +84,7 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
     turned = interpolated(time, clock, angle)
     logged = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
     inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1])
-    inside &= np.diff(time) < _LONGEST_STEP_S
+    inside &= np.diff(time) < _MAX_STEP_S
     if not inside.any():
         return 0.0
     measured = np.diff(turned, axis=0)[inside]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recorded import DATA
 
-from stario.fusion.live.merging import LONGEST_WAIT, Join, Merger
+from stario.fusion.live.merging import MAX_WAIT, Join, Merger
 from stario.fusion.live.payload import GYRO, TOTAL, Reading, parse_push
 from stario.sequences import read_recording
 
@@ -97,7 +97,7 @@ def test_memory_stays_small_if_the_accelerometer_stops_sending():
     for k in range(1, 20_000):
         join.add(0, k * SECOND // 100, (0.0, 0.0, 0.0))
         join.ready()
-    assert len(join._first) <= LONGEST_WAIT // (SECOND // 100) + 1
+    assert len(join._first) <= MAX_WAIT // (SECOND // 100) + 1
     assert join.alone == 19_999 - len(join._first)
 
 

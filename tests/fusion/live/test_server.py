@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from stario.fusion import read_fixes
-from stario.fusion.live.hub import MOST_DEVICES, Viewer
-from stario.fusion.live.server import MOST_BYTES, live_app
+from stario.fusion.live.hub import MAX_DEVICES, Viewer
+from stario.fusion.live.server import MAX_BYTES, live_app
 from stario.sequences import read_recording
 
 JSON = {"content-type": "application/json"}
@@ -227,10 +227,10 @@ def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, push
 
 
 def test_oversized_pushes_surplus_devices_and_foreign_requests_are_refused(client, hub, pushes):
-    answer = client.post("/data", content=b" " * (MOST_BYTES + 1))
+    answer = client.post("/data", content=b" " * (MAX_BYTES + 1))
     assert (answer.status_code, "bytes" in answer.json()["error"]) == (400, True)
     body = pushes(seconds=0.2)[0]
-    for k in range(MOST_DEVICES):
+    for k in range(MAX_DEVICES):
         client.post("/data", content=body.replace(b"phone", b"phone%d" % k))
     answer = client.post("/data", content=body.replace(b"phone", b"another"))
     assert (answer.status_code, "at most" in answer.json()["error"]) == (400, True)
@@ -289,7 +289,7 @@ def test_viewers_get_new_points_and_after_a_change_the_whole_track(client, hub, 
 def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, monkeypatch):
     from stario.fusion.live import drawn as module
 
-    monkeypatch.setattr(module, "MOST_POINTS", 50)
+    monkeypatch.setattr(module, "MAX_POINTS", 50)
     drawn, navigator = module.DisplayedTrack(), new_navigator()
     for k in range(800):
         state = navigator.push(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
