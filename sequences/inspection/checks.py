@@ -110,7 +110,8 @@ def _check_content(sequence: ImuSequence) -> None:
     if len(sequence) < 2:
         raise InputError(f"{sequence.name}: samples", "1", f"at least {MIN_SECONDS} s of them")
     for field, values in (("gyro", sequence.gyro), ("accel", sequence.accel)):
-        size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
+        with np.errstate(over="ignore"):  # single values may be huge: the median ignores them
+            size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
             raise InputError(
                 f"{sequence.name}: {field}", f"{size:.3g} on average", "a plausible sensor value",
