@@ -290,3 +290,8 @@ def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
         check_units(sequence)
         text = "\n".join(inspect_recording(sequence).lines())
     assert text.endswith("in 1 sample")
+
+
+def test_the_unit_g_given_for_metres_is_named(walk: ImuSequence) -> None:
+    text = refusal(with_units(walk.without_truth(), accel_unit="g"))
+    assert "omit the unit g" in text
