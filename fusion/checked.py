@@ -23,7 +23,7 @@ def check_type(name: str, value: object, kind: type, otherwise: str | None = "")
         InputError: the type differs; names the argument.
     """
     if not (isinstance(value, kind) or (otherwise is None and value is None)):
-        expected = f"of type {kind.__name__}" + (" or None" if otherwise is None else "")
+        expected = f"a value of type {kind.__name__}" + (" or None" if otherwise is None else "")
         raise InputError(name, f"{value!r:.60}", expected, otherwise or "")
 
 

@@ -161,7 +161,7 @@ class NavigatorConfig:
         for name, kind in (("noise", ImuNoise), ("filter", FilterConfig), ("graph", GraphConfig)):
             value = getattr(self, name)
             if not isinstance(value, kind):
-                raise ConfigError(name, f"{value!r:.60}", f"of type {kind.__name__}")
+                raise ConfigError(name, f"{value!r:.60}", f"a value of type {kind.__name__}")
         check_number(self, "gravity", 9.5, 10.1)
 
 

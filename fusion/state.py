@@ -183,7 +183,9 @@ class Health:
         if self.bearings:
             text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
         if self.accel_noise_factor > 1.0:
-            text.append(f"accelerometer noise {self.accel_noise_factor:.1f} times the configured")
+            text.append(
+                f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
+            )
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}"]
 

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
 
 RecordingsArgument = Annotated[
-    list[Path], typer.Argument(help="Recordings, folders, archives or list files.")
+    list[Path],
+    typer.Argument(metavar="PATH...", help="Recordings, folders, archives or list files."),
 ]
 
 

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 PathsArgument = Annotated[
-    list[Path] | None, typer.Argument(help="Recordings, folders or list files.")
+    list[Path] | None,
+    typer.Argument(metavar="PATH...", help="Recordings, folders or list files."),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
 FixesOption = Annotated[

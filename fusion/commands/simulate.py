@@ -17,7 +17,11 @@ def simulate(
     seconds: Annotated[float, typer.Option(help="Duration in s.")] = 60.0,
     rate: Annotated[float, typer.Option(min=50.0, max=1000.0, help="Sampling rate in Hz.")] = 200.0,
     carry: Annotated[
-        str, typer.Option(help="How the device is carried; random also draws the person.")
+        str,
+        typer.Option(
+            help="How the device is carried: handheld, call, swinging, pocket, bag, trolley, rig, "
+            "or random, which also draws the person."
+        ),
     ] = "random",
     imu: Annotated[str, typer.Option(help="Sensor model: phone, good or perfect.")] = "phone",
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,

@@ -258,6 +258,6 @@ def _describe(value: Any) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, (dict, list)):
-        return "a list" if isinstance(value, list) else "an object"
+        return f"a list of {len(value)}" if isinstance(value, list) else "an object"
     text = repr(value) if isinstance(value, (str, float, bool)) else f"{str(value)[:20]}"
     return text if len(text) <= 40 else f"{text[:40]}..."

@@ -110,7 +110,8 @@ def _check_content(sequence: ImuSequence) -> None:
     if len(sequence) < 2:
         raise InputError(f"{sequence.name}: samples", "1", f"at least {MIN_SECONDS} s of them")
     for field, values in (("gyro", sequence.gyro), ("accel", sequence.accel)):
-        size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
+        with np.errstate(over="ignore"):  # single values may be huge: the median ignores them
+            size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
             raise InputError(
                 f"{sequence.name}: {field}", f"{size:.3g} on average", "a plausible sensor value",
@@ -202,11 +203,14 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
             "an iPhone) or write `ax [g]` in the CSV's header",
         )
     if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
+        twice = _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]
         raise InputError(
             field,
             f"an average of {average:.3g}",
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            "convert it to m/s^2 or g, with gravity included",
+            "it seems to be in m/s^2 already: omit the unit g"
+            if twice
+            else "convert it to m/s^2 or g, with gravity included",
         )
 
 

@@ -51,7 +51,8 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
         )
     invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if invalid:
-        problems.append(f"{sequence.name}: values that no sensor can measure, in {invalid} samples")
+        samples = "1 sample" if invalid == 1 else f"{invalid} samples"
+        problems.append(f"{sequence.name}: values that no sensor can measure, in {samples}")
     return problems + _stuck_problems(sequence) + _limit_problems(sequence)
 
 

@@ -88,7 +88,7 @@ def track_with_fixes(
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses")
     known = true_fixes(sequence.truth, every, sigma, seed)
-    fixes = [fix for fix in known if fix.time >= sequence.time[0]]
+    fixes = [fix for fix in known if fix.time >= sequence.time[0]]  # truth may begin earlier
     if len(fixes) < _MIN_FIXES:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")
     track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)

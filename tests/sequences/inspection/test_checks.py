@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -278,3 +279,19 @@ def test_a_sensor_at_its_limit_is_named_with_the_share_of_samples() -> None:
         reported = float(problem.split("%")[0].split()[-1]) / 100.0
         assert 0.5 * share < reported < share
     assert not [p for p in inspect_recording(free).problems if "limit" in p]
+
+
+def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
+    gyro = walk.gyro.copy()
+    gyro[5, 0] = 1e300
+    sequence = replace(walk, gyro=gyro)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_units(sequence)
+        text = "\n".join(inspect_recording(sequence).lines())
+    assert text.endswith("in 1 sample")
+
+
+def test_the_unit_g_given_for_metres_is_named(walk: ImuSequence) -> None:
+    text = refusal(with_units(walk.without_truth(), accel_unit="g"))
+    assert "omit the unit g" in text

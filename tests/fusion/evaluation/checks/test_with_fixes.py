@@ -38,3 +38,16 @@ def test_missing_poses_and_too_few_fixes_are_refused(walk: ImuSequence, still_mo
         track_with_fixes(still_model, replace(walk, truth=None), CONFIG, "walks")
     with pytest.raises(InputError, match="fixes"):
         track_with_fixes(still_model, walk, CONFIG, "walks", every=15.0)
+
+
+def test_truth_before_the_first_sample_gives_no_fixes(
+    walk: ImuSequence, make_oracle: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert walk.truth is not None
+    time = walk.truth.time.copy()
+    time[0] = walk.time[0] - 1.0
+    earlier = replace(walk, truth=replace(walk.truth, time=time))
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    found = track_with_fixes(oracle, earlier, CONFIG, "walks", every=2.0, sigma=0.05)
+    assert "before the start" not in caplog.text
+    assert found.applied > 0.9
