@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.attitude.levelling import STILL_ACCEL
 from stario.sequences.legs import LegStream
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
@@ -68,6 +69,11 @@ class KnownMotion:
         """Return the distance (B,) of windows (B, 6, 200) to known motion, 1 at the limit."""
         distances, _ = self._tree.query(scaled_features(features(windows)))
         return np.asarray(distances / self.limit)
+
+    def is_unfamiliar(self, windows: NDArray[np.float32]) -> BoolArray:
+        """Return which windows (B, 6, 200) move, and unlike those of the training."""
+        moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
+        return np.asarray(moves & (self.novelty(windows) > 1.0))
 
     @cached_property
     def _tree(self) -> Any:

@@ -123,5 +123,5 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
     training = model.card.known_motion
     if training is None:
         return Familiarity(None, medians, {}, observed)
-    outside = float(np.mean(training.novelty(windows) > 1.0))
+    outside = float(np.mean(training.is_unfamiliar(windows)))
     return Familiarity(outside, medians, dict(training.ranges), observed)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
-from stario.sequences.attitude.levelling import STILL_ACCEL
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -89,10 +88,7 @@ class StatefulInference:
     def unfamiliar(self, windows: NDArray[np.float32]) -> int:
         """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
         known_motion = getattr(getattr(self._model, "card", None), "known_motion", None)
-        if known_motion is None:
-            return 0
-        moves = np.linalg.norm(windows[:, 3:].std(axis=2), axis=1) > STILL_ACCEL
-        return int((moves & (known_motion.novelty(windows) > 1.0)).sum())
+        return 0 if known_motion is None else int(known_motion.is_unfamiliar(windows).sum())
 
     @property
     def memory(self) -> Any:

@@ -128,3 +128,13 @@ def test_a_model_widens_its_covariance_for_unfamiliar_motion(known: KnownMotion)
     np.testing.assert_array_equal(mean, same)
     factors = known.variance_factor(unfamiliar)
     np.testing.assert_allclose(wider, factors[:, None, None] * covariance)
+
+
+def test_a_stationary_device_is_unlike_the_training_but_not_unfamiliar(known: KnownMotion) -> None:
+    rng = np.random.default_rng(0)
+    stationary = 0.01 * rng.standard_normal((8, 6, 200)).astype(np.float32)
+    stationary[:, 5] += STANDARD_GRAVITY
+    running = windows(walking_stream(9, rate=3.5, size=15.0))
+    assert (known.novelty(stationary) > 1.0).all()
+    assert not known.is_unfamiliar(stationary).any()
+    assert known.is_unfamiliar(running).all()
