@@ -158,7 +158,7 @@ class MagneticFindings:
         if self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
             return ""
         pairs = zip(self.hard_iron_uT, self.hard_iron_sigma_uT, strict=True)
-        return ", hard iron " + ", ".join(f"{b:+.1f}" + f" ± {s:.1f}" for b, s in pairs) + " uT"
+        return ", hard iron " + ", ".join(f"{b:+.1f}" + f" +- {s:.1f}" for b, s in pairs) + " uT"
 
 
 def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
