@@ -30,11 +30,14 @@ def simulate(
     """Write a simulated walk with its ground truth as a CSV recording."""
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
-    from stario.sequences.simulation.walks import WalkStyle, generate_walk
+    from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     if imu not in sensors:
         raise InputError("--imu", repr(imu), f"one of {', '.join(sensors)}")
+    modes = (*CARRYING_MODES, "random")
+    if carry not in modes:
+        raise InputError("--carry", repr(carry), f"one of {', '.join(modes)}")
     style = None if carry == "random" else WalkStyle(carry=carry)
     walk = generate_walk(seed, seconds, style=style)
     sequence = simulate_imu(walk, rate, sensors[imu], seed, name=path.stem)
