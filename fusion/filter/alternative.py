@@ -91,10 +91,8 @@ class HypothesisPair:
         if self.alternative is not None:
             filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
             work()
-            self.alternative, self.ekf.state = (
-                changed(self.alternative, ekf=self.ekf.state),
-                filter_state,
-            )
+            self.alternative = changed(self.alternative, ekf=self.ekf.state)
+            self.ekf.state = filter_state
         return result
 
     def compare(self, fits: Callable[[], bool], fits_filter: bool) -> None:

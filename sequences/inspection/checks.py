@@ -203,13 +203,13 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
             "an iPhone) or write `ax [g]` in the CSV's header",
         )
     if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
-        twice = _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]
+        was_metric = _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]
         raise InputError(
             field,
             f"an average of {average:.3g}",
             f"about {STANDARD_GRAVITY:.2f} m/s^2",
             "it seems to be in m/s^2 already: omit the unit g"
-            if twice
+            if was_metric
             else "convert it to m/s^2 or g, with gravity included",
         )
 

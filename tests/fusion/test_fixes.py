@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,13 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.fix_file import read_fixes
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.cutting import split_at
 from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.errors import InputError, ReadError
+from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
@@ -372,68 +370,3 @@ def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: An
     assert track.health.fixes == {"applied": 1}
     assert np.isfinite(track.covariance).all()
     assert np.linalg.eigvalsh(track.covariance).min() > -1e-9
-
-
-# --- file ------------------------------------------------------------------------------------
-
-HEADER = "t,kind,x,y,z,sx,sy,sz\n"
-
-
-def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "fixes.csv"
-    path.write_text(
-        HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,yaw,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
-        encoding="utf-8",
-    )
-    position, yaw, velocity = read_fixes(path)
-    assert (position.kind, yaw.kind, velocity.kind) == ("position", "yaw", "velocity")
-    assert (position.time, yaw.time) == (1.5, 2.0)
-    np.testing.assert_allclose(position.value, [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(position.covariance, np.diag([0.01, 0.01, 0.09]))
-    np.testing.assert_allclose(yaw.covariance, [[0.0025]])
-
-
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        ("", "line 1.*header"),
-        ("time,kind\n", "line 1.*header"),
-        (HEADER + "1,altitude,1,2,3,1,,\n", "line 2, kind.*altitude"),
-        (HEADER + "1,position,1,2,3,1,,\nx,position,1,2,3,1,,\n", "line 3, t"),
-        (HEADER + "1,position,1,2,,1,,0.5\n", "line 2, z"),
-        (HEADER + "1,yaw,170,,,5,,\n", r"yaw.*radians.*\[deg\]"),
-        (HEADER + "1,position [deg],1,2,3,1,,\n", "line 2, kind"),
-        ("t,kind,x,x,sx\n", "line 1.*header"),
-        ("t,kind,x [cm],y [cm],sx\n", r"line 1.*\[cm\]"),
-        ("t [ms],kind,x [m],y,sx\n", r"line 1.*\[ms\]"),
-        (HEADER + "1,position,1,2,3,,,\n", "line 2, sx"),
-        (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
-        (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
-        (HEADER + "1,position,1,2,3,1,1,1,1\n", "9 values"),
-    ],
-)
-def test_an_invalid_file_raises_an_error_that_names_line_and_field(
-    tmp_path: Path, text: str, match: str
-) -> None:
-    path = tmp_path / "fixes.csv"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(ReadError, match=match) as caught:
-        read_fixes(path)
-    assert "fixes.csv" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path: Path) -> None:
-    path = tmp_path / "fixes.csv"
-    path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw[deg];2;170;;;5\n")
-    position, yaw = read_fixes(path)
-    np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
-    assert position.covariance[0, 0] == pytest.approx(0.25)
-    assert position.covariance[2, 2] == pytest.approx(1e6)
-    np.testing.assert_allclose(yaw.value, [np.radians(170.0)])
-    np.testing.assert_allclose(yaw.covariance, [[np.radians(5.0) ** 2]])
-
-
-def test_a_missing_file_raises_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ReadError, match="fixes"):
-        read_fixes(tmp_path / "fixes.csv")

@@ -1,0 +1,169 @@
+"""Wrong input to the commands: one line that names what is wrong and what fixes it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.readers.generic_csv import read_generic_csv
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.usefixtures("no_figures")
+def test_degrees_are_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path, truth: bool
+) -> None:
+    sequence = read_generic_csv(recording)
+    sequence = sequence if truth else sequence.without_truth()
+    write_csv(tmp_path / "deg.csv", replace(sequence, gyro=np.degrees(sequence.gyro)))
+    done = stario("run", "deg.csv", "--out", "out")
+    done.assert_one_line_error("--gyro-unit deg/s", "deg")
+    assert not (tmp_path / "out").exists()
+    if truth:
+        assert stario("run", "deg.csv", "--out", "out", "--gyro-unit", "deg/s").code == 0
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
+    sequence = read_generic_csv(recording)
+    write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
+    stario("run", "g.csv").assert_one_line_error("--accel-unit g")
+    assert stario("run", "g.csv", "--accel-unit", "g").code == 0
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_wrong_sign_of_gravity_is_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    sequence = read_generic_csv(recording)
+    write_csv(tmp_path / "apple.csv", replace(sequence, accel=-sequence.accel))
+    stario("run", "apple.csv").assert_one_line_error("--accel-unit=-m/s^2")
+    assert stario("run", "apple.csv", "--accel-unit=-m/s^2").code == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ["broken.csv"]),
+        (b"t,gx,gy,gz,ax,ay,az\n", ["broken.csv", "rows"]),
+        (b"t,gx,gy,gz,ax,ay\n0,0,0,0,0,0\n", ["broken.csv"]),
+        (b"t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n0.01,0,0\n", ["line 3", "cut short"]),
+        (b"t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0,9.8\n", ["broken", "at least"]),
+        (b"\x89PNG\r\n\x1a\n\x00\x00", ["broken.csv"]),
+    ],
+)
+def test_a_broken_file_is_named_in_one_line(
+    stario, tmp_path: Path, content: bytes, words: list[str]
+) -> None:
+    (tmp_path / "broken.csv").write_bytes(content)
+    stario("run", "broken.csv").assert_one_line_error(*words)
+    assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
+
+
+def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Path) -> None:
+    content = recording.read_bytes()
+    (tmp_path / "cut.csv").write_bytes(content[:50_020] + content[content.index(b"\n", 60_000) :])
+    stario("run", "cut.csv").assert_one_line_error("cut.csv", "line ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "missing.csv"], ["missing.csv", "no such file"]),
+        (["compare", "missing"], ["missing", "no such file"]),
+        (["evaluate", "--data", "missing"], ["missing", "--data"]),
+        (["evaluate", "--data", ".", "--split", "practice"], ["split", "practice"]),
+        (["evaluate"], ["PATH", "--data"]),
+        (["evaluate", "--data", ".", "--where", "person=dan"], ["--where", "--data"]),
+        (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
+        (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
+        (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
+        (["run", "RECORDING", "--gyro-unit", "rpm"], ["gyro_unit", "rpm"]),
+        (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
+        (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
+        (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
+        (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
+        (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
+        (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
+        (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
+        (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
+        (["simulate", "no/such/folder.csv"], ["folder"]),
+        (["simulate", ".", "--seconds", "2"], ["folder"]),
+        (["simulate", "a.csv", "--seconds", "0"], ["duration"]),
+        (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
+        (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
+        (["train", "--generated", "0"], ["streams"]),
+        (["train", "--config", "missing.json"], ["missing.json"]),
+        (["train"], ["PATH", "--data"]),
+        (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
+        (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
+    ],
+)
+def test_invalid_arguments_give_a_one_line_error(
+    stario, recording: Path, arguments: list[str], words: list[str]
+) -> None:
+    done = stario(*(recording if word == "RECORDING" else word for word in arguments))
+    done.assert_one_line_error(*words)
+
+
+@pytest.mark.parametrize(
+    ("command", "content", "named"),
+    [
+        ("run", '{"filter": {"speed": 1}}', "filter.speed"),
+        ("run", '{"noise": {"gyro_noise": "low"}}', "noise.gyro_noise"),
+        ("compare", '{"filter": {"update_rate": 3}}', "filter.update_rate"),
+        ("evaluate", '{"gravity": 1.62}', "gravity"),
+        ("run", "{", "settings.json"),
+        ("train", '{"speed": 1}', "speed"),
+        ("train", "[1]", "settings.json"),
+        ("train", '{"epochs": "three"}', "epochs"),
+        ("train", '{"augmentation": {"magic": 1}}', "augmentation.magic"),
+    ],
+)
+def test_an_invalid_setting_is_named_in_one_line(
+    stario, recording: Path, tmp_path: Path, command: str, content: str, named: str
+) -> None:
+    (tmp_path / "settings.json").write_text(content)
+    stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
+
+
+def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_path: Path) -> None:
+    before = recording.read_bytes()
+    stario("convert", recording, recording).assert_one_line_error("also an input", "another file")
+    stario("convert", recording, recording, "--overwrite").assert_one_line_error("also an input")
+    assert recording.read_bytes() == before
+    there = tmp_path / "there.csv"
+    there.write_text("mine")
+    stario("convert", recording, there).assert_one_line_error("already exists", "--overwrite")
+    assert there.read_text() == "mine"
+    assert stario("convert", recording, there, "--overwrite").code == 0
+    assert there.read_text() != "mine"
+    assert stario("convert", recording, there, "two.h5").code == 0
+    before = Path("two.h5").read_bytes()
+    for source in ("two.h5:walk", "."):
+        stario("convert", source, "two.h5", "--overwrite").assert_one_line_error("also an input")
+    assert Path("two.h5").read_bytes() == before
+
+
+def test_a_file_extension_without_a_layout_is_refused(stario, recording: Path) -> None:
+    stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
+    assert not Path("walk.txt").exists()
+
+
+def test_unknown_weights_are_refused_with_the_names_of_the_known_ones(
+    stario, recording: Path
+) -> None:
+    stario("run", recording, "--model", "nothere").assert_one_line_error(
+        "nothere", "default, first-stage, open or walks-36min"
+    )
+
+
+def test_a_declination_without_a_source_of_north_is_reported(stario, recording: Path) -> None:
+    done = stario("run", recording, "--declination", "-6", "--out", "north")
+    assert done.code == 0
+    assert "north" in done.out
+    assert "nothing to do" not in done.out
