@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,15 +64,25 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 
 def summary_table(recordings: Sequence[Scores]) -> str:
     """Return the summary as text: horizontal ATE of each track, consistency of the back ends."""
-    rows = [(r.name, [_value(r, t, m) for t, m, _ in _COLUMNS]) for r in recordings]
-    columns = [_known_values(recordings, track, metric) for track, metric, _ in _COLUMNS]
+    rows = [[r.name, *(_cell([r], t, m, np.mean) for t, m, _ in _COLUMNS)] for r in recordings]
     for name, over in (("median", np.median), ("mean", np.mean)):
-        rows.append((name, [float(over(values)) if len(values) else None for values in columns]))
-    cells = [[name, *(figure(value, ".2f") for value in row)] for name, row in rows]
-    lines = aligned([["", *(title for _, _, title in _COLUMNS)], *cells])
-    lines.append(f"ATE in m: {METRIC_WORDS['ate_m']}; NIS: {METRIC_WORDS['nis']}; ")
+        rows.append([name, *(_cell(recordings, t, m, over) for t, m, _ in _COLUMNS)])
+    lines = aligned([["", *(title for _, _, title in _COLUMNS)], *rows])
+    lines.append(f"ATE in m: {METRIC_WORDS['ate_m']};")
+    lines.append(f"in parentheses {METRIC_WORDS['ate_fit_m']};")
+    lines.append(f"NIS: {METRIC_WORDS['nis']};")
     lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
     return "\n".join(lines)
+
+
+def _cell(
+    recordings: Sequence[Scores], track: str, metric: str, over: Callable[[FloatArray], float]
+) -> str:
+    """Return a figure over recordings; an ATE with that after a yaw fit in parentheses."""
+    names = ("ate_m", "ate_fit_m") if metric == "ate_m" else (metric,)
+    columns = [_known_values(recordings, track, name) for name in names]
+    texts = [figure(float(over(values)) if len(values) else None, ".2f") for values in columns]
+    return texts[0] + "".join(f" ({text})" for text in texts[1:])
 
 
 def _known_values(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:

@@ -248,7 +248,8 @@ def test_summary_has_median_and_mean_over_recordings(
     table = summary_table(scores)
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
-    assert "3.00" in lines[4]
+    fitted = compared.metrics["ekf"]["ate_fit_m"]
+    assert f"3.00 ({fitted:.2f})" in lines[4]
 
 
 def test_summary_omits_a_track_that_the_recording_lacks(
