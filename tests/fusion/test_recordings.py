@@ -71,3 +71,16 @@ def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> No
     off = track.trajectory.position_W[at] - np.array([s.p_W for s in states])
     assert np.linalg.norm(off, axis=1).max() < 1e-3
     assert navigator.health.gated == track.health.gated
+
+
+def test_a_phone_in_a_runners_hand_is_tracked_although_both_sensors_saturate(
+    model: DisplacementModel,
+) -> None:
+    archive = DATA / "archives/tyrex.h5"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    recording = read_recording(f"{archive}:Guillaume_Nexus5_NoDist_RunningHand")
+    result = compare(model, recording, NavigatorConfig())
+    assert result.tracks["ekf"].health.flagged["saturated"] > 1000
+    # Measured 1.4 m for the EKF and 1.5 m for its network on a path of 214 m.
+    assert result.metrics["ekf"]["ate_fit_m"] < 2.5
