@@ -116,7 +116,8 @@ def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     start = start_from_gravity(time[:first], gyro[:first], accel[:first])
     loop = LevelledAttitude(start.R_WB)
     grid = np.arange(time[0] + PERIOD, time[-1], PERIOD)
-    ends = np.unique([0, *np.searchsorted(time, grid), len(time) - 1])
+    # Without the last sample, which rounding may place before the grid's last time.
+    ends = np.unique([0, *np.searchsorted(time[:-1], grid), len(time) - 1])
     attitudes = np.empty((len(time), 3, 3))
     attitudes[0] = start.R_WB
     for begin, end in pairwise(ends.tolist()):

@@ -35,6 +35,13 @@ def test_scale_and_bias_are_recovered(walk: ImuSequence, scale: float, bias: flo
     assert found.residual_rms < np.radians(1.0)
 
 
+def test_a_grid_rounded_to_beyond_the_last_sample_is_fitted(walk: ImuSequence) -> None:
+    """3.305 s plus 369 steps of 0.1 s is later than 40.205 s in floating point."""
+    time = 0.005 + walk.time
+    part = replace(walk, time=time, truth=replace(walk.truth, time=time)).slice(3.3, 40.206)
+    assert yaw_drift(part, fit_truth(part)) is not None
+
+
 def test_the_report_states_the_scale_error(walk: ImuSequence) -> None:
     too_high, too_low = (
         "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).lines())
