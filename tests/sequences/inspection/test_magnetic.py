@@ -20,7 +20,7 @@ from stario.sequences import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
-from stario.sequences.inspection.magnetic import assess_magnetometer
+from stario.sequences.inspection.magnetic import assess_magnetometer, magnetic_problems
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import clean_samples
@@ -43,13 +43,13 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
     found = assess_magnetometer(replace(sequence, gyro=sequence.gyro + drift * up_B))
     assert found is not None
     assert found.verdict == "good"
-    assert found.correlation is not None
-    assert found.correlation > 0.89  # the sensor's own noise and its lag leave 0.90
+    assert found.correlation_with_gyroscope is not None
+    assert found.correlation_with_gyroscope > 0.89  # the sensor's own noise and its lag leave 0.90
     assert found.lag_s == pytest.approx(0.04, abs=0.01)
     np.testing.assert_allclose(found.hard_iron_uT, IRON, atol=3.0)
     assert found.dip_rad == pytest.approx(math.radians(63.0), abs=0.1)
-    assert found.drift_rad_s == pytest.approx(drift, rel=0.15)
-    assert "hard iron" in found.problems[0]
+    assert found.gyroscope_drift_rad_s == pytest.approx(drift, rel=0.15)
+    assert "hard iron" in magnetic_problems("walk", found)[0]
 
 
 @pytest.mark.parametrize("lag", [-0.08, 0.2])
@@ -62,7 +62,7 @@ def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag: float) 
     report = "\n".join(inspected.lines())
     assert "lag outside -50 to +150 ms" in report
     assert "constant field" not in report
-    assert found.correlation is not None
+    assert found.correlation_with_gyroscope is not None
 
 
 def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
@@ -76,7 +76,7 @@ def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
     wrong = assess_magnetometer(replace(good, magnetometer=turned))
     assert wrong is not None
     assert wrong.verdict == "not usable"
-    assert "does not follow the gyroscope" in " ".join(wrong.problems)
+    assert "does not follow the gyroscope" in " ".join(magnetic_problems("walk", wrong))
     lines = inspect_recording(replace(good, truth=None, accel=-good.accel)).lines()
     assert any("points up by" in line and "--accel-sign apple" in line for line in lines)
     unit = Magnetometer(good.magnetometer.time, 1e3 * good.magnetometer.field)
@@ -104,7 +104,7 @@ def test_a_magnetometer_that_starts_with_zeros_is_assessed() -> None:
             replace(late, magnetometer=Magnetometer(late.magnetometer.time, field))
         )
     assert found is not None
-    assert found.held < 0.5
+    assert found.held_share < 0.5
 
 
 def test_inspection_reports_a_good_magnetometer_and_a_missing_one() -> None:
@@ -140,7 +140,8 @@ def test_recorded_magnetometers_measure_the_gyroscopes_drift(
     found = assess_magnetometer(recording)
     assert found is not None
     assert found.verdict == verdict
-    assert math.degrees(found.drift_rad_s) == pytest.approx(math.degrees(drift), abs=tolerance)
+    measured = math.degrees(found.gyroscope_drift_rad_s)
+    assert measured == pytest.approx(math.degrees(drift), abs=tolerance)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")

@@ -44,7 +44,7 @@ def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:
     assert found.timing.gaps == ()
     assert found.accel_norm == pytest.approx(STANDARD_GRAVITY, abs=0.5)
     assert found.coverage is not None
-    assert found.coverage.share > 0.99
+    assert found.coverage.coverage > 0.99
     assert found.coverage.path_m == pytest.approx(truth_of(walk).path_length())
 
 
@@ -61,11 +61,11 @@ def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     lengths = {round(start, 2): round(length, 2) for start, length in timing.gaps}
     assert lengths[4.99] == 2.51
     assert lengths[11.99] == 0.04
-    assert timing.repeated == 1
-    assert timing.backward == 1
-    assert timing.not_finite == 1
+    assert timing.times_repeated == 1
+    assert timing.times_backward == 1
+    assert timing.samples_not_finite == 1
     # The two samples with wrong times leave gaps where they should have been.
-    assert timing.lost >= 250 + 3
+    assert timing.samples_lost_in_gaps >= 250 + 3
     assert timing.jitter_s < 1e-9
 
 
