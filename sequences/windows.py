@@ -299,9 +299,14 @@ def windows_at(
 
     Rotating both by minus `headings_at` gives frame H.
     """
-    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
+    windows = cut_windows(stream.imu_W, starts)
     return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
+
+
+def cut_windows(imu: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the windows (M, 6, 200) of samples (N, 6) that start at samples `starts` (M,)."""
+    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
+    return np.ascontiguousarray(imu[rows].transpose(0, 2, 1))
 
 
 def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> FloatArray:
