@@ -150,13 +150,7 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     return np.where((widths > 0.25 * step)[:, None], means, interpolated(grid, time, values))
 
 
-_SHORTEST_SECONDS = 2.0 * WINDOW_SECONDS
-
-
-def world_streams(
-    sequence: ImuSequence,
-    attitude: Attitude = "levelled",
-) -> list[WorldStream]:
+def world_streams(sequence: ImuSequence, attitude: Attitude = "levelled") -> list[WorldStream]:
     """Cut a recording with ground truth into unbroken 200 Hz stretches in the world frame.
 
     No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); stretches
@@ -173,9 +167,8 @@ def world_streams(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for training")
-    world = imu_in_world(sequence, sequence.truth, attitude)
-    known = sequence.truth.valid
-    truth = sequence.truth
+    truth, known = sequence.truth, sequence.truth.valid
+    world = imu_in_world(sequence, truth, attitude)
     position_W = interpolated(world.time, truth.time[known], truth.position_W[known])
     return [
         WorldStream(
@@ -185,7 +178,7 @@ def world_streams(
             facing_W=world.facing[start:stop],
         )
         for start, stop in runs(world.usable)
-        if (stop - start) / WINDOW_RATE >= _SHORTEST_SECONDS
+        if stop - start >= 2 * WINDOW_SAMPLES
     ]
 
 
@@ -196,9 +189,10 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
         InputError: as for `clean_samples`.
     """
     time, gyro, accel = clean_samples(sequence)
-    attitude_WB = truth.at(time).attitude_WB
+    pose = truth.at(time)
+    attitude_WB = pose.attitude_WB
     if attitude == "levelled":
-        attitude_WB = _levelled(time, gyro, accel, attitude_WB, truth.covers(time))
+        attitude_WB = _levelled(time, gyro, accel, attitude_WB, pose.valid)
     world = _even(time, gyro, accel, attitude_WB)
     return replace(world, usable=world.usable & truth.covers(world.time))
 
@@ -224,25 +218,19 @@ def _levelled(
     Within a window the heading follows the gyroscope, as at inference: the rotation is averaged
     over a second.
     """
-    parts = unbroken(time)
-    levelled_NB = Rotation.from_matrix(_levelled_NB(time, gyro, accel))
+    R_NB = np.empty((len(time), 3, 3))
+    parts = [slice(start, stop) for start, stop in unbroken(time)]
+    for part in parts:
+        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
+    levelled_NB = Rotation.from_matrix(R_NB)
     turn = yaw_of(true_WB * levelled_NB.inv())
     second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
     changes = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
-    edges = np.union1d([start for start, _ in parts], changes)
+    edges = np.union1d([part.start for part in parts], changes)
     for start, stop in pairwise([*edges.tolist(), len(time)]):
         part = slice(start, stop)
         turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
     return about_z(turn) * levelled_NB
-
-
-def _levelled_NB(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-    """Return attitudes (n, 3, 3) levelled by the IMU, separately in each unbroken stretch."""
-    R_NB = np.empty((len(time), 3, 3))
-    for start, stop in unbroken(time):
-        part = slice(start, stop)
-        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
-    return R_NB
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -266,12 +254,8 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     time = sequence.time[index]
     rate = float(1.0 / np.median(np.diff(time)))
     if not MIN_RATE <= rate <= MAX_RATE:
-        raise InputError(
-            f"{sequence.name}: rate",
-            f"{rate:.1f} Hz",
-            "50 Hz to 1 kHz",
-            "is the time column in seconds?",
-        )
+        found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
+        raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
 
 

@@ -138,18 +138,16 @@ def middle_part(sequence: ImuSequence) -> ImuSequence:
     if sequence.duration <= LONGEST_S:
         return sequence
     centre = float(np.nanmedian(sequence.time))
-    keep = np.abs(sequence.time - centre) <= LONGEST_S / 2
-    return ImuSequence(
-        sequence.name, sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
-    )
+    return sequence.slice(centre - LONGEST_S / 2, centre + LONGEST_S / 2)
 
 
 def _grid(start: float, stop: float) -> FloatArray:
     return np.arange(start, max(stop, start + 2.0 / _RATE), 1.0 / _RATE)
 
 
-def _speed(attitude: Rotation, valid: BoolArray, stride: int = 4) -> FloatArray:
+def _speed(attitude: Rotation, valid: BoolArray) -> FloatArray:
     """Return the angular rate [rad/s] around each sample of an even grid, NaN where unknown."""
+    stride = 4
     speed = np.full(len(valid), np.nan)
     if len(valid) > stride:
         half = stride // 2
