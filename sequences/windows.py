@@ -15,7 +15,7 @@ down throughout, for which any heading is acceptable.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -193,21 +193,15 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
     attitude_WB = pose.attitude_WB
     if attitude == "levelled":
         attitude_WB = _levelled(time, gyro, accel, attitude_WB, pose.valid)
-    world = _even(time, gyro, accel, attitude_WB)
-    return replace(world, usable=world.usable & truth.covers(world.time))
-
-
-def _even(
-    time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
-) -> LevelledImu:
-    """Rotate samples by their attitudes and resample them to an even 200 Hz."""
     omitted = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
     even_time = time - omitted
     even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
     grid = even + omitted[np.searchsorted(even_time, even, side="right") - 1]
     columns = [attitude_WB.apply(gyro), attitude_WB.apply(accel), facing(attitude_WB.as_matrix())]
     values = resample(even_time, np.concatenate(columns, axis=1), even).astype(np.float32)
-    return LevelledImu(grid, values[:, :6], values[:, 6:], ~_spans_gap(even_time, even))
+    right = np.clip(np.searchsorted(even_time, even), 1, len(even_time) - 1)
+    in_gap = even_time[right] - even_time[right - 1] > MAX_IMU_GAP
+    return LevelledImu(grid, values[:, :6], values[:, 6:], ~in_gap & truth.covers(grid))
 
 
 def _levelled(
@@ -245,8 +239,9 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
     index = np.flatnonzero(finite)
     kept = increasing_mask(sequence.time[index])
-    ahead = _ahead(sequence.time[index], kept)
-    if ahead:
+    # Dropped samples that are later than all kept ones before them.
+    newest = np.maximum.accumulate(np.where(kept, sequence.time[index], -np.inf))
+    if ahead := int((sequence.time[index] > newest).sum()):
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
     index = index[kept]
     if len(index) < 2:
@@ -257,12 +252,6 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
         found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
         raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
-
-
-def _ahead(time: FloatArray, kept: BoolArray) -> int:
-    """Return the number of dropped samples that are later than all kept ones before them."""
-    newest = np.maximum.accumulate(np.where(kept, time, -np.inf))
-    return int((time > newest).sum())
 
 
 def unbroken(time: FloatArray) -> list[tuple[int, int]]:
@@ -307,8 +296,3 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
     """Return the maximal runs [start, stop) of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-def _spans_gap(time: FloatArray, grid: FloatArray) -> BoolArray:
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    return np.asarray(time[right] - time[right - 1] > MAX_IMU_GAP)

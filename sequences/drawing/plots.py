@@ -98,32 +98,19 @@ def innovations(
     residual: FloatArray,
     sigma: FloatArray,
     nis: FloatArray,
-    dof: int,
     gated: BoolArray,
-    title: str = "Innovations of the filter",
-    unit: str = "m",
+    title: str,
 ) -> Figure:
-    """Draw a filter's innovations with their 3 sigma bands, and the NIS.
+    """Draw a filter's innovations, one or more, with their 3 sigma bands, and the NIS.
 
     Args:
         time: (M,) times of the updates [s].
-        residual: (M, 3) innovation, x y z [unit].
-        sigma: (M, 3) standard deviation of the innovation according to the filter [unit].
+        residual: (M, 3) innovation, x y z [m].
+        sigma: (M, 3) standard deviation of the innovation according to the filter [m].
         nis: (M,) normalised innovation squared.
-        dof: degrees of freedom, the expected NIS.
         gated: (M,) True where the gate rejected or weakened the update.
         title: title of the figure.
-        unit: unit of the measurement.
-
-    Raises:
-        InputError: shapes do not agree or there is no update.
     """
-    m = len(time)
-    arrays = {"residual": (residual, (m, 3)), "sigma": (sigma, (m, 3)), "nis": (nis, (m,))}
-    for name, (value, shape) in {**arrays, "gated": (gated, (m,))}.items():
-        if np.shape(value) != shape or m == 0:
-            raise InputError(name, f"shape {np.shape(value)}", f"{shape}, with at least one update")
-    gated = np.asarray(gated, dtype=np.bool_)
     fig = new_figure(9.0, 9.0, title)
     panels = panels_of(fig, 1, 1, 1, 1.3)
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
@@ -131,9 +118,9 @@ def innovations(
         reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
         # A gated residual can be huge: drawn at the edge, it leaves room for the others.
         _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
-        axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
+        axes.set(ylabel=f"{axis} [m]", ylim=(-reach, reach))
     panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
-    _draw_nis(panels[3], time, nis, dof, gated)
+    _draw_nis(panels[3], time, nis, gated)
     panels[3].set_xlabel("time [s]")
     fig.align_ylabels()
     return fig
@@ -150,18 +137,13 @@ def imu_overview(
     Long recordings are drawn as mean and envelope, so that no peak is lost.
 
     Args:
-        sequence: the recording.
+        sequence: the recording, with a finite sample.
         rotation: times [s] and norm of the true angular rate [rad/s], drawn with that of the
             gyroscope.
         rest: first and last time of stretches to shade as stationary [s].
         gaps: first and last time of stretches to shade as gaps [s].
-
-    Raises:
-        InputError: no sample has finite values.
     """
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
-    if not finite.any():
-        raise InputError("sequence", "no finite sample", "finite time, gyro and accel")
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     count = 2 + (rotation is not None) + (sequence.truth is not None)
@@ -233,10 +215,10 @@ def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray
     axes.plot(time[gated], value[gated], "x", color=RED, ms=5, label="gated", clip_on=clipped)
 
 
-def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
-    low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
+def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, gated: BoolArray) -> None:
+    low, bound, top = (chi2_quantile(p, 3.0) for p in (0.001, 0.95, 0.9999))
     _draw_dots(axes, time, np.maximum(nis, low), gated)
-    axes.axhline(dof, color=INK, lw=1.0, label=f"expected {dof}")
+    axes.axhline(3.0, color=INK, lw=1.0, label="expected 3")
     axes.axhline(bound, color=INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
     axes.set_yscale("log")
     axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
