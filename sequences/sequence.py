@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -20,9 +20,6 @@ from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
 from stario.sequences.errors import InputError
-
-if TYPE_CHECKING:
-    from typing import Any
 
 STANDARD_GRAVITY = 9.80665
 """Default magnitude of gravity [m/s^2]."""

@@ -142,7 +142,7 @@ class Inspection:
             *(self.magnetic.lines() if self.magnetic else []),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
-            *(f"! {problem}" for problem in self.problems or ()),
+            *(f"! {problem}" for problem in self.problems),
             *([] if self.problems else ["units, signs and axes: no problems found"]),
         ]
 

@@ -10,7 +10,7 @@ length. The rate thus matches the attitude given as truth exactly, at the cost o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -140,11 +140,8 @@ def simulate_imu(
         accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
         errors.accel_scale, errors.misalignment, errors.accel_range,
     )  # fmt: skip
-    sequence = ImuSequence(name, truth.time, gyro, accel, truth)
-    if magnetic_field is not None:
-        measured = simulate_magnetometer(truth, magnetic_field, seed)
-        sequence = replace(sequence, magnetometer=measured)
-    return sequence
+    seen = None if magnetic_field is None else simulate_magnetometer(truth, magnetic_field, seed)
+    return ImuSequence(name, truth.time, gyro, accel, truth, magnetometer=seen)
 
 
 def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:

@@ -60,8 +60,6 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
     part = slice(start, stop)
-    if stop - start < 2:
-        return None
     R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
     # Without the last sample, which rounding may place before the grid's last time.
     grid = np.arange(time[start], time[stop - 1], _STEP_S)
