@@ -280,10 +280,11 @@ def _mounts(
     fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
     longest = int(np.argmax([stop - start for start, stop in pieces]))
     mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
-    order = [(k, k - 1) for k in range(longest + 1, len(pieces))]
-    order += [(k, k + 1) for k in range(longest - 1, -1, -1)]
-    for k, neighbour in order:
-        here, there = _facing_ends(pieces[k], pieces[neighbour])
+    count = len(pieces)
+    # Pieces after and before the longest, their neighbours towards it, and the facing ends of both.
+    order = [(k, k - 1, pieces[k][0], pieces[k - 1][1] - 1) for k in range(longest + 1, count)]
+    order += [(k, k + 1, pieces[k][1] - 1, pieces[k + 1][0]) for k in range(longest - 1, -1, -1)]
+    for k, neighbour, here, there in order:
         mount, fit = mounts[neighbour], fitted[k]
         carried = fit or mount
         if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
@@ -292,17 +293,11 @@ def _mounts(
         same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
         agrees = fit is not None and _same_mount(fit, carried)
         mounts[k] = mount if same else (fit if agrees and fit else carried)
-    return [mounts[k] for k in range(len(pieces))]
+    return [mounts[k] for k in range(count)]
 
 
 def _same_mount(mount: Rotation, other: Rotation) -> bool:
     return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
-
-
-def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[int, int]:
-    if piece[0] >= neighbour[1]:
-        return piece[0], neighbour[1] - 1
-    return piece[1] - 1, neighbour[0]
 
 
 def _fit(

@@ -25,8 +25,9 @@ def walk() -> ImuSequence:
 
 
 def problem(sequence: ImuSequence) -> str:
-    (text,) = inspect_recording(sequence).problems
-    assert text in "\n".join(inspect_recording(sequence).lines())
+    found = inspect_recording(sequence)
+    (text,) = found.problems
+    assert text in "\n".join(found.lines())
     return text
 
 

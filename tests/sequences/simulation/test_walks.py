@@ -143,7 +143,7 @@ def test_walks_are_smooth_enough_for_the_spline() -> None:
         assert (a.gyro - b.gyro)[inner].std() < 0.1 * a.gyro[inner].std()
 
 
-def test_noise_helpers_have_unit_deviation_in_their_band() -> None:
+def test_noise_has_unit_deviation_in_its_band() -> None:
     rng = np.random.default_rng(0)
     assert drift(rng, 200_000, 100.0, 0.5).std() == pytest.approx(1.0, rel=0.05)
     noise = band_noise(rng, 100_000, 100.0, 5.0, 10.0, 2)
