@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -124,7 +124,7 @@ class Inspection:
                 "accel_norm_m_s2": rest.accel_norm,
                 "accel_noise_m_s2_sqrt_hz": rest.accel_noise,
             },
-            "truth": self.coverage and vars(self.coverage),
+            "truth": self.coverage and asdict(self.coverage),
             "truth_against_gyroscope": self.fit and fit_as_dict(self.fit, self.yaw),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
