@@ -96,22 +96,18 @@ def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStr
     start, stop, displacement, sigma = _legs(sequence.positions)
     streams = []
     for stream in levelled_streams(sequence, min_seconds):
-        begin, end = stream.start, stream.start + len(stream) / WINDOW_RATE
-        inside = (start >= begin) & (stop <= end)
-        if inside.sum() < 2:
-            continue
-        streams.append(
-            LegStream(
-                sequence.name,
-                sequence.positions.kind,
-                stream.imu_N,
-                stream.facing_N,
-                start[inside] - begin,
-                stop[inside] - begin,
-                displacement[inside],
-                sigma[inside],
-            )
-        )
+        legs = LegStream(
+            sequence.name,
+            sequence.positions.kind,
+            stream.imu_N,
+            stream.facing_N,
+            start - stream.start,
+            stop - stream.start,
+            displacement,
+            sigma,
+        ).part(0, len(stream))
+        if len(legs.start) >= 2:
+            streams.append(legs)
     return streams
 
 
@@ -123,23 +119,10 @@ def gaps_and_jumps(time: FloatArray, position: FloatArray) -> BoolArray:
         position: (N, 2 or 3) [m].
     """
     step = np.diff(time)
+    usual = float(np.median(step)) if len(step) else 0.0
+    longest = max(_MAX_STEP, min(_SLOW_STEP * usual, _SLOWEST_STEP))
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
-    return np.asarray((speed > _FASTEST_STEP) | (step > _longest_step(step)))
-
-
-def _longest_step(step: FloatArray) -> float:
-    """Return the longest step [s] that is not a gap, from a track's steps (n,) [s]."""
-    if not len(step):
-        return _MAX_STEP
-    return max(_MAX_STEP, min(_SLOW_STEP * float(np.median(step)), _SLOWEST_STEP))
-
-
-def _ticks(time: FloatArray) -> NDArray[np.int64]:
-    """Return the index of the first of times (n,) [s] in each interval of `_TRACK_STEP`."""
-    if not len(time):
-        return np.zeros(0, dtype=np.int64)
-    whole = np.floor((time - time[0]) / _TRACK_STEP)
-    return np.flatnonzero(np.diff(whole, prepend=-1.0) > 0.0)
+    return np.asarray((speed > _FASTEST_STEP) | (step > longest))
 
 
 def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -149,9 +132,11 @@ def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, Flo
         position = np.column_stack([position, np.zeros(len(position))])
     if known.kind == "waypoints":
         ends = np.arange(len(time))
-        unbroken = np.ones(max(len(ends) - 1, 0), dtype=np.bool_)
+        unbroken = np.ones_like(ends[1:], dtype=np.bool_)
     else:
-        ends = _ticks(time)
+        # The first position in each interval.
+        whole = np.floor((time - time[:1]) / _TRACK_STEP)
+        ends = np.flatnonzero(np.diff(whole, prepend=-1.0) > 0.0)
         breaks = np.concatenate([[0], np.cumsum(gaps_and_jumps(time, position))])
         unbroken = np.diff(breaks[ends]) == 0
     start, stop = time[ends[:-1]], time[ends[1:]]

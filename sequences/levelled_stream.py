@@ -18,6 +18,7 @@ from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
     clean_samples,
+    cut_windows,
     facing,
     headings_at,
     resample,
@@ -71,8 +72,7 @@ class LevelledStream:
 
     def windows(self) -> NDArray[np.float32]:
         """Return windows (M, 6, 200) in N that start at the first M ticks."""
-        rows = self._starts[:, None] + np.arange(WINDOW_SAMPLES)
-        return np.ascontiguousarray(self.imu_N[rows].transpose(0, 2, 1))
+        return cut_windows(self.imu_N, self._starts)
 
 
 def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[LevelledStream]:

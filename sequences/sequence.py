@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -20,9 +20,6 @@ from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
 from stario.sequences.errors import InputError
-
-if TYPE_CHECKING:
-    from typing import Any
 
 STANDARD_GRAVITY = 9.80665
 """Default magnitude of gravity [m/s^2]."""
@@ -143,15 +140,17 @@ class Trajectory:
 
     def slice(self, start: float, stop: float) -> Trajectory:
         """Return the samples with start <= time <= stop [s]."""
-        keep = (self.time >= start) & (self.time <= stop)
+        return self.select((self.time >= start) & (self.time <= stop))
+
+    def select(self, keep: BoolArray) -> Trajectory:
+        """Return the samples for which `keep` (N,) is True."""
+        velocity, covariance = self.velocity_W, self.position_covariance_W
         return Trajectory(
             time=self.time[keep],
             position_W=self.position_W[keep],
             attitude_WB=self.attitude_WB[keep],
-            velocity_W=None if self.velocity_W is None else self.velocity_W[keep],
-            position_covariance_W=(
-                None if self.position_covariance_W is None else self.position_covariance_W[keep]
-            ),
+            velocity_W=None if velocity is None else velocity[keep],
+            position_covariance_W=None if covariance is None else covariance[keep],
             valid=self.valid[keep],
         )
 
@@ -258,12 +257,6 @@ class ImuSequence:
             return f"{count} waypoints, no poses"
         return f"{count} positions without attitude, no poses"
 
-    def _truth_within(self, start: float, stop: float) -> Trajectory | None:
-        truth = self.truth
-        if truth is None or not ((truth.time >= start) & (truth.time <= stop)).any():
-            return None
-        return truth.slice(start, stop)
-
     def without_truth(self) -> ImuSequence:
         """Return the recording without its ground truth."""
         return replace(self, truth=None, positions=None)
@@ -271,13 +264,17 @@ class ImuSequence:
     def slice(self, start: float, stop: float) -> ImuSequence:
         """Return the samples with start <= time <= stop [s], and all other data within them."""
         keep = (self.time >= start) & (self.time <= stop)
-        field, positions, own = self.magnetometer, self.positions, self.device_attitude
+        truth, field = self.truth, self.magnetometer
+        positions, own = self.positions, self.device_attitude
+        if truth is not None:
+            inside = (truth.time >= start) & (truth.time <= stop)
+            truth = truth.select(inside) if inside.any() else None
         return replace(
             self,
             time=self.time[keep],
             gyro=self.gyro[keep],
             accel=self.accel[keep],
-            truth=self._truth_within(start, stop),
+            truth=truth,
             magnetometer=None if field is None else field.slice(start, stop),
             positions=None if positions is None else positions.slice(start, stop),
             device_attitude=None if own is None else own.slice(start, stop),

@@ -15,7 +15,7 @@ down throughout, for which any heading is acceptable.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -150,13 +150,7 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     return np.where((widths > 0.25 * step)[:, None], means, interpolated(grid, time, values))
 
 
-_SHORTEST_SECONDS = 2.0 * WINDOW_SECONDS
-
-
-def world_streams(
-    sequence: ImuSequence,
-    attitude: Attitude = "levelled",
-) -> list[WorldStream]:
+def world_streams(sequence: ImuSequence, attitude: Attitude = "levelled") -> list[WorldStream]:
     """Cut a recording with ground truth into unbroken 200 Hz stretches in the world frame.
 
     No stretch spans a gap of the IMU (`MAX_IMU_GAP`) or of the truth (`MAX_TRUTH_GAP`); stretches
@@ -173,9 +167,8 @@ def world_streams(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for training")
-    world = imu_in_world(sequence, sequence.truth, attitude)
-    known = sequence.truth.valid
-    truth = sequence.truth
+    truth, known = sequence.truth, sequence.truth.valid
+    world = imu_in_world(sequence, truth, attitude)
     position_W = interpolated(world.time, truth.time[known], truth.position_W[known])
     return [
         WorldStream(
@@ -185,7 +178,7 @@ def world_streams(
             facing_W=world.facing[start:stop],
         )
         for start, stop in runs(world.usable)
-        if (stop - start) / WINDOW_RATE >= _SHORTEST_SECONDS
+        if stop - start >= 2 * WINDOW_SAMPLES
     ]
 
 
@@ -196,24 +189,19 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
         InputError: as for `clean_samples`.
     """
     time, gyro, accel = clean_samples(sequence)
-    attitude_WB = truth.at(time).attitude_WB
+    pose = truth.at(time)
+    attitude_WB = pose.attitude_WB
     if attitude == "levelled":
-        attitude_WB = _levelled(time, gyro, accel, attitude_WB, truth.covers(time))
-    world = _even(time, gyro, accel, attitude_WB)
-    return replace(world, usable=world.usable & truth.covers(world.time))
-
-
-def _even(
-    time: FloatArray, gyro: FloatArray, accel: FloatArray, attitude_WB: Rotation
-) -> LevelledImu:
-    """Rotate samples by their attitudes and resample them to an even 200 Hz."""
+        attitude_WB = _levelled(time, gyro, accel, attitude_WB, pose.valid)
     omitted = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
     even_time = time - omitted
     even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
     grid = even + omitted[np.searchsorted(even_time, even, side="right") - 1]
     columns = [attitude_WB.apply(gyro), attitude_WB.apply(accel), facing(attitude_WB.as_matrix())]
     values = resample(even_time, np.concatenate(columns, axis=1), even).astype(np.float32)
-    return LevelledImu(grid, values[:, :6], values[:, 6:], ~_spans_gap(even_time, even))
+    right = np.clip(np.searchsorted(even_time, even), 1, len(even_time) - 1)
+    in_gap = even_time[right] - even_time[right - 1] > MAX_IMU_GAP
+    return LevelledImu(grid, values[:, :6], values[:, 6:], ~in_gap & truth.covers(grid))
 
 
 def _levelled(
@@ -224,25 +212,19 @@ def _levelled(
     Within a window the heading follows the gyroscope, as at inference: the rotation is averaged
     over a second.
     """
-    parts = unbroken(time)
-    levelled_NB = Rotation.from_matrix(_levelled_NB(time, gyro, accel))
+    R_NB = np.empty((len(time), 3, 3))
+    parts = [slice(start, stop) for start, stop in unbroken(time)]
+    for part in parts:
+        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
+    levelled_NB = Rotation.from_matrix(R_NB)
     turn = yaw_of(true_WB * levelled_NB.inv())
     second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
     changes = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
-    edges = np.union1d([start for start, _ in parts], changes)
+    edges = np.union1d([part.start for part in parts], changes)
     for start, stop in pairwise([*edges.tolist(), len(time)]):
         part = slice(start, stop)
         turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
     return about_z(turn) * levelled_NB
-
-
-def _levelled_NB(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
-    """Return attitudes (n, 3, 3) levelled by the IMU, separately in each unbroken stretch."""
-    R_NB = np.empty((len(time), 3, 3))
-    for start, stop in unbroken(time):
-        part = slice(start, stop)
-        R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
-    return R_NB
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -257,8 +239,9 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
     index = np.flatnonzero(finite)
     kept = increasing_mask(sequence.time[index])
-    ahead = _ahead(sequence.time[index], kept)
-    if ahead:
+    # Dropped samples that are later than all kept ones before them.
+    newest = np.maximum.accumulate(np.where(kept, sequence.time[index], -np.inf))
+    if ahead := int((sequence.time[index] > newest).sum()):
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
     index = index[kept]
     if len(index) < 2:
@@ -266,19 +249,9 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     time = sequence.time[index]
     rate = float(1.0 / np.median(np.diff(time)))
     if not MIN_RATE <= rate <= MAX_RATE:
-        raise InputError(
-            f"{sequence.name}: rate",
-            f"{rate:.1f} Hz",
-            "50 Hz to 1 kHz",
-            "is the time column in seconds?",
-        )
+        found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
+        raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
-
-
-def _ahead(time: FloatArray, kept: BoolArray) -> int:
-    """Return the number of dropped samples that are later than all kept ones before them."""
-    newest = np.maximum.accumulate(np.where(kept, time, -np.inf))
-    return int((time > newest).sum())
 
 
 def unbroken(time: FloatArray) -> list[tuple[int, int]]:
@@ -299,9 +272,14 @@ def windows_at(
 
     Rotating both by minus `headings_at` gives frame H.
     """
-    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    windows = np.ascontiguousarray(stream.imu_W[rows].transpose(0, 2, 1))
+    windows = cut_windows(stream.imu_W, starts)
     return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
+
+
+def cut_windows(imu: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the windows (M, 6, 200) of samples (N, 6) that start at samples `starts` (M,)."""
+    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
+    return np.ascontiguousarray(imu[rows].transpose(0, 2, 1))
 
 
 def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> FloatArray:
@@ -318,8 +296,3 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
     """Return the maximal runs [start, stop) of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-def _spans_gap(time: FloatArray, grid: FloatArray) -> BoolArray:
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    return np.asarray(time[right] - time[right - 1] > MAX_IMU_GAP)

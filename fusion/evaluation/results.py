@@ -162,10 +162,8 @@ def _figures(
             filter_innovations.residual_W,
             filter_innovations.sigma,
             filter_innovations.nis,
-            3,
             filter_innovations.gated,
-            title=f"{name}: innovations",
-            unit="m",
+            f"{name}: innovations",
         )
     for file, figure in figures.items():
         save_figure(figure, folder / file)

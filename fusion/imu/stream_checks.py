@@ -22,9 +22,8 @@ import numpy as np
 
 from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import average_force, check_gyro
+from stario.sequences.inspection.checks import check_gyro
 from stario.sequences.sequence import FloatArray
-from stario.sequences.units import GYRO_UNITS
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches
@@ -153,7 +152,7 @@ class GyroUnitCheck:
 
     def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
         try:
-            _check_unit(time, gyro, accel)
+            check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
         except InputError as error:
             self._wrong += 1
             if self._wrong >= _MIN_FAILED_PIECES:
@@ -164,14 +163,3 @@ class GyroUnitCheck:
             if speed < _DOUBTFUL_RAD_S:
                 self._wrong = 0
                 self._turned += int(speed > _TURNING_RAD_S)
-
-
-def _check_unit(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-    stretches = [slice(0, len(time))]
-    check_gyro(
-        "stream",
-        gyro,
-        float(np.median(np.linalg.norm(accel, axis=1))),
-        average_force(time, gyro, accel, stretches),
-        average_force(time, gyro * GYRO_UNITS["deg/s"], accel, stretches),
-    )

@@ -104,7 +104,7 @@ def pose_errors(estimate: Trajectory, truth: Trajectory) -> PoseErrors:
             "a pose at a time when the truth is known",
             low_rate_message(truth),
         )
-    estimated, true = _select(estimate, common), _select(at_estimate, common)
+    estimated, true = estimate.select(common), at_estimate.select(common)
     return PoseErrors(
         estimate=estimated,
         truth=true,
@@ -174,7 +174,8 @@ def evaluate_track(
     errors = pose_errors(align(estimate, truth, alignment), truth)
     time = errors.estimate.time
     error = errors.position_W[:, : 2 if horizontal else 3]
-    path = _path_length(errors.truth, horizontal)
+    level = replace(errors.truth, position_W=errors.truth.position_W * [1.0, 1.0, 0.0])
+    path = (level if horizontal else errors.truth).path_length()
     rte, scaled = _relative_error(time, error, rte_interval, convention)
     return TrackMetrics(
         ate_m=_average(error, convention),
@@ -226,12 +227,6 @@ def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.
     return right - (wanted - time[right - 1] < time[right] - wanted)
 
 
-def _path_length(truth: Trajectory, horizontal: bool) -> float:
-    if not horizontal:
-        return truth.path_length()
-    return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()
-
-
 def _moved(
     trajectory: Trajectory, yaw: float, pivot_W: FloatArray, target_W: FloatArray
 ) -> Trajectory:
@@ -245,18 +240,6 @@ def _moved(
         attitude_WB=turn * trajectory.attitude_WB,
         velocity_W=None if velocity is None else velocity @ R.T,
         position_covariance_W=None if covariance is None else R @ covariance @ R.T,
-    )
-
-
-def _select(trajectory: Trajectory, keep: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Trajectory:
-    velocity, covariance = trajectory.velocity_W, trajectory.position_covariance_W
-    return Trajectory(
-        time=trajectory.time[keep],
-        position_W=trajectory.position_W[keep],
-        attitude_WB=trajectory.attitude_WB[keep],
-        velocity_W=None if velocity is None else velocity[keep],
-        position_covariance_W=None if covariance is None else covariance[keep],
-        valid=trajectory.valid[keep],
     )
 
 

@@ -116,7 +116,8 @@ def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     start = start_from_gravity(time[:first], gyro[:first], accel[:first])
     loop = LevelledAttitude(start.R_WB)
     grid = np.arange(time[0] + PERIOD, time[-1], PERIOD)
-    ends = np.unique([0, *np.searchsorted(time, grid), len(time) - 1])
+    # Without the last sample, which rounding may place before the grid's last time.
+    ends = np.unique([0, *np.searchsorted(time[:-1], grid), len(time) - 1])
     attitudes = np.empty((len(time), 3, 3))
     attitudes[0] = start.R_WB
     for begin, end in pairwise(ends.tolist()):
@@ -170,7 +171,10 @@ class LevelledAttitude:
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
         up = (0.5 * (time[1:] - time[:-1])) @ (force_N[1:] + force_N[:-1]) / dt
         up /= max(float(np.linalg.norm(up)), MIN_GRAVITY_FORCE)
-        P = self._propagated(attitudes, dt)
+        F = np.eye(6)  # theta' = theta - dt R d_bg
+        F[:3, 3:] = -dt * attitudes.mean(axis=0)
+        turn, walk = dt * _TURN_NOISE**2, dt * _BIAS_WALK**2
+        P = F @ self._P @ F.T + np.diag([turn, turn, 0.0, walk, walk, walk])
         gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
         P = P - gain @ P[:2]
         self._P = 0.5 * (P + P.T)
@@ -179,14 +183,6 @@ class LevelledAttitude:
         self.b_g = self.b_g + x[3:]
         turned: FloatArray = exp_so3(np.array([x[0], x[1], 0.0])) @ attitudes[-1]
         return turned
-
-    def _propagated(self, attitudes: FloatArray, dt: float) -> FloatArray:
-        """Return the covariance after an update period: theta' = theta - dt R d_bg."""
-        F = np.eye(6)
-        F[:3, 3:] = -dt * attitudes.mean(axis=0)
-        turn, walk = dt * _TURN_NOISE**2, dt * _BIAS_WALK**2
-        P: FloatArray = F @ self._P @ F.T + np.diag([turn, turn, 0.0, walk, walk, walk])
-        return P
 
 
 def _inverse(P: FloatArray, noise: float) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Rotation helpers shared by readers, windows, metrics and estimators."""
+"""Rotations, as readers, windows, metrics and estimators need them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,13 @@ NORM_TOLERANCE = 1e-2
 
 
 def yaw_of(attitude_WB: Rotation) -> FloatArray:
-    """Return the yaw [rad] of the twist about world z (singular only upside down).
+    """Return the yaw [rad], in (-pi, pi], of the twist about world z (singular only upside down).
 
     The twist is the rotation that remains when the smallest tilt is removed; unlike an Euler angle
     its yaw stays defined when a device stands upright.
     """
     quat_xyzw = np.atleast_2d(attitude_WB.as_quat())
-    return wrap_angle(2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3]))
-
-
-def wrap_angle(angle: FloatArray) -> FloatArray:
-    """Wrap an angle [rad] to (-pi, pi]."""
+    angle = 2.0 * np.arctan2(quat_xyzw[:, 2], quat_xyzw[:, 3])
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
 
 

@@ -114,24 +114,6 @@ def distance(metres: float) -> str:
     return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
 
 
-def draw_path(
-    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
-) -> None:
-    """Draw a path (N, 2) [m] with its start and end marked."""
-    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
-    known = path[np.isfinite(path).all(axis=1)]
-    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
-    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
-
-
-def draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
-    """Draw values (N,) as dots, gated ones as crosses."""
-    axes.plot(time[~gated], value[~gated], ".", color=BLUE, ms=3, label="used")
-    # An empty line has no extent; unclipped, it would leave the layout without any bounds.
-    clipped = not gated.any()
-    axes.plot(time[gated], value[gated], "x", color=RED, ms=5, label="gated", clip_on=clipped)
-
-
 def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:
     """Draw a curve through samples; if they are many, through block means within the extremes."""
     block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.sequences.drawing.boxes import box_of, excess, frame_around, revisit_count, size_of
 from stario.sequences.drawing.figures import (
     INK,
     LEGEND,
     RED,
     distance,
-    draw_path,
     indices_after_gaps,
     new_figure,
     panels_of,
@@ -21,14 +19,14 @@ from stario.sequences.drawing.figures import (
     style_of,
 )
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import PositionTrack, Trajectory
+from stario.sequences.sequence import FloatArray, PositionTrack, Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _CROWDED = 12.0
-"""Revisit count above which lines are drawn thinner."""
+"""Length of a path over the size of its box above which lines are drawn thinner."""
 
 _MARKED_GAP = 1.0
 """Length of a gap [s] above which the track's next pose is marked."""
@@ -56,38 +54,36 @@ def plan_view(
     Raises:
         InputError: there is nothing to draw.
     """
-    paths = {
-        name: split_at_gaps(t.time, t.position_W[:, :2], t.valid)[1] for name, t in tracks.items()
-    }
-    path_truth = (
-        None if truth is None else split_at_gaps(truth.time, truth.position_W[:, :2], truth.valid)
-    )
-    boxes = {name: box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
-    if path_truth is not None and np.isfinite(path_truth[1]).any():
-        typical = path_truth[1]
+    paths = {name: _path_of(track) for name, track in tracks.items()}
+    true_path = np.empty((0, 2)) if truth is None else _path_of(truth)
+    boxes = {name: _box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
+    if np.isfinite(true_path).any():
+        typical = true_path
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track without large drift.
-        by_size = sorted(boxes, key=lambda name: size_of(boxes[name]))
+        by_size = sorted(boxes, key=lambda name: _size_of(boxes[name]))
         typical = paths[by_size[(len(boxes) - 1) // 2]]
     else:
         raise InputError("tracks", "no valid pose", "at least one track to draw")
-    home = box_of(typical)
-    near = [box for box in boxes.values() if excess(box, home) <= 0.5 * size_of(home)]
+    home = _box_of(typical)
+    beyond = {name: _excess(box, home) for name, box in boxes.items()}
+    leaves = {name for name in boxes if beyond[name] > 0.5 * _size_of(home)}
+    near = [boxes[name] for name in boxes if name not in leaves]
     if known is not None:
-        near.append(box_of(known.position_W))
-    frame = frame_around(np.array([home, *near]))
+        near.append(_box_of(known.position_W))
+    frame = _frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
     fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
     (axes,) = panels_of(fig)
-    fine = 0.6 if revisit_count(typical, home) > _CROWDED else 1.0
-    if path_truth is not None:
-        draw_path(axes, path_truth[1], "truth", "black", width=2.2 * fine, order=2)
-    for k, (name, box) in enumerate(boxes.items()):
+    length = float(np.nansum(np.linalg.norm(np.diff(typical, axis=0), axis=1)))
+    fine = 0.6 if length / _size_of(home) > _CROWDED else 1.0
+    if typical is true_path:
+        _draw_path(axes, true_path, "truth", "black", width=2.2 * fine, order=2)
+    for k, name in enumerate(boxes):
         label, colour = style_of(name, k)
-        far = excess(box, home)
-        if far > 0.5 * size_of(home):
-            label += f" (leaves the figure by {distance(far)})"
-        draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+        if name in leaves:
+            label += f" (leaves the figure by {distance(beyond[name])})"
+        _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     _mark_gaps(axes, tracks)
     if known is not None:
         size = 7.0 if known.kind == "waypoints" else 3.0
@@ -101,6 +97,20 @@ def plan_view(
     return fig
 
 
+def _path_of(track: Trajectory) -> FloatArray:
+    return split_at_gaps(track.time, track.position_W[:, :2], track.valid)[1]
+
+
+def _draw_path(
+    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
+) -> None:
+    """Draw a path (N, 2) [m] with its start and end marked."""
+    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
+    known = path[np.isfinite(path).all(axis=1)]
+    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
+    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
+
+
 def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
     """Mark where each track continues after a gap, during which its direction is unknown."""
     label = "after a gap"
@@ -112,3 +122,27 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
             x, y = track.position_W[after, :2].T
             axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
             label = ""
+
+
+def _box_of(path: FloatArray) -> FloatArray:
+    """Return the corners (2, 2), lower left and upper right, of a path (n, 2)."""
+    return np.array([np.nanmin(path, axis=0), np.nanmax(path, axis=0)])
+
+
+def _size_of(box: FloatArray) -> float:
+    """Return the longer side of a box, at least 1 [m]."""
+    return max(float(np.ptp(box, axis=0).max()), 1.0)
+
+
+def _excess(box: FloatArray, home: FloatArray) -> float:
+    """Return how far [m] a box extends beyond another, in x or y."""
+    return float(max((home[0] - box[0]).max(), (box[1] - home[1]).max(), 0.0))
+
+
+def _frame_around(boxes: FloatArray) -> FloatArray:
+    """Return the corners (2, 2), lower left and upper right, of a frame around boxes (n, 2, 2)."""
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    half = np.maximum(0.5 * (high - low), 0.5) * 1.08
+    half = np.maximum(half, 0.6 * half.max())  # even a straight path gets a frame of some width
+    center = 0.5 * (low + high)
+    return np.array([center - half, center + half])

@@ -8,7 +8,7 @@ slow to import.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from stario.sequences.drawing.figures import (
     RED,
     SKY,
     distance,
-    draw_dots,
     draw_samples,
     new_figure,
     panels_of,
@@ -36,6 +35,7 @@ from stario.sequences.drawing.figures import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
+    MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     BoolArray,
     FloatArray,
@@ -98,43 +98,29 @@ def innovations(
     residual: FloatArray,
     sigma: FloatArray,
     nis: FloatArray,
-    dof: int,
     gated: BoolArray,
-    title: str = "Innovations of the filter",
-    unit: str = "m",
+    title: str,
 ) -> Figure:
-    """Draw a filter's innovations with their 3 sigma bands, and the NIS.
+    """Draw a filter's innovations, one or more, with their 3 sigma bands, and the NIS.
 
     Args:
         time: (M,) times of the updates [s].
-        residual: (M, 3) innovation, x y z [unit].
-        sigma: (M, 3) standard deviation of the innovation according to the filter [unit].
+        residual: (M, 3) innovation, x y z [m].
+        sigma: (M, 3) standard deviation of the innovation according to the filter [m].
         nis: (M,) normalised innovation squared.
-        dof: degrees of freedom, the expected NIS.
         gated: (M,) True where the gate rejected or weakened the update.
         title: title of the figure.
-        unit: unit of the measurement.
-
-    Raises:
-        InputError: shapes do not agree or there is no update.
     """
-    m = len(time)
-    arrays = {"residual": (residual, (m, 3)), "sigma": (sigma, (m, 3)), "nis": (nis, (m,))}
-    for name, (value, shape) in {**arrays, "gated": (gated, (m,))}.items():
-        if np.shape(value) != shape or m == 0:
-            raise InputError(name, f"shape {np.shape(value)}", f"{shape}, with at least one update")
-    gated = np.asarray(gated, dtype=np.bool_)
     fig = new_figure(9.0, 9.0, title)
     panels = panels_of(fig, 1, 1, 1, 1.3)
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
-        band_time, band = split_at_gaps(time, 3 * sigma[:, k : k + 1], max_gap=1.0)
-        axes.fill_between(band_time, -band[:, 0], band[:, 0], color=BLUE, alpha=0.15, lw=0)
+        _draw_band(axes, time, sigma[:, k], max_gap=1.0, color=BLUE)
         reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
         # A gated residual can be huge: drawn at the edge, it leaves room for the others.
-        draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
-        axes.set(ylabel=f"{axis} [{unit}]", ylim=(-reach, reach))
+        _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
+        axes.set(ylabel=f"{axis} [m]", ylim=(-reach, reach))
     panels[0].set_title("residual, band: 3 sigma", loc="left", fontsize=10)
-    _draw_nis(panels[3], time, nis, dof, gated)
+    _draw_nis(panels[3], time, nis, gated)
     panels[3].set_xlabel("time [s]")
     fig.align_ylabels()
     return fig
@@ -151,18 +137,13 @@ def imu_overview(
     Long recordings are drawn as mean and envelope, so that no peak is lost.
 
     Args:
-        sequence: the recording.
+        sequence: the recording, with a finite sample.
         rotation: times [s] and norm of the true angular rate [rad/s], drawn with that of the
             gyroscope.
         rest: first and last time of stretches to shade as stationary [s].
         gaps: first and last time of stretches to shade as gaps [s].
-
-    Raises:
-        InputError: no sample has finite values.
     """
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
-    if not finite.any():
-        raise InputError("sequence", "no finite sample", "finite time, gyro and accel")
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     count = 2 + (rotation is not None) + (sequence.truth is not None)
@@ -198,48 +179,50 @@ def imu_overview(
 
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     """Return times [s] and speed [m/s] along 1 s chords, from which path length is measured."""
-    step = 1.0
     ticks = whole_seconds(truth.time)
     if len(ticks) < 2 or truth.valid.sum() < 2:
         return np.empty(0), np.empty(0)
     at = truth.at(ticks)
-    speed = np.linalg.norm(np.diff(at.position_W, axis=0), axis=1) / step
+    speed = np.linalg.norm(np.diff(at.position_W, axis=0), axis=1)
     known = at.valid[1:] & at.valid[:-1]
-    return ticks[:-1] + step / 2, np.where(known, speed, np.nan)
+    return ticks[:-1] + 0.5, np.where(known, speed, np.nan)
 
 
 def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
     time = errors.estimate.time
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
-        axes.plot(
-            *split_at_gaps(time, errors.position_W[:, k : k + 1]), color=colour, lw=1.2, label=label
-        )
+        ticks, error = split_at_gaps(time, errors.position_W[:, [k]])
+        axes.plot(ticks, error[:, 0], color=colour, lw=1.2, label=label)
         if errors.estimate.position_covariance_W is not None:
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
-            band_time, band = split_at_gaps(time, 3 * sigma[:, None])
-            axes.fill_between(
-                band_time,
-                -band[:, 0],
-                band[:, 0],
-                color=colour,
-                alpha=0.15,
-                lw=0,
-                label=f"{label}, 3 sigma",
-            )
+            _draw_band(axes, time, sigma, color=colour, label=f"{label}, 3 sigma")
         axes.set_ylabel(f"error in {axis} [m]")
 
 
-def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, dof: int, gated: BoolArray) -> None:
-    low, bound, top = (chi2_quantile(p, dof) for p in (0.001, 0.95, 0.9999))
-    draw_dots(axes, time, np.maximum(nis, low), gated)
-    axes.axhline(dof, color=INK, lw=1.0, label=f"expected {dof}")
+def _draw_band(
+    axes: Axes, time: FloatArray, sigma: FloatArray, max_gap: float = MAX_TRUTH_GAP, **style: Any
+) -> None:
+    """Shade three standard deviations (N,) on both sides of zero."""
+    time, band = split_at_gaps(time, 3 * sigma[:, None], max_gap=max_gap)
+    axes.fill_between(time, -band[:, 0], band[:, 0], alpha=0.15, lw=0, **style)
+
+
+def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:
+    """Draw values (N,) as dots, gated ones as crosses."""
+    axes.plot(time[~gated], value[~gated], ".", color=BLUE, ms=3, label="used")
+    # An empty line has no extent; unclipped, it would leave the layout without any bounds.
+    clipped = not gated.any()
+    axes.plot(time[gated], value[gated], "x", color=RED, ms=5, label="gated", clip_on=clipped)
+
+
+def _draw_nis(axes: Axes, time: FloatArray, nis: FloatArray, gated: BoolArray) -> None:
+    low, bound, top = (chi2_quantile(p, 3.0) for p in (0.001, 0.95, 0.9999))
+    _draw_dots(axes, time, np.maximum(nis, low), gated)
+    axes.axhline(3.0, color=INK, lw=1.0, label="expected 3")
     axes.axhline(bound, color=INK, lw=1.0, ls="--", label=f"95 % below {bound:.1f}")
     axes.set_yscale("log")
     axes.set_ylim(low, 1.5 * max(top, float(np.nanmax(nis))))
     axes.set_ylabel("NIS [1]")
-    axes.set_title(
-        f"NIS: mean {np.nanmean(nis):.2f}, {100 * np.mean(gated):.1f} % gated",
-        loc="left",
-        fontsize=10,
-    )
+    title = f"NIS: mean {np.nanmean(nis):.2f}, {100 * np.mean(gated):.1f} % gated"
+    axes.set_title(title, loc="left", fontsize=10)
     axes.legend(**ABOVE_RIGHT)

@@ -91,26 +91,20 @@ def check_units(sequence: ImuSequence) -> None:
         )  # fmt: skip
     pieces = _pieces(time)
     if pieces:  # otherwise gaps leave nothing to average over
-        force = float(np.median(np.linalg.norm(accel, axis=1)))
-        average = average_force(time, gyro, accel, pieces)
-        in_degrees = average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
         known = "gyro" in sequence.converted
-        check_gyro(sequence.name, gyro, force, average, in_degrees, known)
+        force, average = check_gyro(sequence.name, time, gyro, accel, pieces, known)
         _check_force(sequence, force, average)
     _check_direction(sequence, time, accel)
 
 
 def _check_content(sequence: ImuSequence) -> None:
-    for field, values in (
-        ("time", sequence.time),
-        ("gyro", sequence.gyro),
-        ("accel", sequence.accel),
-    ):
+    sensors = {"gyro": sequence.gyro, "accel": sequence.accel}
+    for field, values in {"time": sequence.time, **sensors}.items():
         if not np.isfinite(values.reshape(len(values), -1)).all(axis=1).any():
             raise InputError(f"{sequence.name}: {field}", "no finite sample", "numbers")
     if len(sequence) < 2:
         raise InputError(f"{sequence.name}: samples", "1", f"at least {MIN_SECONDS} s of them")
-    for field, values in (("gyro", sequence.gyro), ("accel", sequence.accel)):
+    for field, values in sensors.items():
         with np.errstate(over="ignore"):  # single values may be huge: the median ignores them
             size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
@@ -139,25 +133,31 @@ def _check_time(sequence: ImuSequence) -> None:
 
 def check_gyro(
     name: str,
+    time: FloatArray,
     gyro: FloatArray,
-    force: float,
-    average: float,
-    in_degrees: float,
+    accel: FloatArray,
+    pieces: list[slice],
     unit_known: bool = False,
-) -> None:
+) -> tuple[float, float]:
     """Check the gyroscope's rotations against the accelerometer.
 
     Args:
         name: name of the recording.
+        time: (N,) [s].
         gyro: (N, 3) [rad/s].
-        force: median magnitude of the specific force [m/s^2].
-        average: `average_force` of the recording [m/s^2].
-        in_degrees: the same with the gyroscope read as deg/s.
+        accel: (N, 3) [m/s^2].
+        pieces: unbroken stretches to average the force over.
         unit_known: whether the file names the unit; then no option changes it.
+
+    Returns:
+        Median magnitude of the force, and of its average over a piece [m/s^2].
 
     Raises:
         InputError: the gyroscope cannot be in rad/s.
     """
+    force = float(np.median(np.linalg.norm(accel, axis=1)))
+    average = _average_force(time, gyro, accel, pieces)
+    in_degrees = _average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
     speed = float(np.percentile(np.linalg.norm(gyro, axis=1), 95))
     # On a swinging arm centripetal acceleration makes samples exceed their average, which is still
     # gravity. So an average that equals gravity, in m/s^2 or g, clears the gyroscope.
@@ -167,7 +167,7 @@ def check_gyro(
     if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _MIN_LOSS_RATIO * lost_in_degrees):
         found += " that contradict the accelerometer"
     elif speed <= _FAST_RAD_S:
-        return
+        return force, average
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
     if speed <= _FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
@@ -177,42 +177,32 @@ def check_gyro(
 
 
 def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
-    field = f"{sequence.name}: accelerometer"
+    field, found = f"{sequence.name}: accelerometer", f"an average of {average:.3g}"
+    expected = f"about {STANDARD_GRAVITY:.2f} m/s^2"
     # Shaking makes samples exceed gravity: an average that equals gravity is accepted anyway. In
     # the hand of a runner both sensors saturate, and the average loses a fourth.
     gravity = abs(average / STANDARD_GRAVITY - 1.0) <= _SHAKEN_OFF_GRAVITY
     if not (gravity or average > _COHERENT * force) or average < _NO_GRAVITY:
-        raise InputError(
-            field,
-            f"an average of {average:.3g} from samples of {force:.3g}",
-            f"specific force with gravity, about {STANDARD_GRAVITY:.2f} m/s^2 on average",
-            "if it is linear or user acceleration, "
-            + (
-                "record the raw accelerometer: gravity cannot be restored without a true attitude"
-                if sequence.truth is None
-                else "pass `--gravity removed`"
-            ),
+        found += f" from samples of {force:.3g}"
+        expected = f"specific force with gravity, {expected} on average"
+        fix = "record the raw accelerometer: gravity cannot be restored without a true attitude"
+        if sequence.truth is not None:
+            fix = "pass `--gravity removed`"
+        fix = f"if it is linear or user acceleration, {fix}"
+    elif _G_RANGE[0] <= average <= _G_RANGE[1]:
+        fix = (
+            "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if it is from "
+            "an iPhone) or write `ax [g]` in the CSV's header"
         )
-    if _G_RANGE[0] <= average <= _G_RANGE[1]:
-        raise InputError(
-            field,
-            f"an average of {average:.3g}",
-            f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            _UNIT_NAMED
-            if "accel" in sequence.converted
-            else "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if it is from "
-            "an iPhone) or write `ax [g]` in the CSV's header",
-        )
-    if not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
-        was_metric = _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]
-        raise InputError(
-            field,
-            f"an average of {average:.3g}",
-            f"about {STANDARD_GRAVITY:.2f} m/s^2",
-            "it seems to be in m/s^2 already: omit the unit g"
-            if was_metric
-            else "convert it to m/s^2 or g, with gravity included",
-        )
+        if "accel" in sequence.converted:
+            fix = _UNIT_NAMED
+    elif not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:
+        fix = "convert it to m/s^2 or g, with gravity included"
+        if _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]:
+            fix = "it seems to be in m/s^2 already: omit the unit g"
+    else:
+        return
+    raise InputError(field, found, expected, fix)
 
 
 def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray) -> None:
@@ -229,32 +219,25 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
     tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
     if tilt < _MAX_TILT_RAD:
         return
-    axes = _axes(sequence)
+    try:
+        axes = fit_truth(sequence).axes()
+    except InputError:
+        axes = None
     if tilt > math.pi - _MAX_TILT_RAD and axes is None:
+        fix = "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header"
         raise InputError(
             f"{sequence.name}: accelerometer",
             "a force that points down under the true attitude",
             "specific force, which points up at rest",
-            _UNIT_NAMED
-            if "accel" in sequence.converted
-            else "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header",
+            _UNIT_NAMED if "accel" in sequence.converted else fix,
         )
+    fix = "omit the truth if it is wrong: it is only needed for error metrics"
     raise InputError(
         f"{sequence.name}: truth's attitude",
         f"an average force {math.degrees(tilt):.0f} degrees off the vertical",
         "quaternion x y z w, body to a world with z up",
-        f"the IMU's axes are not the truth's: pass `--axes={axes}`"
-        if axes
-        else "omit the truth if it is wrong: it is only needed for error metrics",
+        f"the IMU's axes are not the truth's: pass `--axes={axes}`" if axes else fix,
     )
-
-
-def _axes(sequence: ImuSequence) -> str | None:
-    """Return the `--axes` that gyroscope and true attitude imply, or None."""
-    try:
-        return fit_truth(sequence).axes()
-    except InputError:
-        return None
 
 
 def _pieces(time: FloatArray) -> list[slice]:
@@ -273,7 +256,7 @@ def _pieces(time: FloatArray) -> list[slice]:
     return [pieces[k] for k in chosen]
 
 
-def average_force(
+def _average_force(
     time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice]
 ) -> float:
     """Return the median over pieces of the magnitude of the mean force [m/s^2].

@@ -15,7 +15,7 @@ except for the gyroscope's drift. Its steadiness within a minute is what a filte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,10 +36,7 @@ _TURNING_RAD_S = 0.1
 
 _SIZES_UT = (15.0, 90.0)
 _LEVEL_UT = 6.0
-_VERDICTS = (
-    ("good", math.radians(12.0), 0.75),
-    ("coarse", math.radians(25.0), 0.5),
-)
+_VERDICTS = (("good", math.radians(12.0), 0.75), ("coarse", math.radians(25.0), 0.5))
 """Maximum RMS of the bearing [rad] and minimum correlation of each verdict."""
 
 HELD_CHANGE = 2e-3
@@ -68,97 +65,81 @@ class MagneticFindings:
     Attributes:
         samples: number of samples as recorded.
         rate_hz: median rate [Hz].
-        size_uT: median magnitude of the field [uT].
-        spread_uT: 10th and 90th percentile of the magnitude [uT].
+        size_median_uT: median magnitude of the field [uT].
+        size_p10_p90_uT: 10th and 90th percentile of the magnitude [uT].
         dip_rad: median angle below the horizontal [rad].
-        correlation: correlation of dm/dt and -w x (m - b); None if the device hardly turns.
+        correlation_with_gyroscope: correlation of dm/dt and -w x (m - b); None if the device hardly
+            turns.
         lag_s: time by which the samples are stamped late [s]; None in that case, and if it is
             outside the range searched.
         hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
         hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None if the lag is.
-        bearing_rms_rad: median RMS of the levelled bearing about a line over a minute [rad].
-        drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
-        held: share of the half seconds with rotation in which the device extrapolated the field
-            instead of measuring it.
-        problems: problems found, one line each.
+        levelled_bearing_rms_rad: median RMS of the bearing about a line over a minute [rad].
+        gyroscope_drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
+        held_share: share of the half seconds with rotation in which the device extrapolated the
+            field instead of measuring it.
     """
 
     samples: int
     rate_hz: float
-    size_uT: float
-    spread_uT: tuple[float, float]
+    size_median_uT: float
+    size_p10_p90_uT: tuple[float, float]
     dip_rad: float
-    correlation: float | None
+    correlation_with_gyroscope: float | None
     lag_s: float | None
     hard_iron_uT: FloatArray | None
     hard_iron_sigma_uT: FloatArray | None
-    bearing_rms_rad: float
-    drift_rad_s: float
-    held: float = 0.0
-    problems: tuple[str, ...] = ()
+    levelled_bearing_rms_rad: float
+    gyroscope_drift_rad_s: float
+    held_share: float
 
     @property
     def verdict(self) -> str:
         """Quality of the levelled bearing as a yaw reference: "good", "coarse" or "not usable"."""
-        level = self.size_uT * math.cos(self.dip_rad)
+        level = self.size_median_uT * math.cos(self.dip_rad)
+        agreement = self.correlation_with_gyroscope
         for word, steady, follows in _VERDICTS:
-            agrees = self.correlation is None or self.correlation > follows
-            if self.bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
+            agrees = agreement is None or agreement > follows
+            if self.levelled_bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
                 return word
         return "not usable"
 
     def as_dict(self) -> dict[str, object]:
         """Return the findings as plain values, with units in their names."""
-        return {
-            "samples": self.samples,
-            "rate_hz": self.rate_hz,
-            "size_median_uT": self.size_uT,
-            "size_p10_p90_uT": self.spread_uT,
-            "dip_rad": self.dip_rad,
-            "correlation_with_gyroscope": self.correlation,
-            "lag_s": self.lag_s,
-            "hard_iron_uT": self.hard_iron_uT,
-            "hard_iron_sigma_uT": self.hard_iron_sigma_uT,
-            "levelled_bearing_rms_rad": self.bearing_rms_rad,
-            "gyroscope_drift_rad_s": self.drift_rad_s,
-            "held_share": self.held,
-            "verdict": self.verdict,
-        }
+        return vars(self) | {"verdict": self.verdict}
 
     def lines(self) -> list[str]:
         """Return the findings as lines to print."""
-        low, high = self.spread_uT
+        low, high = self.size_p10_p90_uT
         lines = [
-            f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, {self.size_uT:.1f} uT "
-            f"(80 % within {low:.1f} to {high:.1f}), dip {math.degrees(self.dip_rad):.0f} deg"
+            f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, "
+            f"{self.size_median_uT:.1f} uT (80 % within {low:.1f} to {high:.1f}), "
+            f"dip {math.degrees(self.dip_rad):.0f} deg"
         ]
-        if self.correlation is not None:
+        if self.correlation_with_gyroscope is not None:
             lines.append(
-                f"  against the gyroscope: correlation {self.correlation:.3f}, {self._lag_words()}"
+                f"  against the gyroscope: correlation {self.correlation_with_gyroscope:.3f}, "
+                f"{self._lag_words()}"
             )
         lines.append(
-            f"  levelled bearing: steady to {math.degrees(self.bearing_rms_rad):.1f} deg within a "
-            f"minute, drifts by {math.degrees(60.0 * self.drift_rad_s):+.1f} deg/min against the "
-            f"gyroscope; as a yaw reference: {self.verdict}"
+            f"  levelled bearing: steady to {math.degrees(self.levelled_bearing_rms_rad):.1f} deg "
+            f"within a minute, drifts by {math.degrees(60.0 * self.gyroscope_drift_rad_s):+.1f} "
+            f"deg/min against the gyroscope; as a yaw reference: {self.verdict}"
         )
-        if self.held > _REPORTED_SHARE:
+        if self.held_share > _REPORTED_SHARE:
             lines.append(
                 f"  constant in magnitude: extrapolated by the device's own gyroscope "
-                f"{self.held:.0%} of the time that it turns, and given little weight then"
+                f"{self.held_share:.0%} of the time that it turns, and given little weight then"
             )
         return lines
 
     def _lag_words(self) -> str:
-        if self.lag_s is None:
+        if self.lag_s is None or self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
             first, last = (1e3 * lag for lag in (_LAGS_S[0], _LAGS_S[-1]))
             return f"lag outside {first:+.0f} to {last:+.0f} ms; lag and hard iron unknown"
-        return f"lag {1e3 * self.lag_s:+.0f} ms{self._iron_words()}"
-
-    def _iron_words(self) -> str:
-        if self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
-            return ""
         pairs = zip(self.hard_iron_uT, self.hard_iron_sigma_uT, strict=True)
-        return ", hard iron " + ", ".join(f"{b:+.1f}" + f" +- {s:.1f}" for b, s in pairs) + " uT"
+        iron = ", ".join(f"{b:+.1f} +- {s:.1f}" for b, s in pairs)
+        return f"lag {1e3 * self.lag_s:+.0f} ms, hard iron {iron} uT"
 
 
 def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
@@ -170,17 +151,18 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     if sequence.magnetometer is None:
         return None
     time, gyro, accel = clean_samples(sequence)
-    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0], default=(0, 0))
-    stop = min(stop, int(np.searchsorted(time, time[start] + _LONGEST_S))) if stop else 0
+    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
+    stop = min(stop, int(np.searchsorted(time, time[start] + _LONGEST_S)))
     time, gyro, accel = time[start:stop], gyro[start:stop], accel[start:stop]
     field = sequence.magnetometer
-    inside = slice(*np.searchsorted(field.time, [time[0], time[-1]])) if len(time) else slice(0)
+    inside = slice(*np.searchsorted(field.time, time[[0, -1]]))
     stamps, values = field.time[inside], field.field[inside]
     if len(stamps) < 20 or stamps[-1] - stamps[0] < _SHORTEST_S:
         return None
     turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
-    comparison = _against_gyro(time, gyro, stamps, values) if turning > _TURNING_RAD_S else None
-    agreement, lag, iron, sigma = comparison or (None, None, None, None)
+    agreement = lag = iron = sigma = None
+    if turning > _TURNING_RAD_S:
+        agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
     removed = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
     nearest = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[nearest]
@@ -189,26 +171,25 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     spread, drift = _steadiness(stamps, field_N[:, :2])
     sizes = np.linalg.norm(values, axis=1)
     low, median, high = np.percentile(sizes, [10.0, 50.0, 90.0]).tolist()
-    findings = MagneticFindings(
+    return MagneticFindings(
         samples=len(field),
-        rate_hz=float(1.0 / np.median(np.diff(field.time))),
-        size_uT=median,
-        spread_uT=(low, high),
+        rate_hz=field.rate,
+        size_median_uT=median,
+        size_p10_p90_uT=(low, high),
         dip_rad=float(np.median(np.arctan2(-field_N[:, 2], level))),
-        correlation=agreement,
+        correlation_with_gyroscope=agreement,
         lag_s=lag,
         hard_iron_uT=iron,
         hard_iron_sigma_uT=sigma,
-        bearing_rms_rad=spread,
-        held=_held(stamps, values),
-        drift_rad_s=drift,
+        levelled_bearing_rms_rad=spread,
+        gyroscope_drift_rad_s=drift,
+        held_share=_held(stamps, values),
     )
-    return _with_problems(sequence.name, findings)
 
 
 def _against_gyro(
     time: FloatArray, gyro: FloatArray, stamps: FloatArray, values: FloatArray
-) -> tuple[float, float | None, FloatArray | None, FloatArray | None] | None:
+) -> tuple[float | None, float | None, FloatArray | None, FloatArray | None]:
     """Return correlation, lag [s], hard iron and its sigma [uT], from dm/dt = -w x (m - b).
 
     A lag at the edge of the search is not the best one and corrupts the hard iron: both are None.
@@ -216,13 +197,12 @@ def _against_gyro(
     edge = _SPAN_S + float(np.abs(_LAGS_S).max())
     grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
-        return None
+        return None, None, None, None
     steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
     angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     half = 0.5 * _SPAN_S
-    rate = (
-        interpolated(grid + half, time, angle) - interpolated(grid - half, time, angle)
-    ) / _SPAN_S
+    before, after = (interpolated(grid + d, time, angle) for d in (-half, half))
+    rate = (after - before) / _SPAN_S
 
     def fit(lag: float) -> tuple[float, FloatArray, FloatArray]:
         before, after = (interpolated(grid + lag + d, stamps, values) for d in (-half, half))
@@ -294,17 +274,19 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
     return float(np.median(spreads)), float(np.median(slopes))
 
 
-def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
+def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
+    """Return problems of the magnetometer of recording `name`, one line each."""
     field, problems = f"{name}: magnetometer", []
     iron, sigma = findings.hard_iron_uT, findings.hard_iron_sigma_uT
-    if not _SIZES_UT[0] < findings.size_uT < _SIZES_UT[1]:
+    agreement = findings.correlation_with_gyroscope
+    if not _SIZES_UT[0] < findings.size_median_uT < _SIZES_UT[1]:
         problems.append(
-            f"{field}: found {findings.size_uT:.3g} uT, expected the earth's 25 to 65; "
+            f"{field}: found {findings.size_median_uT:.3g} uT, expected the earth's 25 to 65; "
             "is it uncalibrated, in another unit or near a magnet?"
         )
-    if findings.correlation is not None and findings.correlation < _VERDICTS[-1][2]:
+    if agreement is not None and agreement < _VERDICTS[-1][2]:
         problems.append(
-            f"{field}: does not follow the gyroscope (correlation {findings.correlation:.2f}): "
+            f"{field}: does not follow the gyroscope (correlation {agreement:.2f}): "
             "a disturbed field, stale readings or different axes"
         )
     if iron is not None and sigma is not None and _is_iron(iron, sigma):
@@ -315,4 +297,4 @@ def _with_problems(name: str, findings: MagneticFindings) -> MagneticFindings:
             f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
             "magnetic equator; elsewhere, the accelerometer has Apple's sign: --accel-sign apple"
         )
-    return replace(findings, problems=tuple(problems))
+    return problems

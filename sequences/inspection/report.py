@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.magnetic import MagneticFindings, assess_magnetometer
+from stario.sequences.inspection.magnetic import (
+    MagneticFindings,
+    assess_magnetometer,
+    magnetic_problems,
+)
 from stario.sequences.inspection.samples import sample_problems, usable
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
@@ -27,7 +31,7 @@ from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing of the samples.
+    """Timing of the samples, named as in `Inspection.as_dict`.
 
     Attributes:
         samples: number of samples as recorded.
@@ -35,10 +39,10 @@ class Timing:
         rate_hz: median rate [Hz].
         jitter_s: median deviation of a step from the median step [s].
         gaps: start and length [s] of each step that has lost samples.
-        lost: number of samples missing in the gaps.
-        repeated: number of samples at the time of the previous one.
-        backward: number of samples earlier than the previous one.
-        not_finite: number of samples with a time or a value that is not finite.
+        samples_lost_in_gaps: number of samples missing there.
+        times_repeated: number of samples at the time of the previous one.
+        times_backward: number of samples earlier than the previous one.
+        samples_not_finite: number of samples with a time or a value that is not finite.
     """
 
     samples: int
@@ -46,25 +50,25 @@ class Timing:
     rate_hz: float
     jitter_s: float
     gaps: tuple[tuple[float, float], ...]
-    lost: int
-    repeated: int
-    backward: int
-    not_finite: int
+    samples_lost_in_gaps: int
+    times_repeated: int
+    times_backward: int
+    samples_not_finite: int
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Ground truth available for a recording.
+    """Ground truth available for a recording, named as in `Inspection.as_dict`.
 
     Attributes:
-        share: share of the IMU's samples for which the truth is known.
+        coverage: share of the IMU's samples for which the truth is known.
         rate_hz: median rate of the truth [Hz].
         gaps: number of gaps in the truth that are too long to interpolate across.
         longest_gap_s: longest step of the truth [s].
         path_m: length of the path [m].
     """
 
-    share: float
+    coverage: float
     rate_hz: float
     gaps: int
     longest_gap_s: float
@@ -98,25 +102,18 @@ class Inspection:
     coverage: Coverage | None
     fit: TruthFit | None
     problems: tuple[str, ...]
-    truth: str = "none"
-    magnetic: MagneticFindings | None = None
-    device_attitude: int = 0
-    yaw: YawDrift | None = None
+    truth: str
+    magnetic: MagneticFindings | None
+    device_attitude: int
+    yaw: YawDrift | None
 
     def as_dict(self) -> dict[str, object]:
         """Return the findings as plain values, with units in their names."""
-        timing, rest, fit, coverage = self.timing, self.rest, self.fit, self.coverage
+        rest = self.rest
         return {
             "recording": self.name,
-            "samples": timing.samples,
-            "duration_s": timing.duration_s,
-            "rate_hz": timing.rate_hz,
-            "jitter_s": timing.jitter_s,
-            "gaps": [{"start_s": start, "length_s": length} for start, length in timing.gaps],
-            "samples_lost_in_gaps": timing.lost,
-            "times_repeated": timing.repeated,
-            "times_backward": timing.backward,
-            "samples_not_finite": timing.not_finite,
+            **vars(self.timing),
+            "gaps": [{"start_s": start, "length_s": length} for start, length in self.timing.gaps],
             "accel_norm_mean_m_s2": self.accel_norm,
             "gyro_norm_mean_rad_s": self.gyro_norm,
             "rest": rest
@@ -127,15 +124,8 @@ class Inspection:
                 "accel_norm_m_s2": rest.accel_norm,
                 "accel_noise_m_s2_sqrt_hz": rest.accel_noise,
             },
-            "truth": coverage
-            and {
-                "coverage": coverage.share,
-                "rate_hz": coverage.rate_hz,
-                "gaps": coverage.gaps,
-                "longest_gap_s": coverage.longest_gap_s,
-                "path_m": coverage.path_m,
-            },
-            "truth_against_gyroscope": fit and fit_as_dict(fit, self.yaw),
+            "truth": self.coverage and asdict(self.coverage),
+            "truth_against_gyroscope": self.fit and fit_as_dict(self.fit, self.yaw),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
@@ -152,7 +142,7 @@ class Inspection:
             *(self.magnetic.lines() if self.magnetic else []),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
-            *(f"! {problem}" for problem in self.problems or ()),
+            *(f"! {problem}" for problem in self.problems),
             *([] if self.problems else ["units, signs and axes: no problems found"]),
         ]
 
@@ -165,14 +155,14 @@ class Inspection:
         if t.gaps:
             start, length = max(t.gaps, key=lambda gap: gap[1])
             lines.append(
-                f"gaps: {len(t.gaps)}, {t.lost} samples lost; "
+                f"gaps: {len(t.gaps)}, {t.samples_lost_in_gaps} samples lost; "
                 f"longest {length:.3f} s at {start:.1f} s"
             )
         else:
             lines.append("gaps: none")
         lines.append(
-            f"times: {t.repeated} repeated, {t.backward} backward; "
-            f"{t.not_finite} non-finite samples"
+            f"times: {t.times_repeated} repeated, {t.times_backward} backward; "
+            f"{t.samples_not_finite} non-finite samples"
         )
         return lines
 
@@ -194,7 +184,7 @@ class Inspection:
         if coverage is None:
             return [f"truth: {self.truth}"]
         lines = [
-            f"truth: covers {100 * coverage.share:.1f} % of the samples, "
+            f"truth: covers {100 * coverage.coverage:.1f} % of the samples, "
             f"{coverage.rate_hz:.1f} Hz, {coverage.gaps} gaps "
             f"(longest step {coverage.longest_gap_s:.2f} s), path of {coverage.path_m:.1f} m"
         ]
@@ -218,28 +208,30 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         check_units(sequence)
     except InputError as error:
         problems.append(str(error))
-    fit: TruthFit | None = None
-    coverage = None if sequence.truth is None else _coverage(sequence, sequence.truth)
-    slow = "" if sequence.truth is None else low_rate_message(sequence.truth)
-    if slow:
-        problems.append(f"{sequence.name}: truth: {slow}")
-    elif coverage is not None and coverage.share > 0.0:
-        try:
-            fit = fit_truth(sequence)
-        except InputError as error:
-            if not problems:  # otherwise wrong units explain it
-                problems.append(f"{sequence.name}: truth against gyroscope: {error}")
-    yaw = None if fit is None else yaw_drift(sequence, fit)
-    if fit is not None:
-        problems += fit_problems(sequence.name, fit, yaw, " ".join(problems))
-    magnetic = _magnetic(sequence)
-    problems += magnetic.problems if magnetic else ()
+    coverage = fit = yaw = None
+    if sequence.truth is not None:
+        coverage = _coverage(sequence, sequence.truth)
+        if slow := low_rate_message(sequence.truth):
+            problems.append(f"{sequence.name}: truth: {slow}")
+        elif coverage.coverage > 0.0:
+            try:
+                fit = fit_truth(sequence)
+                yaw = yaw_drift(sequence, fit)
+                problems += fit_problems(sequence.name, fit, yaw, " ".join(problems))
+            except InputError as error:
+                if not problems:  # otherwise wrong units explain it
+                    problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+    try:
+        rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
+    except InputError:  # an invalid rate, which `check_units` reports
+        rest = magnetic = None
+    problems += magnetic_problems(sequence.name, magnetic) if magnetic else ()
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, int((~finite).sum())),
         accel_norm=float(np.linalg.norm(sequence.accel[given], axis=1).mean()),
         gyro_norm=float(np.linalg.norm(sequence.gyro[given], axis=1).mean()),
-        rest=_rest(sequence),
+        rest=rest,
         coverage=coverage,
         fit=fit,
         problems=tuple(problems),
@@ -248,20 +240,6 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         magnetic=magnetic,
         yaw=yaw,
     )
-
-
-def _rest(sequence: ImuSequence) -> Rest | None:
-    try:
-        return find_rest(sequence)
-    except InputError:  # an invalid rate, which `check_units` reports
-        return None
-
-
-def _magnetic(sequence: ImuSequence) -> MagneticFindings | None:
-    try:
-        return assess_magnetometer(sequence)
-    except InputError:  # an invalid rate, which `check_units` reports
-        return None
 
 
 def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
@@ -276,10 +254,10 @@ def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
         rate_hz=sequence.rate,
         jitter_s=float(np.median(np.abs(forward - usual))) if len(forward) else math.nan,
         gaps=tuple((float(time[k]), float(steps[k])) for k in gaps),
-        lost=int(np.round(steps[gaps] / usual - 1.0).sum()) if len(gaps) else 0,
-        repeated=int((steps == 0).sum()),
-        backward=int((steps < 0).sum()),
-        not_finite=not_finite,
+        samples_lost_in_gaps=int(np.round(steps[gaps] / usual - 1.0).sum()) if len(gaps) else 0,
+        times_repeated=int((steps == 0).sum()),
+        times_backward=int((steps < 0).sum()),
+        samples_not_finite=not_finite,
     )
 
 
@@ -288,7 +266,7 @@ def _coverage(sequence: ImuSequence, truth: Trajectory) -> Coverage:
     known = truth.time[truth.valid]
     steps = np.diff(known)
     return Coverage(
-        share=float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
+        coverage=float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
         rate_hz=float(1.0 / np.median(steps)) if len(steps) else 0.0,
         gaps=int(is_gap(steps).sum()),
         longest_gap_s=float(steps.max(initial=0.0)),

@@ -116,15 +116,15 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
     spans = [(a, b) for a, b in runs(joined) if stop[b - 1] - start[a] >= _SHORTEST_S]
     if not spans:
         return None
+    still_rates, still_forces = ([x[a:b] for a, b in spans] for x in (rates, forces))
+    norms = np.linalg.norm(np.concatenate(still_forces).mean(axis=1), axis=1)
     tau = 2 * per_bin * float(np.median(np.diff(time)))
     return Rest(
         stretches=tuple((float(start[a]), float(stop[b - 1])) for a, b in spans),
-        gyro_bias=np.concatenate([rates[a:b] for a, b in spans]).mean(axis=(0, 1)),
-        gyro_noise=_density([rates[a:b] for a, b in spans], tau),
-        accel_norm=float(
-            np.linalg.norm(np.concatenate([forces[a:b] for a, b in spans]).mean(1), axis=1).mean()
-        ),
-        accel_noise=_density([forces[a:b] for a, b in spans], tau),
+        gyro_bias=np.concatenate(still_rates).mean(axis=(0, 1)),
+        gyro_noise=_density(still_rates, tau),
+        accel_norm=float(norms.mean()),
+        accel_noise=_density(still_forces, tau),
     )
 
 

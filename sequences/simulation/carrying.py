@@ -69,18 +69,14 @@ def trunk(gait: Gait) -> FloatArray:
     """
     rng, phi = gait.rng, gait.phase
     bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
-    rise = 0.5 * bounce * gait.effort * step_length(gait) ** 2 / (8.0 * 0.53 * gait.height)
+    length = gait.speed / gait.step_rate
+    rise = 0.5 * bounce * gait.effort * length**2 / (8.0 * 0.53 * gait.height)
     shift = rng.uniform(-np.pi, np.pi, 4)
     shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest at the highest point
     z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
     x = 0.012 * surge * gait.effort * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
     return np.stack([x, y, z], axis=1)
-
-
-def step_length(gait: Gait) -> FloatArray:
-    """Return the step length (N,) [m]: speed over step rate."""
-    return gait.speed / gait.step_rate
 
 
 def heel_strikes(gait: Gait, strength: float) -> FloatArray:

@@ -10,10 +10,10 @@ length. The rate thus matches the attitude given as truth exactly, at the cost o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 
 import numpy as np
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
@@ -140,11 +140,8 @@ def simulate_imu(
         accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
         errors.accel_scale, errors.misalignment, errors.accel_range,
     )  # fmt: skip
-    sequence = ImuSequence(name, truth.time, gyro, accel, truth)
-    if magnetic_field is not None:
-        measured = simulate_magnetometer(truth, magnetic_field, seed)
-        sequence = replace(sequence, magnetometer=measured)
-    return sequence
+    seen = None if magnetic_field is None else simulate_magnetometer(truth, magnetic_field, seed)
+    return ImuSequence(name, truth.time, gyro, accel, truth, magnetometer=seen)
 
 
 def _check(trajectory: Trajectory, rate: float, gravity: float) -> None:
@@ -173,7 +170,7 @@ def _sampled(trajectory: Trajectory, rate: float) -> tuple[Trajectory, FloatArra
     # Include the last pose even if rounding places it slightly beyond the end.
     count = int(np.floor((t[-1] - t[0]) * rate + 1e-6)) + 1
     time = np.minimum(t[0] + np.arange(count) / rate, t[-1])
-    position = _spline(t, trajectory.position_W[trajectory.valid], 5)
+    position = make_interp_spline(t, trajectory.position_W[trajectory.valid], k=5)
     attitude_WB, gyro = _attitude_and_rate(t, trajectory.quat_xyzw[trajectory.valid], time)
     truth = Trajectory(time, position(time), attitude_WB, velocity_W=position(time, 1))
     return truth, gyro, np.asarray(position(time, 2), dtype=np.float64)
@@ -182,23 +179,14 @@ def _sampled(trajectory: Trajectory, rate: float) -> tuple[Trajectory, FloatArra
 def _attitude_and_rate(
     t: FloatArray, quat_xyzw: FloatArray, time: FloatArray
 ) -> tuple[Rotation, FloatArray]:
-    spline = _spline(t, sign_continuous(quat_xyzw), 3)
+    # Signs such that neighbours lie on one half-sphere.
+    dots = np.sum(quat_xyzw[1:] * quat_xyzw[:-1], axis=1)
+    signs = np.cumprod(np.where(np.append(1.0, dots) < 0.0, -1.0, 1.0))
+    spline = make_interp_spline(t, quat_xyzw * signs[:, None], k=3)
     s, ds = spline(time), spline(time, 1)
     vector, scalar = s[:, :3], s[:, 3:]
     rate = 2.0 * (scalar * ds[:, :3] - ds[:, 3:] * vector - np.cross(vector, ds[:, :3]))
     return Rotation.from_quat(s), rate / np.sum(s * s, axis=1, keepdims=True)
-
-
-def sign_continuous(quat_xyzw: FloatArray) -> FloatArray:
-    """Return the same rotations (N, 4) with signs such that neighbours lie on one half-sphere."""
-    dots = np.sum(quat_xyzw[1:] * quat_xyzw[:-1], axis=1)
-    signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
-    signed = quat_xyzw * np.concatenate([[1.0], signs])[:, None]
-    return np.asarray(signed, dtype=np.float64)
-
-
-def _spline(t: FloatArray, values: FloatArray, degree: int) -> BSpline:
-    return make_interp_spline(t, values, k=degree)
 
 
 def _measured(

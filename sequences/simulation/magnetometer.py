@@ -57,8 +57,7 @@ class MagneticField:
             value = getattr(self, item.name)
             if not np.isfinite(np.asarray(value, dtype=np.float64)).all():
                 raise InputError(item.name, repr(value), "finite numbers")
-            least = {"strength": 0.0, "disturbance": 0.0, "noise": 0.0}.get(item.name)
-            if least is not None and value < least:
+            if item.name in ("strength", "disturbance", "noise") and value < 0.0:
                 raise InputError(item.name, repr(value), "a magnitude >= 0 uT")
             if item.name in ("length", "rate") and value <= 0.0:
                 raise InputError(item.name, repr(value), "a number > 0")

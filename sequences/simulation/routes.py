@@ -9,6 +9,7 @@ infinitely differentiable.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import irfft, rfft, rfftfreq
@@ -38,8 +39,7 @@ class Route:
     climb: FloatArray
 
 
-@dataclass(frozen=True)
-class _Command:
+class _Command(NamedTuple):
     """Duration [s], speed [m/s], turn rate [rad/s], course from the heading [rad], climb [m/s]."""
 
     duration: float
@@ -62,13 +62,11 @@ def random_route(
         wheels: whether the person pushes a trolley: no stairs, no steps sideways or backward.
     """
     commands: list[_Command] = []
-    lasted = 0.0
-    while lasted < count / rate:
+    while sum(command.duration for command in commands) < count / rate:
         commands += _activity(rng, preferred_speed, wheels)
-        lasted = sum(command.duration for command in commands)
-    tables = np.array([[c.speed, c.turn_rate, c.course, c.climb] for c in commands])
-    repeats = np.diff(np.round(np.cumsum([0.0] + [c.duration for c in commands]) * rate))
-    held = np.repeat(tables, repeats.astype(np.int64), axis=0)[:count]
+    table = np.array(commands)
+    repeats = np.diff(np.round(np.cumsum([0.0, *table[:, 0]]) * rate))
+    held = np.repeat(table[:, 1:], repeats.astype(np.int64), axis=0)[:count]
     # A course means nothing without its speed: smooth velocity components, not the angle.
     velocity_H = held[:, :1] * np.stack([np.cos(held[:, 2]), np.sin(held[:, 2])], axis=1)
     sigma = rng.uniform(0.2, 0.35)

@@ -34,7 +34,7 @@ _MAX_GYRO_GAP_S = 0.5
 _MIN_PIECE_S = 1.0
 _MIN_FIT_S = 10.0
 _LAG_STEP_S = 0.0025
-_REMAINING_LAG_S = 0.04
+_MAX_LAG_S, _REMAINING_LAG_S = 0.15, 0.04
 _CORRELATED_S = 0.1
 
 
@@ -67,7 +67,6 @@ def align_tracked_body(
     attitude_WV: Rotation,
     valid: BoolArray,
     position_WV: FloatArray | None = None,
-    max_lag: float = 0.15,
 ) -> BodyAlignment:
     """Estimate the lag, the mount (separately after every flip) and the tilt of the world.
 
@@ -80,7 +79,6 @@ def align_tracked_body(
         valid: (M,) bool, whether a sample may be used at all.
         position_WV: (M, 3) positions of the tracked body [m]; with them the accelerometer helps to
             find the mount's rotation about the vertical, which the gyroscope misses on wheels.
-        max_lag: largest lag searched, in either direction [s].
 
     Raises:
         InputError: less than 10 s without a break in which both measured the same rotations, or
@@ -89,7 +87,8 @@ def align_tracked_body(
     _check_length("recording", imu_time)
     _check_length("capture", truth_time[valid])
     gyro_B = _GyroIntegral(imu_time, gyro)
-    lag = _lag(gyro_B, truth_time, attitude_WV, valid, max_lag)
+    sizes = _agreement(gyro_B, truth_time, attitude_WV, valid, 0.04, sizes_only=True)
+    lag = _best_lag(sizes, _MAX_LAG_S)
     time = truth_time + lag
     attitude_B = gyro_B.attitude(time)
     valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
@@ -100,7 +99,9 @@ def align_tracked_body(
     kept = np.zeros_like(valid)
     for start, stop in pieces:
         kept[start:stop] = valid[start:stop]
-    lag += _lag_by_axes(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept)
+    # From magnitudes alone, the capture's noise costs up to 12 ms on a trolley, which hardly turns.
+    rates = _agreement(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept, 0.06)
+    lag += _best_lag(rates, _REMAINING_LAG_S)
     time = truth_time + lag
     mounts = _mounts(time, attitude_WV, gyro_B, pieces)
     force_B, rate_B = interpolated(time, imu_time, accel), interpolated(time, imu_time, gyro)
@@ -115,7 +116,8 @@ def align_tracked_body(
     kept &= ~_disagreeing(time, drift, Rotation.identity(len(drift)))
     return BodyAlignment(
         lag=lag,
-        correlation=_correlation(time, attitude_WB, gyro_B, kept),
+        # Over a shorter span, the capture's noise hides a trolley's turns.
+        correlation=_agreement(gyro_B, time, attitude_WB, kept, _CORRELATED_S)(0.0),
         attitude_WB=attitude_WB,
         leveling_WW=leveling,
         valid=kept,
@@ -186,52 +188,34 @@ class _GyroIntegral:
         return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
 
 
-def _rates(
-    time: FloatArray, attitude: Rotation, valid: BoolArray, stride: int
-) -> tuple[FloatArray, BoolArray]:
-    rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
-    rates = rates / (time[stride:] - time[:-stride])[:, None]
-    return rates, valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)
-
-
-def _lag(
+def _agreement(
     gyro_B: _GyroIntegral,
     time: FloatArray,
-    attitude_WV: Rotation,
+    attitude: Rotation,
     valid: BoolArray,
-    max_lag: float,
-) -> float:
-    """Return the lag at which the magnitudes of both rates correlate best; needs no mount."""
-    stride = max(1, round(0.04 / float(np.median(np.diff(time)))))
-    rates_V, good = _rates(time, attitude_WV, valid, stride)
-    speed_V = np.linalg.norm(rates_V, axis=1)
+    span: float,
+    sizes_only: bool = False,
+) -> Callable[[float], float]:
+    """Return the correlation of both rates over `span` [s] as a function of the lag [s].
 
-    def score(lag: float) -> float:
-        speed_B = np.linalg.norm(gyro_B.mean_rate(time + lag, stride), axis=1)
-        # Glitches are rare but huge: compare where the two do not differ grossly.
-        use = good & (np.abs(speed_V - speed_B) < 3.0)
-        return correlation(speed_V[use], speed_B[use])
-
-    return _best_lag(score, max_lag)
-
-
-def _lag_by_axes(
-    gyro_B: _GyroIntegral, time: FloatArray, attitude_WB: Rotation, valid: BoolArray
-) -> float:
-    """Return the remaining lag from the rates as vectors, once the mount is known.
-
-    From magnitudes alone, the capture's noise costs up to 12 ms if there is little rotation, as on
-    a trolley.
+    Magnitudes alone (`sizes_only`) need no mount. Glitches are rare but huge: only rates that do
+    not differ grossly are compared.
     """
-    stride = max(1, round(0.06 / float(np.median(np.diff(time)))))
-    rates, good = _rates(time, attitude_WB, valid, stride)
+    stride = max(1, round(span / float(np.median(np.diff(time)))))
+    rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    rates = rates / (time[stride:] - time[:-stride])[:, None]
+    good = valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)
+    if sizes_only:
+        rates = np.linalg.norm(rates, axis=1, keepdims=True)
 
     def score(lag: float) -> float:
         measured = gyro_B.mean_rate(time + lag, stride)
+        if sizes_only:
+            measured = np.linalg.norm(measured, axis=1, keepdims=True)
         use = good & (np.linalg.norm(rates - measured, axis=1) < 3.0)
         return correlation(rates[use], measured[use])
 
-    return _best_lag(score, _REMAINING_LAG_S)
+    return score
 
 
 def _best_lag(score: Callable[[float], float], reach: float) -> float:
@@ -296,10 +280,11 @@ def _mounts(
     fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
     longest = int(np.argmax([stop - start for start, stop in pieces]))
     mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
-    order = [(k, k - 1) for k in range(longest + 1, len(pieces))]
-    order += [(k, k + 1) for k in range(longest - 1, -1, -1)]
-    for k, neighbour in order:
-        here, there = _facing_ends(pieces[k], pieces[neighbour])
+    count = len(pieces)
+    # Pieces after and before the longest, their neighbours towards it, and the facing ends of both.
+    order = [(k, k - 1, pieces[k][0], pieces[k - 1][1] - 1) for k in range(longest + 1, count)]
+    order += [(k, k + 1, pieces[k][1] - 1, pieces[k + 1][0]) for k in range(longest - 1, -1, -1)]
+    for k, neighbour, here, there in order:
         mount, fit = mounts[neighbour], fitted[k]
         carried = fit or mount
         if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
@@ -308,17 +293,11 @@ def _mounts(
         same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
         agrees = fit is not None and _same_mount(fit, carried)
         mounts[k] = mount if same else (fit if agrees and fit else carried)
-    return [mounts[k] for k in range(len(pieces))]
+    return [mounts[k] for k in range(count)]
 
 
 def _same_mount(mount: Rotation, other: Rotation) -> bool:
     return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
-
-
-def _facing_ends(piece: tuple[int, int], neighbour: tuple[int, int]) -> tuple[int, int]:
-    if piece[0] >= neighbour[1]:
-        return piece[0], neighbour[1] - 1
-    return piece[1] - 1, neighbour[0]
 
 
 def _fit(
@@ -341,14 +320,3 @@ def _fit(
         scale = max(float(np.median(residual)), 1e-4)
         weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
     return mount
-
-
-def _correlation(
-    time: FloatArray, attitude_WB: Rotation, gyro_B: _GyroIntegral, valid: BoolArray
-) -> float:
-    """Correlate both rates over 0.1 s; over less, the capture's noise hides a trolley's turns."""
-    stride = max(1, round(_CORRELATED_S / float(np.median(np.diff(time)))))
-    rates, good = _rates(time, attitude_WB, valid, stride)
-    measured = gyro_B.mean_rate(time, stride)
-    good &= np.linalg.norm(rates - measured, axis=1) < 3.0
-    return correlation(rates[good], measured[good])

@@ -75,21 +75,17 @@ def _correlations(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]
     masks = [np.isfinite(x).astype(np.float64) for x in (a, b)]
     values = [np.nan_to_num(x - np.nanmean(x)) for x in (a, b)]
     lags = np.arange(-(len(b) - 1), len(a)).astype(np.float64)
-    common, products, power_a, power_b = (
-        _convolved(x, y[::-1])
-        for x, y in (
-            (masks[0], masks[1]),
-            (values[0], values[1]),
-            (values[0] ** 2, masks[1]),
-            (masks[0], values[1] ** 2),
-        )
-    )
+    common = convolved(masks[0], masks[1][::-1])
+    products = convolved(values[0], values[1][::-1])
+    power_a = convolved(values[0] ** 2, masks[1][::-1])
+    power_b = convolved(masks[0], values[1][::-1] ** 2)
     enough = common >= 0.5 * min(masks[0].sum(), masks[1].sum())
     scores = products / np.sqrt(np.maximum(power_a * power_b, 1e-12))
     return lags[enough], np.asarray(scores[enough], dtype=np.float64)
 
 
-def _convolved(x: FloatArray, y: FloatArray) -> FloatArray:
+def convolved(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the full convolution of two rows; importing `scipy.signal` for it takes a second."""
     count = len(x) + len(y) - 1
     size = next_fast_len(count, real=True)
     return np.asarray(irfft(rfft(x, size) * rfft(y, size), size)[:count], dtype=np.float64)

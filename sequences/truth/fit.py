@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated
@@ -18,6 +17,7 @@ from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.clock_offset import convolved
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples
 
 LONGEST_S = 600.0
@@ -138,18 +138,16 @@ def middle_part(sequence: ImuSequence) -> ImuSequence:
     if sequence.duration <= LONGEST_S:
         return sequence
     centre = float(np.nanmedian(sequence.time))
-    keep = np.abs(sequence.time - centre) <= LONGEST_S / 2
-    return ImuSequence(
-        sequence.name, sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
-    )
+    return sequence.slice(centre - LONGEST_S / 2, centre + LONGEST_S / 2)
 
 
 def _grid(start: float, stop: float) -> FloatArray:
     return np.arange(start, max(stop, start + 2.0 / _RATE), 1.0 / _RATE)
 
 
-def _speed(attitude: Rotation, valid: BoolArray, stride: int = 4) -> FloatArray:
+def _speed(attitude: Rotation, valid: BoolArray) -> FloatArray:
     """Return the angular rate [rad/s] around each sample of an even grid, NaN where unknown."""
+    stride = 4
     speed = np.full(len(valid), np.nan)
     if len(valid) > stride:
         half = stride // 2
@@ -170,7 +168,7 @@ def _coarse_offset(time: FloatArray, gyro: FloatArray, truth: Trajectory) -> flo
     turning = np.where(known, speed_T - speed_T[known].mean(), 0.0)
     speed = np.interp(grid, time, np.linalg.norm(gyro, axis=1))
     speed = np.where((grid < time[0]) | (grid > time[-1]), 0.0, speed - speed.mean())
-    score = correlate(speed, turning, mode="full", method="fft")
+    score = convolved(speed, turning[::-1])
     lags = np.arange(-len(grid) + 1, len(grid)) / _RATE
     near = np.abs(lags) <= MAX_OFFSET_S
     return float(lags[near][np.argmax(score[near])])

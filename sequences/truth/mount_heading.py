@@ -79,7 +79,8 @@ def _gyro_information(
 ) -> float:
     """Return the inverse variance [1/rad^2] of the gyroscope's fit for rotation about `up_B`."""
     stride = max(1, round(_TURN_S / float(np.median(np.diff(time)))))
-    angle = np.vstack([np.zeros(3), np.cumsum(_trapezia(time, gyro), axis=0)])
+    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     use = valid[:-stride] & valid[stride:]
     use &= np.arange(len(use)) % stride == 0
     phi_B = (angle[stride:] - angle[:-stride])[use]
@@ -87,10 +88,6 @@ def _gyro_information(
     phi_attitude = (attitude_WB[starts].inv() * attitude_WB[starts + stride]).as_rotvec()
     deviation = _deviation(phi_attitude - phi_B)
     return float(np.square(np.cross(phi_B, up_B)).sum() / deviation**2)
-
-
-def _trapezia(time: FloatArray, rate: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * np.diff(time)[:, None] * (rate[1:] + rate[:-1]), dtype=np.float64)
 
 
 def _deviation(residual: FloatArray) -> float:

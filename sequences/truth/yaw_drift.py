@@ -60,10 +60,10 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
     part = slice(start, stop)
-    if stop - start < 2:
-        return None
     R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
-    at = np.unique(np.searchsorted(time[part], np.arange(time[start], time[stop - 1], _STEP_S)))
+    # Without the last sample, which rounding may place before the grid's last time.
+    grid = np.arange(time[start], time[stop - 1], _STEP_S)
+    at = np.unique(np.searchsorted(time[part][:-1], grid))
     pose = truth.at(time[part][at])
     attitude_NB = Rotation.from_matrix(R_NB[at])
     yaw = np.unwrap(yaw_of(attitude_NB))[pose.valid]

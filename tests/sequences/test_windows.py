@@ -34,11 +34,6 @@ def walk(track: Trajectory) -> ImuSequence:
     return simulate_imu(track, rate=200.0, errors=PERFECT_IMU)
 
 
-def truth_of(sequence: ImuSequence) -> Trajectory:
-    assert sequence.truth is not None
-    return sequence.truth
-
-
 def smooth(time: FloatArray) -> FloatArray:
     return np.stack([np.sin(2 * np.pi * f * time + f) for f in (0.5, 1.0, 2.0)], axis=1)
 
@@ -89,7 +84,7 @@ def test_the_target_is_the_displacement_over_the_window(walk: ImuSequence) -> No
     (stream,) = world_streams(walk, attitude="true")
     windows, targets = windows_of(stream, stride=50)
     assert windows.shape == (len(targets), 6, 200)
-    truth = truth_of(walk)
+    truth = walk.truth
     for k in range(len(targets)):
         start, stop = truth.time[50 * k], truth.time[50 * k] + 1.0
         ends = truth.at(np.array([start, stop])).position_W
@@ -104,8 +99,7 @@ def test_the_target_is_the_displacement_over_the_window(walk: ImuSequence) -> No
 def test_a_window_contains_the_motion_of_its_target(walk: ImuSequence) -> None:
     """Force integrated twice from the true initial velocity gives the target: no time shift."""
     (stream,) = world_streams(walk, attitude="true")
-    velocity = truth_of(walk).velocity_W
-    assert velocity is not None
+    velocity = walk.truth.velocity_W
     windows, targets = windows_of(stream, stride=100)
     for k, (window, target) in enumerate(zip(windows, targets, strict=True)):
         accel = window[3:].T.astype(np.float64) - [0.0, 0.0, 9.80665]
@@ -116,7 +110,7 @@ def test_a_window_contains_the_motion_of_its_target(walk: ImuSequence) -> None:
 
 
 def test_no_window_spans_a_gap_in_the_truth(walk: ImuSequence) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     valid = np.ones(len(truth), dtype=np.bool_)
     valid[1600:1700] = False
     streams = world_streams(replace(walk, truth=replace(truth, valid=valid)))
@@ -139,14 +133,14 @@ def test_short_gaps_are_bridged_and_short_stretches_dropped(walk: ImuSequence) -
     kept = (walk.time < 8.0) | (walk.time > 8.05)
     gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
     assert len(world_streams(gappy)) == 1
-    truth = truth_of(walk)
+    truth = walk.truth
     valid = np.ones(len(truth), dtype=np.bool_)
     valid[1000:1100] = valid[1300:1400] = False
     assert len(world_streams(replace(walk, truth=replace(truth, valid=valid)))) == 2
 
 
 def test_rotating_the_world_rotates_window_and_target_equally(walk: ImuSequence) -> None:
-    truth, turn = truth_of(walk), about_z(2.1)
+    truth, turn = walk.truth, about_z(2.1)
     turned = replace(
         walk,
         truth=Trajectory(truth.time, turn.apply(truth.position_W), turn * truth.attitude_WB),
@@ -164,7 +158,7 @@ def test_a_misaligned_truth_does_not_affect_levelled_windows() -> None:
     """It tilts the mean specific force towards the facing of the device, a clue absent in use."""
     style = WalkStyle(carry="handheld")
     walk = simulate_imu(generate_walk(7, 60.0, rate=200.0, style=style), 200.0, PERFECT_IMU)
-    truth = truth_of(walk)
+    truth = walk.truth
     askew = truth.attitude_WB * Rotation.from_rotvec([0.05, 0.0, 0.0])
     tilted = replace(walk, truth=replace(truth, attitude_WB=askew))
     settled = slice(20 * 200, None)
@@ -183,7 +177,7 @@ def test_levelled_windows_equal_the_navigators_except_for_heading() -> None:
     walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
     (stream,) = world_streams(walk)
     epochs, _ = cut_recording(walk, NavigatorConfig())
-    true_WB = truth_of(walk).attitude_WB
+    true_WB = walk.truth.attitude_WB
     compared = 0
     for epoch in epochs:
         if epoch.window is None:
@@ -229,10 +223,10 @@ def test_a_zero_time_before_times_since_1970_does_not_exhaust_memory(
 ) -> None:
     """A grid over the whole time between would not fit in memory."""
     start = 1.7e9 - 0.01
-    truth = truth_of(walk)
+    truth = walk.truth
     late = replace(walk, time=start + walk.time, truth=replace(truth, time=start + truth.time))
     late.time[0] = 0.0
-    world = imu_in_world(late, truth_of(late), attitude)
+    world = imu_in_world(late, late.truth, attitude)
     assert len(world.time) == len(world.imu) == len(world.usable) < len(walk) + 500
     assert (np.diff(world.time) > 0.0).all()
     (stream,), (whole,) = world_streams(late, attitude=attitude), world_streams(walk)
@@ -243,7 +237,7 @@ def test_after_a_long_gap_the_grid_continues_evenly(walk: ImuSequence) -> None:
     """Whole seconds are skipped, so that index arithmetic gives the same times as without a gap."""
     kept = (walk.time < 4.0) | (walk.time > 12.345)
     gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    world = imu_in_world(gappy, truth_of(walk), "true")
+    world = imu_in_world(gappy, walk.truth, "true")
     grid, usable = world.time, world.usable
     index = (grid - grid[0]) * 200.0
     assert np.abs(index - np.round(index)).max() < 1e-6

@@ -334,15 +334,11 @@ def test_position_nees_skips_a_start_without_covariance_and_is_yaw_invariant():
     np.testing.assert_allclose(position_nees(other, truth).nees, found.nees, rtol=1e-6)
 
 
-def test_nees_refuses_invalid_covariances_and_run_counts():
+def test_nees_refuses_invalid_covariances():
     with pytest.raises(InputError, match="row 1 not positive definite"):
         nees(np.ones((2, 3)), np.stack([np.eye(3), np.diag([1.0, 1.0, -1.0])]))
-    with pytest.raises(InputError, match=r"covariance: found shape \(2, 2\)"):
-        nees(np.ones((2, 3)), np.eye(2))
     with pytest.raises(InputError, match="position_covariance_W"):
         position_nees(walk(), walk())
-    with pytest.raises(InputError, match="runs"):
-        nees_bounds(3, 0)
 
 
 @pytest.mark.parametrize("poses", [1, 600])

@@ -73,6 +73,16 @@ def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not() ->
     assert np.max(integrated) > 10.0
 
 
+def test_a_grid_rounded_to_beyond_the_last_sample_is_levelled() -> None:
+    """0.09 s plus 420 steps of 0.1 s is later than 42.09 s in floating point."""
+    walk = simulated_walk(1, 43.0, "handheld", PERFECT_IMU)
+    part = slice(9, 4210)
+    time = np.arange(4301)[part] / 100.0
+    gyro, accel = walk.gyro[part], walk.accel[part]
+    shorter = levelled_attitudes(time[:-1], gyro[:-1], accel[:-1])
+    np.testing.assert_array_equal(levelled_attitudes(time, gyro, accel)[:-10], shorter[:-9])
+
+
 def test_levelling_tolerates_uncorrected_gyroscope_rates() -> None:
     """A phone that does not correct its gyroscope: a bias of 5 deg/s about a body axis."""
     walk = simulated_walk(1, 90.0, "handheld", PERFECT_IMU)

@@ -29,7 +29,6 @@ def in_degrees(sequence: ImuSequence) -> ImuSequence:
 
 
 def without_gravity(sequence: ImuSequence) -> ImuSequence:
-    assert sequence.truth is not None
     return replace(sequence, accel=sequence.accel - sequence.truth.attitude_WB.apply(UP, True))
 
 
@@ -99,7 +98,6 @@ def test_a_reversed_sign_is_detected_only_with_a_true_attitude(walk: ImuSequence
 
 
 def test_a_truth_with_another_quaternion_order_is_refused(walk: ImuSequence) -> None:
-    assert walk.truth is not None
     shuffled = Rotation.from_quat(walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
     text = refusal(replace(walk, truth=replace(walk.truth, attitude_WB=shuffled)))
     assert "x y z w" in text

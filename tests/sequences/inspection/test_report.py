@@ -14,7 +14,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -24,14 +24,10 @@ def walk() -> ImuSequence:
     return simulate_imu(generate_walk(8, 30.0, style=WalkStyle()), 100.0, seed=2, name="walk")
 
 
-def truth_of(sequence: ImuSequence) -> Trajectory:
-    assert sequence.truth is not None
-    return sequence.truth
-
-
 def problem(sequence: ImuSequence) -> str:
-    (text,) = inspect_recording(sequence).problems
-    assert text in "\n".join(inspect_recording(sequence).lines())
+    found = inspect_recording(sequence)
+    (text,) = found.problems
+    assert text in "\n".join(found.lines())
     return text
 
 
@@ -43,9 +39,8 @@ def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:
     assert found.timing.rate_hz == pytest.approx(100.0)
     assert found.timing.gaps == ()
     assert found.accel_norm == pytest.approx(STANDARD_GRAVITY, abs=0.5)
-    assert found.coverage is not None
-    assert found.coverage.share > 0.99
-    assert found.coverage.path_m == pytest.approx(truth_of(walk).path_length())
+    assert found.coverage.coverage > 0.99
+    assert found.coverage.path_m == pytest.approx(walk.truth.path_length())
 
 
 def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
@@ -61,11 +56,11 @@ def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     lengths = {round(start, 2): round(length, 2) for start, length in timing.gaps}
     assert lengths[4.99] == 2.51
     assert lengths[11.99] == 0.04
-    assert timing.repeated == 1
-    assert timing.backward == 1
-    assert timing.not_finite == 1
+    assert timing.times_repeated == 1
+    assert timing.times_backward == 1
+    assert timing.samples_not_finite == 1
     # The two samples with wrong times leave gaps where they should have been.
-    assert timing.lost >= 250 + 3
+    assert timing.samples_lost_in_gaps >= 250 + 3
     assert timing.jitter_s < 1e-9
 
 
@@ -91,14 +86,13 @@ def test_a_problem_is_named_with_the_option_that_fixes_it(walk, corrupt, option)
 
 
 def test_a_truth_on_another_clock_is_named_with_the_offset(walk: ImuSequence) -> None:
-    late = replace(walk, truth=replace(truth_of(walk), time=truth_of(walk).time - 0.25))
+    late = replace(walk, truth=replace(walk.truth, time=walk.truth.time - 0.25))
     assert "add +0.25" in problem(late)
 
 
 def test_a_truth_too_slow_to_compare_is_named_as_such(walk: ImuSequence) -> None:
     """Its attitude between two poses is unknown, so neither clock nor axes may be blamed."""
     truth = walk.truth
-    assert truth is not None
     found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
     (problem,) = found.problems
     assert "5 Hz; at least 10 Hz" in problem
@@ -106,7 +100,7 @@ def test_a_truth_too_slow_to_compare_is_named_as_such(walk: ImuSequence) -> None
 
 
 def test_a_truth_of_another_body_is_named_in_degrees(walk: ImuSequence) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     # Rotated about the vertical of a level device, so that gravity gives no information.
     turned = truth.attitude_WB * Rotation.from_rotvec([0.0, 0.0, 0.6])
     text = problem(replace(walk, truth=replace(truth, attitude_WB=turned)))
@@ -121,7 +115,6 @@ def test_rest_is_reported(walk: ImuSequence) -> None:
     gyro, accel = 0.003 * rng.normal(size=(500, 3)), 0.02 * rng.normal(size=(500, 3))
     accel[:, 2] += STANDARD_GRAVITY
     found = inspect_recording(ImuSequence("r", time, gyro, accel))
-    assert found.rest is not None
     assert any("at rest: 5.0 s in 1 stretches" in line for line in found.lines())
     assert "truth: none" in found.lines()
 
@@ -142,7 +135,7 @@ def test_poor_recordings_are_described_not_refused(walk: ImuSequence) -> None:
         walk.slice(0.0, 5.0),
         ImuSequence("one", walk.time[:1], walk.gyro[:1], walk.accel[:1]),
         ImuSequence("slow", walk.time[::10], walk.gyro[::10], walk.accel[::10]),
-        replace(walk, truth=replace(truth_of(walk), time=truth_of(walk).time + 1000.0)),
+        replace(walk, truth=replace(walk.truth, time=walk.truth.time + 1000.0)),
     ):
         found = inspect_recording(poor)
         assert found.lines()
@@ -153,7 +146,6 @@ def test_poor_recordings_are_described_not_refused(walk: ImuSequence) -> None:
 
 def test_the_figure_shows_rest_gaps_and_the_rotation_of_the_truth(walk: ImuSequence) -> None:
     fit = inspect_recording(walk).fit
-    assert fit is not None
     figure = imu_overview(walk, (fit.times, fit.speed), rest=[(1.0, 2.0)], gaps=[(5.0, 6.0)])
     labels = {
         text.get_text()
@@ -170,7 +162,6 @@ def test_the_figure_shows_rest_gaps_and_the_rotation_of_the_truth(walk: ImuSeque
 def test_real_recordings_have_no_problems(name: str) -> None:
     found = inspect_recording(read_recording(DATA / name))
     assert found.problems == ()
-    assert found.fit is not None
     assert found.fit.correlation > 0.95
     assert abs(found.fit.time_offset) < 0.01
     assert np.degrees(found.fit.misalignment) < 2.0

@@ -27,7 +27,6 @@ def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
 @pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
 def test_noise_and_bias_match_the_sensor_at_any_rate(rate: float) -> None:
     rest = find_rest(device_at_rest(60.0, rate))
-    assert rest is not None
     assert rest.seconds == pytest.approx(60.0, abs=0.6)
     assert len(rest.stretches) == 1
     np.testing.assert_allclose(rest.gyro_bias, BIAS, atol=5e-4)
@@ -47,7 +46,6 @@ def test_rest_is_found_between_motions_but_not_across_a_gap() -> None:
     gyro[300:500] += rng.normal(size=(200, 3)).cumsum(axis=0) * 0.05
     time = still.time + np.where(np.arange(len(still)) >= 700, 2.0, 0.0)
     rest = find_rest(ImuSequence("m", time, gyro, still.accel))
-    assert rest is not None
     (a, b), (c, d), (e, f) = rest.stretches
     assert a == 0.0
     assert 2.4 <= b <= 3.0

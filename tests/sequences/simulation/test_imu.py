@@ -35,8 +35,6 @@ def standing(duration: float, rate: float = 1.0) -> Trajectory:
 def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
     """Pose at every fourth sample from the first true pose and the samples, by Simpson's rule."""
     truth = imu.truth
-    assert truth is not None
-    assert truth.velocity_W is not None
     h = 2.0 / imu.rate
     w0, w1, w2 = imu.gyro[:-2:2], imu.gyro[1:-1:2], imu.gyro[2::2]
     # Magnus expansion of fourth order: Simpson's mean and the first coning term.
@@ -58,7 +56,6 @@ def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
 def test_strapdown_of_a_perfect_imu_returns_the_trajectory() -> None:
     imu = simulate_imu(waving(), rate=400.0, errors=PERFECT_IMU)
     position, R_WB = strapdown(imu)
-    assert imu.truth is not None
     off = (R_WB.inv() * imu.truth.attitude_WB[::4]).magnitude()
     assert off.max() < 1e-7
     assert np.abs(position - imu.truth.position_W[::4]).max() < 1e-5
@@ -67,7 +64,6 @@ def test_strapdown_of_a_perfect_imu_returns_the_trajectory() -> None:
 def test_truth_passes_through_the_given_poses() -> None:
     given = waving()
     truth = simulate_imu(given, rate=200.0, errors=PERFECT_IMU).truth
-    assert truth is not None
     assert np.abs(truth.position_W[::2] - given.position_W).max() < 1e-9
     assert (truth.attitude_WB[::2].inv() * given.attitude_WB).magnitude().max() < 1e-7
 
@@ -75,8 +71,6 @@ def test_truth_passes_through_the_given_poses() -> None:
 def test_velocity_gyro_and_accel_are_the_derivatives_of_truth() -> None:
     imu = simulate_imu(waving(), rate=2000.0, errors=PERFECT_IMU)
     truth, h = imu.truth, 1.0 / 2000.0
-    assert truth is not None
-    assert truth.velocity_W is not None
     p = truth.position_W
     velocity = (p[2:] - p[:-2]) / (2.0 * h)
     assert np.abs(velocity - truth.velocity_W[1:-1]).max() < 1e-5

@@ -21,7 +21,6 @@ def test_every_carrying_mode_is_plausible(carry: str) -> None:
         assert np.isfinite(imu.accel).all()
         assert force.max() < 6.0 * STANDARD_GRAVITY
         assert turning.max() < 20.0
-        assert imu.truth is not None
         upward = imu.truth.attitude_WB.apply(np.array(imu.accel))[:, 2].mean()
         assert upward == pytest.approx(STANDARD_GRAVITY, abs=0.15)
 
@@ -144,7 +143,7 @@ def test_walks_are_smooth_enough_for_the_spline() -> None:
         assert (a.gyro - b.gyro)[inner].std() < 0.1 * a.gyro[inner].std()
 
 
-def test_noise_helpers_have_unit_deviation_in_their_band() -> None:
+def test_noise_has_unit_deviation_in_its_band() -> None:
     rng = np.random.default_rng(0)
     assert drift(rng, 200_000, 100.0, 0.5).std() == pytest.approx(1.0, rel=0.05)
     noise = band_noise(rng, 100_000, 100.0, 5.0, 10.0, 2)

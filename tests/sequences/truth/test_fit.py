@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import with_axes
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.findings import fit_problems
@@ -18,11 +18,6 @@ from stario.sequences.truth.fit import fit_truth
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
     return simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 200.0, seed=2)
-
-
-def truth_of(sequence: ImuSequence) -> Trajectory:
-    assert sequence.truth is not None
-    return sequence.truth
 
 
 def test_a_truth_that_fits_needs_no_correction(walk: ImuSequence) -> None:
@@ -38,13 +33,13 @@ def test_a_truth_that_fits_needs_no_correction(walk: ImuSequence) -> None:
 
 @pytest.mark.parametrize("offset", [-3.21, -0.05, 0.4, 2.503])
 def test_the_clock_offset_is_found(walk: ImuSequence, offset: float) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     late = replace(walk, truth=replace(truth, time=truth.time - offset))
     assert fit_truth(late).time_offset == pytest.approx(offset, abs=0.003)
 
 
 def test_the_rotation_between_the_axes_is_found(walk: ImuSequence) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     R_TB = Rotation.from_rotvec([0.3, -0.8, 0.4])
     turned = replace(walk, truth=replace(truth, attitude_WB=truth.attitude_WB * R_TB.inv()))
     fit = fit_truth(turned)
@@ -58,20 +53,20 @@ def test_the_rotation_between_the_axes_is_found(walk: ImuSequence) -> None:
 def test_axes_are_named_despite_a_clock_offset(
     walk: ImuSequence, turned: str, corrected: str
 ) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     late = replace(walk, truth=replace(truth, time=truth.time + 1.0))
     assert fit_truth(with_axes(late, turned)).axes() == corrected
 
 
 def test_a_tilted_world_is_detected(walk: ImuSequence) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     lean = Rotation.from_rotvec([np.radians(5.0), 0.0, 0.0])
     leaning = replace(walk, truth=replace(truth, attitude_WB=lean * truth.attitude_WB))
     assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
 
 
 def test_a_flip_of_the_truth_is_counted_as_a_jump(walk: ImuSequence) -> None:
-    truth = truth_of(walk)
+    truth = walk.truth
     quat_xyzw = truth.quat_xyzw
     late = truth.time > 20.0
     flip = Rotation.from_rotvec([0.0, 0.0, np.pi])
@@ -101,7 +96,7 @@ def test_a_truth_with_too_little_overlap_is_refused(walk: ImuSequence) -> None:
         fit_truth(walk.without_truth())
     with pytest.raises(InputError, match="10 s"):
         fit_truth(walk.slice(0.0, 6.0))
-    truth = truth_of(walk)
+    truth = walk.truth
     with pytest.raises(InputError):
         fit_truth(replace(walk, truth=replace(truth, time=truth.time + 500.0)))
 
@@ -138,7 +133,7 @@ def test_the_accelerometer_decides_whether_gyroscope_or_truth_is_turned(walk: Im
     fit = fit_truth(replace(walk, gyro=walk.gyro @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix().T))
     (problem,) = fit_problems("w", fit, None, "")
     assert "gyroscope: its axes or signs are not those of the accelerometer" in problem
-    truth = truth_of(walk)
+    truth = walk.truth
     turned = replace(truth, attitude_WB=truth.attitude_WB * Rotation.from_rotvec([0.5, 0, 0]))
     problems = fit_problems("w", fit_truth(replace(walk, truth=turned)), None, "")
     assert "truth: its axes are" in problems[0]

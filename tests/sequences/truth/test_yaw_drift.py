@@ -25,14 +25,19 @@ def walk() -> ImuSequence:
 @pytest.mark.parametrize("bias", [0.0, 0.004])
 def test_scale_and_bias_are_recovered(walk: ImuSequence, scale: float, bias: float) -> None:
     truth = walk.truth
-    assert truth is not None
     up_B = truth.at(walk.time).attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     turned = replace(walk, gyro=(1.0 + scale) * walk.gyro + bias * up_B)
     found = yaw_drift(turned, fit_truth(turned))
-    assert found is not None
     assert found.scale == pytest.approx(scale, abs=2e-3)
     assert found.bias == pytest.approx(bias, abs=5e-4)
     assert found.residual_rms < np.radians(1.0)
+
+
+def test_a_grid_rounded_to_beyond_the_last_sample_is_fitted(walk: ImuSequence) -> None:
+    """3.305 s plus 369 steps of 0.1 s is later than 40.205 s in floating point."""
+    time = 0.005 + walk.time
+    part = replace(walk, time=time, truth=replace(walk.truth, time=time)).slice(3.3, 40.206)
+    assert yaw_drift(part, fit_truth(part)) is not None
 
 
 def test_the_report_states_the_scale_error(walk: ImuSequence) -> None:
@@ -46,7 +51,6 @@ def test_the_report_states_the_scale_error(walk: ImuSequence) -> None:
 
 def test_without_rotation_no_yaw_drift_is_estimated(walk: ImuSequence) -> None:
     truth = walk.truth
-    assert truth is not None
     until = walk.time < walk.time[0] + 12.0
     short = ImuSequence(
         walk.name, walk.time[until], 1e-3 * walk.gyro[until], walk.accel[until], truth
