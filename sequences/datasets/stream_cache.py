@@ -45,8 +45,7 @@ log = logging.getLogger(__name__)
 Stream = WorldStream | LegStream
 """Training data of a network: with poses, or with legs between known positions."""
 
-_TABLES = {"poses": ("imu_W", "position_W", "facing_W"), "legs": ("imu_N", "facing_N", "legs")}
-
+_POSES = "poses"
 _SUFFIX = ".streams"
 _ABANDONED_S = 3600.0
 
@@ -208,10 +207,17 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     """Write streams to the cache; return False, with a warning, if they cannot be written."""
     if not streams:
         return False
-    tables = [_tables(stream) for stream in streams]
+    tables = [
+        {name: value for name, value in vars(stream).items() if isinstance(value, np.ndarray)}
+        for stream in streams
+    ]
     metadata = [
-        {"name": s.name, "kind": getattr(s, "kind", "poses"), "rows": [len(v) for v in t.values()]}
-        for s, t in zip(streams, tables, strict=True)
+        {
+            "name": stream.name,
+            "kind": getattr(stream, "kind", _POSES),
+            "rows": {name: len(array) for name, array in table.items()},
+        }
+        for stream, table in zip(streams, tables, strict=True)
     ]
     content = safetensors.numpy.save(
         {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
@@ -236,29 +242,6 @@ def _sweep(file: Path) -> None:
                 abandoned.unlink()
 
 
-def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
-    """Return a stream's arrays by name; those of the same name are stacked over all streams."""
-    if isinstance(stream, WorldStream):
-        return {name: getattr(stream, name) for name in _TABLES["poses"]}
-    legs = [stream.start, stream.stop, stream.displacement, stream.sigma]
-    return {
-        "imu_N": stream.imu_N,
-        "facing_N": stream.facing_N,
-        "legs": np.column_stack(legs).astype(np.float64),
-    }
-
-
-def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
-    """Rebuild a stream from the arrays of `_tables`."""
-    if kind == "poses":
-        return WorldStream(name, **tables)
-    legs = tables["legs"]
-    return LegStream(
-        name, kind, tables["imu_N"], tables["facing_N"],
-        legs[:, 0], legs[:, 1], legs[:, 2:5], legs[:, 5:7],
-    )  # fmt: skip
-
-
 def _opened(file: Path) -> list[Stream] | None:
     """Return memory-mapped streams, or None if the file is missing or incomplete."""
     try:
@@ -275,14 +258,17 @@ def _opened(file: Path) -> list[Stream] | None:
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.warning("%s: incomplete, will be rebuilt: %s", file, error)
         return None
-    names = list(_TABLES["poses" if metadata[0]["kind"] == "poses" else "legs"])
-    first = dict.fromkeys(names, 0)
-    streams = []
+    first = dict.fromkeys(whole, 0)
+    streams: list[Stream] = []
     for entry in metadata:
-        rows = dict(zip(names, entry["rows"], strict=True))
-        tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
-        first = {name: first[name] + rows[name] for name in names}
-        streams.append(_stream(entry["name"], entry["kind"], tables))
+        arrays = {}
+        for name, rows in entry["rows"].items():
+            arrays[name] = whole[name][first[name] : first[name] + rows]
+            first[name] += rows
+        if entry["kind"] == _POSES:
+            streams.append(WorldStream(entry["name"], **arrays))
+        else:
+            streams.append(LegStream(entry["name"], entry["kind"], **arrays))
     return streams
 
 
