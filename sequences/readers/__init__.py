@@ -60,20 +60,15 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-def _is_archive_or_member(path: Path) -> bool:
-    return is_archive(path) or is_archive_member(path)
-
-
 def _read_zip(path: Path) -> ImuSequence:
     """Read the only recording in a zip; errors name the zip and the file in it."""
     with unpacked(path) as folder:
-        found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
-        if len(found) > 1:
-            names = ", ".join(str(path_inside.relative_to(folder)) for path_inside in found[:4])
-            raise ReadError(
-                path, "content", f"{len(found)} recordings ({names})", "one", "unpack the zip"
-            )
-        return _read_unpacked(path, folder, found[0] if found else folder)
+        inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
+        if len(inside) > 1:
+            names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
+            found = f"{len(inside)} recordings ({names})"
+            raise ReadError(path, "content", found, "one", "unpack the zip")
+        return _read_unpacked(path, folder, inside[0])
 
 
 def _read_json(path: Path) -> ImuSequence:
@@ -94,7 +89,7 @@ def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
 
 
 FORMATS: dict[str, Format] = {
-    "archive": Format(_is_archive_or_member, read_archive, "archive"),
+    "archive": Format(lambda path: is_archive(split_name(path)[0]), read_archive, "archive"),
     "ronin": Format(is_ronin, read_ronin, "RoNIN"),
     "ridi": Format(is_ridi, read_ridi, "RIDI"),
     "imunet": Format(is_imunet, read_imunet, "IMUNet recorder"),
@@ -113,6 +108,8 @@ FORMATS: dict[str, Format] = {
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings."""
+
+_KNOWN = f"one of the formats {', '.join(FORMATS)}"
 
 _SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
@@ -192,13 +189,11 @@ def find_recordings(
         return _with_attributes([path], where)
     if is_list(path):
         return _listed(path, on_error, where)
-    if path.is_file():
-        return _with_attributes([path], where)
-    found = sorted(_below(path))
+    found = [path] if path.is_file() else sorted(_below(path))
     if not found:
         if pose_files(path) or incomplete_sensors(path):
             raise _unknown(path)
-        raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
+        raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)
 
 
@@ -206,16 +201,12 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     """Return the recordings whose attributes match; only those in archives have any."""
     if not where or not found:
         return found
-    members: dict[Path, list[Path]] = {}
-    for path in found:
-        if is_archive_member(path):
-            members.setdefault(split_name(path)[0], []).append(path)
     chosen: list[Path] = []
     errors: list[ReadError] = []
-    for file, paths in members.items():
+    for file in dict.fromkeys(split_name(path)[0] for path in found if is_archive_member(path)):
         try:
             matching = set(archive_members(file, where))
-            chosen += [path for path in paths if path in matching]
+            chosen += [path for path in found if path in matching]
         except ReadError as error:
             errors.append(error)
     if errors and not chosen:
@@ -274,16 +265,6 @@ def _recognised(path: Path) -> str | None:
     return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
 
 
-def _names() -> str:
-    return f"one of the formats {', '.join(FORMATS)}"
-
-
-def _poses_alone(path: Path, pose: Path) -> ReadError:
-    expected = "a gyroscope file and an accelerometer file"
-    fix = "put the IMU files into the same folder"
-    return ReadError(path, "content", f"only poses, {pose.name}", expected, fix)
-
-
 def _unknown(path: Path) -> ReadError:
     """Return an error that describes what was found instead of a recording."""
     fix = ""
@@ -293,7 +274,9 @@ def _unknown(path: Path) -> ReadError:
         expected = "a gyroscope and an accelerometer"
         return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
-        return _poses_alone(path, poses[0])
+        expected = "a gyroscope file and an accelerometer file"
+        fix = "put the IMU files into the same folder"
+        return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
     elif path.is_dir():
         entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(entries[:5]) + (
@@ -310,4 +293,4 @@ def _unknown(path: Path) -> ReadError:
         found, fix = "no line of text", "is it empty or compressed?"
     else:
         found, fix = f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"
-    return ReadError(path, "content", found, _names(), fix)
+    return ReadError(path, "content", found, _KNOWN, fix)
