@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import number_in
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -214,21 +215,11 @@ def _tum_row(path: Path, number: int, line: str) -> list[float]:
     if len(words) != len(_TUM_FIELDS):
         expected = f"{len(_TUM_FIELDS)}: " + " ".join(_TUM_FIELDS)
         raise ReadError(path, f"line {number}", f"{len(words)} values", expected)
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        row = [math.nan]
-    if not all(map(math.isfinite, row)):
-        k = next(k for k, word in enumerate(words) if not _is_finite(word))
-        raise ReadError(path, f"line {number}, {_TUM_FIELDS[k]}", repr(words[k]), "a finite number")
+    row = [number_in(word) for word in words]
+    for name, word, value in zip(_TUM_FIELDS, words, row, strict=True):
+        if not math.isfinite(value):
+            raise ReadError(path, f"line {number}, {name}", repr(word), "a finite number")
     return row
-
-
-def _is_finite(word: str) -> bool:
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False
 
 
 def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:

@@ -7,6 +7,7 @@ folder are read as two recordings, each named by its gyroscope file.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,8 +23,6 @@ from stario.sequences.readers.phones.sensor_words import (
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
 """Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
-
-_NEEDED: tuple[Sensor, ...] = ("accel", "linear")
 
 
 @dataclass
@@ -55,11 +54,16 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
         group.tables.setdefault(sensor, []).append(table)
-    complete = [group for group in groups.values() if _is_complete(group)]
+    complete = [group for group in groups.values() if is_complete(group.tables)]
     if complete:
         return complete
     merged = _merged_groups(list(groups.values()))
-    return [merged] if _is_complete(merged) else []
+    return [merged] if is_complete(merged.tables) else []
+
+
+def is_complete(sensors: Collection[str]) -> bool:
+    """Return whether sensors include a gyroscope and an accelerometer of either kind."""
+    return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
 
 
 def incomplete_sensors(path: Path) -> list[Sensor]:
@@ -68,19 +72,17 @@ def incomplete_sensors(path: Path) -> list[Sensor]:
     Empty if it holds both, or no sensor at all.
     """
     sensors = _sensors(path)
-    complete = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
-    return [] if complete else sensors
+    return [] if is_complete(sensors) else sensors
 
 
 def _sensors(path: Path) -> list[Sensor]:
-    tables: list[tuple[Sensor | None, SensorTable | None]]
-    if path.is_dir():
-        files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
-        tables = [(sensor_of(words_of(file.stem)), sensor_table(file)) for file in files]
-        return list(dict.fromkeys(s for s, table in tables if s is not None and table is not None))
-    table = sensor_table(path) if _may_hold(path) else None
-    sensors: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
-    return [sensor for sensor in sensors if table is not None and sensor in table.axes]
+    if not path.is_dir():
+        table = sensor_table(path) if _may_hold(path) else None
+        order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
+        return [sensor for sensor in order if table is not None and sensor in table.axes]
+    files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
+    named = [(sensor_of(words_of(file.stem)), file) for file in files]
+    return list(dict.fromkeys(s for s, file in named if s is not None and sensor_table(file)))
 
 
 def _may_hold(file: Path) -> bool:
@@ -96,10 +98,6 @@ def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
     """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
     calibrated = {"calibrated", "mot"} & set(words)
     return is_uncalibrated(words), "total" not in words, not calibrated, file
-
-
-def _is_complete(group: PhoneFiles) -> bool:
-    return "gyro" in group.tables and any(sensor in group.tables for sensor in _NEEDED)
 
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:

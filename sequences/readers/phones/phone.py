@@ -31,8 +31,13 @@ from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.generic_csv import is_generic_csv
 from stario.sequences.readers.phones.apps import app_of
-from stario.sequences.readers.phones.attitude import logged_attitude
-from stario.sequences.readers.phones.files import SUFFIXES, PhoneFiles, phone_recordings
+from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
+from stario.sequences.readers.phones.files import (
+    SUFFIXES,
+    PhoneFiles,
+    is_complete,
+    phone_recordings,
+)
 from stario.sequences.readers.phones.reference_points import reference_points
 from stario.sequences.readers.phones.sensor_table import (
     Samples,
@@ -51,7 +56,6 @@ from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
-    DeviceAttitude,
     FloatArray,
     ImuSequence,
     Magnetometer,
@@ -109,7 +113,7 @@ def is_wide(path: Path) -> bool:
 
 def _wide(path: Path) -> PhoneFiles | None:
     table = sensor_table(path)
-    if table is None or not {"gyro"} < set(table.axes) or not {"accel", "linear"} & set(table.axes):
+    if table is None or not is_complete(table.axes):
         return None
     words = words_of(path.stem)
     key = " ".join(word for word in words if word != "imu" and not is_sensor_word(word))
@@ -161,7 +165,7 @@ def assemble_recording(
         accel=force,
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
-        device_attitude=_device_attitude(attitude, stamps[0]),
+        device_attitude=device_attitude(attitude, stamps[0]),
         source="" if core_motion else app_of(files),
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
@@ -215,15 +219,13 @@ def _force(
 ) -> tuple[Samples, set[str]]:
     """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
-    gravity = _gravity(files)
+    gravity_table = files.first("gravity")
+    gravity = None if gravity_table is None else _read(gravity_table, "gravity")
     total = _with_gravity(candidates, or_g=gravity is None)
-    linear = files.first("linear")
-    if total is None and not candidates and linear is not None:
-        candidates = [_read(linear, "linear")]
-    accel = total or candidates[0]
+    accel = total or (candidates[0] if candidates else _read(files.tables["linear"][0], "linear"))
     separate_gravity = total is None and gravity is not None
-    if separate_gravity and gravity is not None:
-        folder = gyro_folder(files)
+    if total is None and gravity is not None:
+        folder = files.gyro.parent
         stamps, force, gravity_B = resample_to_gyro(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
@@ -239,11 +241,6 @@ def _force(
     return replace(accel, values=factor * accel.values), converted
 
 
-def gyro_folder(files: PhoneFiles) -> Path:
-    """Return the folder of a recording's files."""
-    return files.gyro.parent
-
-
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
     """Return the first candidate with gravity in m/s^2, else the steadiest that may be in g."""
     sizes = [np.linalg.norm(candidate.values, axis=1) for candidate in candidates]
@@ -253,17 +250,6 @@ def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
     shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
     maybe = [k for k, candidate in enumerate(candidates) if or_g and is_in_g(candidate.values)]
     return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
-
-
-def _gravity(files: PhoneFiles) -> Samples | None:
-    table = files.first("gravity")
-    return None if table is None else _read(table, "gravity")
-
-
-def _device_attitude(
-    attitude: tuple[IntArray, Rotation] | None, start_ns: np.int64
-) -> DeviceAttitude | None:
-    return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
 
 
 def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> Magnetometer | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
@@ -86,16 +87,13 @@ def sensor_table(file: Path) -> SensorTable | None:
     return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
 
 
-def read_samples(
-    table: SensorTable, sensor: str, axes: str = "", per_second: int | None = None
-) -> Samples:
+def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     """Read a sensor's samples, in rad/s, m/s^2 or uT if the file names a unit.
 
     Args:
         table: the file's layout.
         sensor: the sensor, a key of `UNITS`.
         axes: the key of its columns in `table.axes`.
-        per_second: number of the clock's units in a second if its header names no unit.
 
     Raises:
         ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
@@ -113,8 +111,7 @@ def read_samples(
         raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
     values = values * (known[unit] if unit else 1.0)
     _check_size(table.file, titles, sensor, values[kept])
-    if per_second is None or clock.unit:
-        per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
+    per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
     if sensor != "mag":
         checked(table.file, titles, np.where(kept.reshape(-1, 1), values, 0.0), rows.first_row)
@@ -140,17 +137,14 @@ def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> Non
         )  # fmt: skip
 
 
-def read_quaternion(
-    table: SensorTable, per_second: int | None = None
-) -> tuple[IntArray, FloatArray]:
+def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
     """Read the times (N,) [ns] and quaternions (N, 4) of an attitude, in the table's order.
 
     Raises:
         ReadError: a row is malformed.
     """
     rows = _rows(table, [table.clock, *table.quaternion])
-    if per_second is None or table.clock.unit:
-        per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
+    per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
 
 
@@ -196,7 +190,4 @@ def _cells(line: str, delimiter: str | None, decimal: str) -> list[str]:
 
 
 def _number(cell: str) -> float:
-    try:
-        return float(cell.strip(" \"'"))
-    except ValueError:
-        return float("nan")
+    return number_in(cell.strip(" \"'"))
