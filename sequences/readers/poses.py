@@ -149,26 +149,21 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     numbers = table.values[:, 1:]
     if columns == 13:
         matrices = numbers.reshape(-1, 3, 4)
-        good = np.abs(np.linalg.det(matrices[:, :, :3]) - 1.0) < NORM_TOLERANCE
-        good &= np.isfinite(numbers[:, :12]).all(axis=1)
-        return [
-            PoseCandidate(
-                file, stamps[good], matrices[good, :, 3],
-                Rotation.from_matrix(matrices[good, :, :3]), "matrix",
-            )
-        ]  # fmt: skip
-    quaternion = numbers[:, 3:7]
-    good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
-    good &= np.isfinite(numbers[:, :7]).all(axis=1)
-    orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+        position, rotation = matrices[:, :, 3], matrices[:, :, :3]
+        size = np.linalg.det(rotation)
+    else:
+        position, rotation = numbers[:, :3], numbers[:, 3:]
+        size = np.linalg.norm(rotation, axis=1)
+    good = (np.abs(size - 1.0) < NORM_TOLERANCE) & np.isfinite(numbers).all(axis=1)
+    if not good.any():
+        return []
+    stamps, position, rotation = stamps[good], position[good], rotation[good]
+    if columns == 13:
+        return [PoseCandidate(file, stamps, position, Rotation.from_matrix(rotation), "matrix")]
     return [
-        PoseCandidate(
-            file, stamps[good], numbers[good, :3],
-            Rotation.from_quat(quaternion[good][:, order]), name,
-        )
-        for name, order in orders.items()
-        if good.any()
-    ]  # fmt: skip
+        PoseCandidate(file, stamps, position, Rotation.from_quat(rotation[:, order]), name)
+        for name, order in (("xyzw", [0, 1, 2, 3]), ("wxyz", [1, 2, 3, 0]))
+    ]
 
 
 @dataclass(frozen=True)

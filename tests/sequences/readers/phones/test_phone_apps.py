@@ -384,6 +384,17 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
     np.testing.assert_allclose(read.truth.position_W, truth.position_W[every], atol=0.1)
 
 
+@pytest.mark.parametrize("columns", [7, 12])
+def test_a_pose_file_without_any_rotation_gives_a_warning(
+    columns: int, walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = np.ones((len(walk), columns))
+    for name, values in (("acce", walk.accel), ("gyro", walk.gyro), ("ARKit_pose", rows)):
+        save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, sep=" ")
+    assert read_recording(tmp_path / "s").truth is None
+    assert "no row in ARKit_pose.txt holds a pose" in caplog.text
+
+
 def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
     rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
     save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
