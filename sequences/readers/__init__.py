@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
@@ -60,32 +62,24 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-def _read_zip(path: Path) -> ImuSequence:
-    """Read the only recording in a zip; errors name the zip and the file in it."""
-    with unpacked(path) as folder:
+def _read_unpacked(
+    unpack: Callable[[Path], AbstractContextManager[Path]], path: Path
+) -> ImuSequence:
+    """Read the only recording unpacked from `path`; errors name `path` and the file in it."""
+    with unpack(path) as folder:
         inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
         if len(inside) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
             found = f"{len(inside)} recordings ({names})"
-            raise ReadError(path, "content", found, "one", "unpack the zip")
-        return _read_unpacked(path, folder, inside[0])
-
-
-def _read_json(path: Path) -> ImuSequence:
-    with unpack_json(path) as folder:
-        return _read_unpacked(path, folder, folder)
-
-
-def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
-    """Read the recording unpacked from `path`; errors name `path` instead of `folder`."""
-    try:
-        sequence = read_recording(inside)
-    except ReadError as error:
-        file = str(error.path).replace(str(folder), str(path))
-        field = error.field.removeprefix(f"{error.path}: ")
-        found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
-        raise ReadError(file, field, found, error.expected, fix) from None
-    return replace(sequence, name=path.stem) if inside == folder else sequence
+            raise ReadError(path, "content", found, "one", f"unpack the {path.suffix[1:].lower()}")
+        try:
+            sequence = read_recording(inside[0])
+        except ReadError as error:
+            file = str(error.path).replace(str(folder), str(path))
+            field = error.field.removeprefix(f"{error.path}: ")
+            found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
+            raise ReadError(file, field, found, error.expected, fix) from None
+    return replace(sequence, name=path.stem) if inside == [folder] else sequence
 
 
 FORMATS: dict[str, Format] = {
@@ -102,8 +96,8 @@ FORMATS: dict[str, Format] = {
     "phone": Format(is_phone, read_phone, "phone"),
     "wide": Format(is_wide, read_wide, "phone"),
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
-    "zip": Format(is_zip, _read_zip, "zip"),
-    "json": Format(is_json_export, _read_json, "Sensor Logger"),
+    "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
+    "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import zipfile
 from collections.abc import Callable
@@ -158,6 +159,14 @@ def json_export(folder: Path, walk: ImuSequence) -> None:
     (folder / "2024-06-10.json").write_text(json.dumps([metadata, *rows]))
 
 
+def json_export_of_a_watch(folder: Path, walk: ImuSequence) -> None:
+    watch(folder, walk)
+    with (folder / "WristMotion.csv").open() as file:
+        rows = [{"sensor": "WristMotion", **row} for row in csv.DictReader(file)]
+    (folder / "WristMotion.csv").unlink()
+    (folder / "2024-06-10.json").write_text(json.dumps(rows))
+
+
 def zip_in_a_zip(folder: Path, walk: ImuSequence) -> None:
     android(folder / "unpacked", walk)
     with zipfile.ZipFile(folder / "inner.zip", "w") as file:
@@ -268,7 +277,7 @@ VARIANTS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         with_byte_order_mark, every_cell_quoted, readable_times, extra_sensors, watch, iphone,
-        iphone_standardised, iphone_uncalibrated, json_export, zip_in_a_zip,
+        iphone_standardised, iphone_uncalibrated, json_export, json_export_of_a_watch, zip_in_a_zip,
         phyphox_with_and_without_g, phyphox_one_table, androsensor_other_units,
         androsensor_garbled, androsensor_lost_symbols, senslogs_first_version,
         two_clocks_and_no_header, senslogs_ios, ios_logger, ios_logger_with_poses,
