@@ -19,9 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import magnetometer, rotations, trajectory
+from stario.sequences.readers.checked import trajectory
 from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
-from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _log = logging.getLogger(__name__)
@@ -56,12 +55,9 @@ def read_ridi(path: Path) -> ImuSequence:
     if file.name in _PICKLES:
         fix = "write the table to data.csv next to it with pandas' to_csv"
         raise ReadError(file, "file", "a pickle, which may run code", "processed/data.csv", fix)
-    columns = NamedColumns(file, _COLUMNS, optional=("magnet",))
-    stamps = columns.table.stamps_ns(columns.file_column("time"))
-    time, accel = seconds(stamps, stamps[0]), columns.stack("acce")
-    first = columns.table.first_row
-    pose = rotations(file, "ori", columns.stack("ori", "wxyz"), first_row=first)
-    game_rv = rotations(file, "rv", columns.stack("rv", "wxyz"), first_row=first)
+    columns = NamedColumns(file, _COLUMNS, magnetic=("magnet",))
+    time, accel = columns.seconds("time"), columns.stack("acce")
+    pose, game_rv = columns.rotations("ori"), columns.rotations("rv")
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv
     if y_is_up(file, attitude_WB, accel):
         attitude_WB = UPRIGHT * attitude_WB
@@ -71,7 +67,7 @@ def read_ridi(path: Path) -> ImuSequence:
         gyro=columns.stack("gyro"),
         accel=accel,
         truth=trajectory(time, columns.stack("pos"), attitude_WB),
-        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
+        magnetometer=columns.magnetometer(time),
     )
 
 
