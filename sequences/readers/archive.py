@@ -95,13 +95,13 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
     wanted = where or {}
     with _opened(path) as file:
         known = {
-            name: {key: _plain(value) for key, value in group.attrs.items()} if wanted else {}
+            name: {"name": name, **(_attributes(group) if wanted else {})}
             for name, group in file.items()
             if "imu/t" in group
         }
-    chosen = [name for name, attributes in known.items() if matches(name, attributes, wanted)]
+    chosen = [name for name, attributes in known.items() if _matches(attributes, wanted)]
     if known and not chosen:
-        raise _none_chosen(path, known, wanted)
+        raise _none_chosen(path, list(known.values()), wanted)
     return [Path(f"{path}:{name}") for name in chosen]
 
 
@@ -111,35 +111,34 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
     if name is None:
         return {}
     with _opened(file_path) as file:
-        return {key: _plain(value) for key, value in file[name].attrs.items()}
+        return _attributes(file[name])
 
 
-def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
-    """Return whether a recording's attributes, including its `name`, match the filter."""
-    values = {"name": name, **attributes}
+def _attributes(group: Any) -> dict[str, str | float]:
+    return {key: _plain(value) for key, value in group.attrs.items()}
+
+
+def _matches(attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
     return all(
-        any(fnmatchcase(_text(values.get(key, "")), pattern) for pattern in patterns)
+        any(fnmatchcase(_text(attributes.get(key, "")), pattern) for pattern in patterns)
         for key, patterns in where.items()
     )
 
 
 def _none_chosen(
-    path: Path, known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter
+    path: Path, known: list[dict[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    wanted = ", ".join(
-        f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns
+    wanted = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+    none_match = (
+        key
+        for key, patterns in where.items()
+        if not any(_matches(attributes, {key: patterns}) for attributes in known)
     )
-    key = next(
-        (k for k, patterns in where.items() if not _any(known, {k: patterns})), next(iter(where))
-    )
-    values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
+    key = next(none_match, next(iter(where)))
+    values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
     listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
     return ReadError(path, f"recordings with {wanted}", "none", expected)
-
-
-def _any(known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter) -> bool:
-    return any(matches(name, attributes, where) for name, attributes in known.items())
 
 
 def _text(value: str | float) -> str:

@@ -100,7 +100,11 @@ def read_generic_csv(path: Path) -> ImuSequence:
         truth=truth,
         positions=positions,
         magnetometer=field,
-        converted=frozenset(["gyro"] * gyro_converted + ["accel"] * accel_converted),
+        converted=frozenset(
+            sensor
+            for sensor, done in (("gyro", gyro_converted), ("accel", accel_converted))
+            if done
+        ),
     )
 
 
@@ -281,9 +285,7 @@ def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionT
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
         k = int(np.argmax(bad))
-        where, fix = (
-            f"line {rows.line_numbers[kept[k]]}, qx qy qz qw",
-            "leave the row's truth blank",
-        )
+        where = f"line {rows.line_numbers[kept[k]]}, qx qy qz qw"
+        fix = "leave the row's truth blank"
         raise ReadError(path, where, f"norm {norm[k]:.4g}", "a unit quaternion", fix)
     return Trajectory(time, values[:, :3], Rotation.from_quat(values[:, 3:])), None

@@ -126,7 +126,7 @@ class Table:
     frame: Any = None
 
     def numbers(self, column: int) -> NDArray[Any] | None:
-        """Return a column of the file, as integers if all of it is written so, if pandas read it."""
+        """Return a column of the file, integers if all are written so; None without pandas."""
         known = self.frame is not None and column in self.frame
         return self.frame[column].to_numpy() if known else None
 
