@@ -92,10 +92,7 @@ def cached(
 ) -> Sequence[Stream]:
     """Return the cached streams of a key, or else build them and add them to the cache.
 
-    Args:
-        key: plain values that determine the result, except for this package's code.
-        build: function that makes the streams.
-        folder: cache folder.
+    The key has plain values that determine the result, except for this package's code.
     """
     file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
     streams = _opened(file)
@@ -106,11 +103,9 @@ def cached(
 
 
 def recording_key(path: Path, options: Mapping[str, object]) -> str:
-    """Return a digest of a recording's path, files and options and of this package's code.
+    """Return a digest of a recording's path and files, the options and this package's code.
 
-    Args:
-        path: path of a recording that exists.
-        options: everything that the result depends on besides the files and this package's code.
+    The options are everything else that the result depends on.
     """
     stamps = [
         (str(file), stat.st_size, stat.st_mtime_ns)

@@ -46,19 +46,14 @@ def read_lines(path: Path) -> list[str]:
 
 
 def first_line(path: Path, comments: bool = False) -> str | None:
-    """Return the first non-blank line of a text file, or None if it has none or is not text.
-
-    Args:
-        path: the file.
-        comments: whether to include lines that start with `#`.
-    """
+    """Return the first line as in `first_lines`, None if there is none."""
     return next(iter(first_lines(path, 1, comments)), None)
 
 
 def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
-    """Return up to `count` lines selected as in `first_line`, reading little of the file.
+    """Return up to `count` lines of a text file that are neither blank nor (by default) comments.
 
-    Never raises: used to recognise formats.
+    Reads little of the file, and never raises: used to recognise formats.
     """
     return [x for x in head_lines(path) if is_row(x) or (comments and x.strip())][:count]
 

@@ -1,4 +1,4 @@
-"""The sensor and the recording that each file of a folder belongs to, determined by its name.
+"""The sensor and the recording that each file of a folder belongs to, and the app that wrote them.
 
 A file belongs to the one sensor that its name contains (`Gyroscope.csv`, `acce.txt`,
 `Eight_gyr.csv`). The rest of the name identifies the recording, so files of two recordings in one
@@ -19,10 +19,31 @@ from stario.sequences.readers.phones.sensor_words import (
     sensor_of,
     words_of,
 )
+from stario.sequences.readers.text import head_lines
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
 """Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
+
+
+_BY_HEADER = {
+    "seconds_elapsed": "Sensor Logger",
+    "Time since start in ms": "AndroSensor",
+    '"Time (s)"': "phyphox",
+    "loggingTime(txt)": "SensorLog",
+    "gFx": "Physics Toolbox",
+}
+"""Text in the headers of an app's files."""
+
+_BY_FILE = {
+    "record.properties": "SensLogs on Android",
+    "description.txt": "SensLogs on iOS",
+    "arposes.txt": "iOS Logger",
+    "motmagnfull.txt": "iOS Logger",
+    "acce_uncalib.txt": "RoNIN-style logger",
+    "game_rv.txt": "RoNIN-style logger",
+}
+"""Files that an app writes alongside its sensor files."""
 
 
 @dataclass
@@ -109,3 +130,18 @@ def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
                 return PhoneFiles("")
             merged.tables[sensor] = tables
     return merged
+
+
+def app_of(files: PhoneFiles) -> str:
+    """Return the name of the app that wrote the files, or else the kind of logger; for display."""
+    header = "\n".join(head_lines(files.gyro)[:8])
+    for words, app in _BY_HEADER.items():
+        if words in header:
+            return app
+    names = {file.name.lower() for file in files.gyro.parent.iterdir()}
+    for name, app in _BY_FILE.items():
+        if name in names:
+            return app
+    accel = files.first("accel") or files.first("linear")
+    one = accel is not None and accel.file == files.gyro
+    return "logger with all sensors in one file" if one else "logger with one file per sensor"

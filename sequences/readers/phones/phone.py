@@ -30,11 +30,11 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.generic_csv import is_generic_csv
-from stario.sequences.readers.phones.apps import app_of
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import (
     SUFFIXES,
     PhoneFiles,
+    app_of,
     is_complete,
     phone_recordings,
 )

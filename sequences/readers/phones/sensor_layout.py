@@ -65,9 +65,7 @@ class Layout:
 def by_header(titles: list[str], head: FloatArray) -> Layout | None:
     """Return the layout that titles describe; None if they name no clock or no sensor.
 
-    Args:
-        titles: the header's cells.
-        head: (N, K) first rows; NaN where a cell is not a number.
+    `head` has the first rows (N, K), NaN where a cell is not a number.
     """
     groups: dict[tuple[str, ...], dict[str, ColumnRef]] = {}
     quaternion: dict[str, ColumnRef] = {}

@@ -88,12 +88,9 @@ def sensor_table(file: Path) -> SensorTable | None:
 
 
 def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
-    """Read a sensor's samples, in rad/s, m/s^2 or uT if the file names a unit.
+    """Read a sensor's samples in the columns `table.axes[axes]`.
 
-    Args:
-        table: the file's layout.
-        sensor: the sensor, a key of `UNITS`.
-        axes: the key of its columns in `table.axes`.
+    They are in rad/s, m/s^2 or uT if the file names a unit.
 
     Raises:
         ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
@@ -155,11 +152,9 @@ _MARK_ROWS = 5
 def first_row(
     numbered: list[tuple[int, str]], least: int = 4
 ) -> tuple[int, str | None, str] | None:
-    """Return the index of the first row of numbers, its delimiter and its decimal mark.
+    """Return the index of the first row of `least` numbers, its delimiter and its decimal mark.
 
-    Args:
-        numbered: a file's lines with their numbers, without blank lines.
-        least: minimum count of numbers in a row.
+    The lines have their numbers in the file; there are no blank ones among them.
     """
     for k, (_, line) in enumerate(numbered):
         if line.lstrip().startswith("#"):

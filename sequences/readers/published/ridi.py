@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import trajectory
-from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
+from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _log = logging.getLogger(__name__)
@@ -89,12 +89,9 @@ def data_file(path: Path) -> Path | None:
 
 
 def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
-    """Return whether the world of an attitude has y up instead of z, from the mean specific force.
+    """Return whether an attitude's world has y up instead of z, by the mean specific force (N, 3).
 
-    Args:
-        path: the file, for the warning.
-        attitude_WB: N rotations.
-        accel: (N, 3) specific force [m/s^2].
+    A warning names the file if neither axis is near the force.
     """
     up = attitude_WB.apply(accel).mean(axis=0)
     cosines = up / max(float(np.linalg.norm(up)), 1e-9)

@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import trajectory
-from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
+from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
 from stario.sequences.sequence import ImuSequence
 
 _FILE = "SenseINS.csv"

@@ -31,7 +31,7 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
-from stario.sequences.readers.published.json_fields import JsonFields
+from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import FloatArray, ImuSequence
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import interpolated
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, rotations, trajectory
-from stario.sequences.readers.published.json_fields import JsonFields, as_array
+from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -208,12 +208,12 @@ def _imu_pose(
 
 def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
     """Return R_DI and p_DI [m], identity if missing, from [w, [x, y, z]] or [w, x, y, z]."""
-    quat = calibration.get("T_Device_Imu.UnitQuaternion")
+    name = "T_Device_Imu.UnitQuaternion"
+    quat = calibration.get(name)
     if quat is None:
         return Rotation.identity(), np.zeros(3)
     nested = isinstance(quat, list) and len(quat) == 2 and isinstance(quat[1], list)
     flat = [quat[0], *quat[1]] if nested else quat
-    name = "T_Device_Imu.UnitQuaternion"
-    quat_wxyz = as_array(calibration.path, name, flat, 4)[None]
+    quat_wxyz = calibration.as_array(name, flat, 4)[None]
     R_DI = rotations(calibration.path, name, quat_wxyz, first_row=0)[0]
     return R_DI, calibration.array("T_Device_Imu.Translation", 3)
