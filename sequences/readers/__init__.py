@@ -240,9 +240,10 @@ def _listed(
         try:
             if isinstance(entry, ReadError):
                 raise entry
-            if not _is_recording(entry.path) and is_list(entry.path):
-                raise ReadError(path, "list", f"another list, {entry.path.name}", "recordings")
-            found += find_recordings(entry.path, where=entry.where)
+            inside, of_entry = entry
+            if not _is_recording(inside) and is_list(inside):
+                raise ReadError(path, "list", f"another list, {inside.name}", "recordings")
+            found += find_recordings(inside, where=of_entry)
         except ReadError as error:
             if on_error is None:
                 raise

@@ -107,11 +107,8 @@ def with_pose(
     candidates = [
         candidate for file in files for candidate in pose_rows(file) if candidate.order in orders
     ]
-    fits = [
-        (candidate, fit)
-        for candidate in candidates
-        if (fit := _fitted(sequence, start_ns, candidate)) is not None
-    ]
+    fitted = (_fitted(sequence, start_ns, candidate) for candidate in candidates)
+    fits = [fit for fit in fitted if fit is not None]
     if not fits:
         if candidates:
             names = ", ".join(dict.fromkeys(candidate.file.name for candidate in candidates))
@@ -120,13 +117,11 @@ def with_pose(
             names = ", ".join(file.name for file in files)
             _log.warning("%s: no row in %s holds a pose", sequence.name, names)
         return sequence
-    best = max(fit.aligned.correlation for _, fit in fits)
-    near = [
-        (candidate, fit) for candidate, fit in fits if fit.aligned.correlation > best - _TIE_MARGIN
-    ]
-    candidate, fit = min(near, key=lambda item: item[1].turn)
-    _log_choice(sequence, fits, candidate, fit)
-    return _posed(sequence, candidate, fit)
+    best = max(fit.aligned.correlation for fit in fits)
+    near = [fit for fit in fits if fit.aligned.correlation > best - _TIE_MARGIN]
+    chosen = min(near, key=lambda fit: fit.turn)
+    _log_choice(sequence, fits, chosen)
+    return _posed(sequence, chosen)
 
 
 def pose_rows(file: Path) -> list[PoseCandidate]:
@@ -170,6 +165,7 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
 class _Fit:
     """Fit of poses to the IMU: times on the IMU's clock, their rows, alignment and mount R_PB."""
 
+    candidate: PoseCandidate
     time: FloatArray
     rows: IntArray
     aligned: BodyAlignment
@@ -192,9 +188,8 @@ def _fitted(
     attitude = candidate.attitude[rows]
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
-        overlap = pose_time[0] < time[-1] and pose_time[-1] > time[0]
         aligned = None
-        if overlap:
+        if pose_time[0] < time[-1] and pose_time[-1] > time[0]:
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
         if (
             aligned is None
@@ -208,7 +203,7 @@ def _fitted(
     if aligned.correlation < _MIN_CORRELATION:
         return None
     mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
-    return _Fit(pose_time, rows, aligned, mount)
+    return _Fit(candidate, pose_time, rows, aligned, mount)
 
 
 def _squared(mount: Rotation) -> Rotation:
@@ -218,26 +213,23 @@ def _squared(mount: Rotation) -> Rotation:
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
 
 
-def _log_choice(
-    sequence: ImuSequence,
-    fits: list[tuple[PoseCandidate, _Fit]],
-    candidate: PoseCandidate,
-    fit: _Fit,
-) -> None:
+def _log_choice(sequence: ImuSequence, fits: list[_Fit], chosen: _Fit) -> None:
+    name = chosen.candidate.file.name
     _log.info(
         "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
-        sequence.name, candidate.file.name, candidate.order, np.degrees(fit.turn),
-        fit.aligned.correlation,
+        sequence.name, name, chosen.candidate.order, np.degrees(chosen.turn),
+        chosen.aligned.correlation,
     )  # fmt: skip
-    for other, other_fit in fits:
-        if other.file != candidate.file and other_fit.turn > _SAME_AXES_RAD:
+    for other in fits:
+        if other.candidate.file != chosen.candidate.file and other.turn > _SAME_AXES_RAD:
             _log.warning(
                 "%s: the ground truth is %s; %s is rotated %.0f degrees from the IMU's axes",
-                sequence.name, candidate.file.name, other.file.name, np.degrees(other_fit.turn),
+                sequence.name, name, other.candidate.file.name, np.degrees(other.turn),
             )  # fmt: skip
 
 
-def _posed(sequence: ImuSequence, candidate: PoseCandidate, fit: _Fit) -> ImuSequence:
+def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
+    candidate = fit.candidate
     aligned = fit.aligned
     attitude_PB = candidate.attitude[fit.rows] * fit.mount
     time = fit.time + aligned.lag
