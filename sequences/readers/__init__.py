@@ -15,7 +15,6 @@ from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,
     is_archive,
-    is_archive_member,
     read_archive,
     split_name,
 )
@@ -51,7 +50,8 @@ class Format:
     Attributes:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
-        read: function that reads the recording or raises ReadError.
+        read: function that reads the recording; it raises ReadError if a file is missing or
+            malformed, InputError if a package is not installed.
         words: name shown to users if the reader does not set a more specific one.
         options: names of further arguments of `read`, all of them strings.
     """
@@ -197,7 +197,7 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
         return found
     chosen: list[Path] = []
     errors: list[ReadError] = []
-    for file in dict.fromkeys(split_name(path)[0] for path in found if is_archive_member(path)):
+    for file in dict.fromkeys(file for file, name in map(split_name, found) if name):
         try:
             matching = set(archive_members(file, where))
             chosen += [path for path in found if path in matching]

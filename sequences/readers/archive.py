@@ -57,12 +57,6 @@ def split_name(path: Path) -> tuple[Path, str | None]:
     return path, None
 
 
-def is_archive_member(path: Path) -> bool:
-    """Return whether a path names a recording in an archive."""
-    file, name = split_name(path)
-    return name is not None and is_archive(file)
-
-
 def is_archive(path: Path) -> bool:
     """Return whether a file is an archive: HDF5 whose first group holds IMU samples or a track.
 

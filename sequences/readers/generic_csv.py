@@ -72,11 +72,7 @@ _HEAD_LINES = 200
 
 
 def read_generic_csv(path: Path) -> ImuSequence:
-    """Read a generic CSV in the format that the module's docstring describes.
-
-    Raises:
-        ReadError: header, unit, row or number is invalid; the error names line and column.
-    """
+    """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
     if _ends_within_a_row(path, lines, header):

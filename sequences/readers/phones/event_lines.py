@@ -51,11 +51,7 @@ Events = tuple[dict[str, Rows], tuple[IntArray, Rotation] | None, Rows | None]
 
 
 def read_event_lines(path: Path) -> ImuSequence:
-    """Read a trace or a log file.
-
-    Raises:
-        ReadError: a sensor is missing, a line is malformed, or the sensors do not overlap.
-    """
+    """Read a trace or a log file."""
     trace = any(_TRACE.match(line) for line in head_lines(path))
     sensors, attitude, points = _trace(path) if trace else _logfile(path)
     for name in ("gyro", "accel"):

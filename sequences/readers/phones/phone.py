@@ -68,12 +68,7 @@ _GRAVITY_REMOVED = 5.0
 
 
 def read_phone(path: Path) -> ImuSequence:
-    """Read a logger's folder, or the recording of one gyroscope file in a folder with several.
-
-    Raises:
-        ReadError: a file is missing or malformed, the folder holds more than one recording, or the
-            two sensors do not overlap in time.
-    """
+    """Read a logger's folder, or the recording of one gyroscope file in a folder with several."""
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
     name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
@@ -81,11 +76,7 @@ def read_phone(path: Path) -> ImuSequence:
 
 
 def read_wide(path: Path) -> ImuSequence:
-    """Read one file that holds all sensors in separate columns.
-
-    Raises:
-        ReadError: the file is malformed.
-    """
+    """Read one file that holds all sensors in separate columns."""
     files = _wide(path)
     if files is None:
         lines = head_lines(path)[:1]

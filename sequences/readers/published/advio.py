@@ -20,11 +20,7 @@ _POSES = ("ground-truth/pose.csv", "iphone/arkit.csv")
 
 
 def read_advio(path: Path) -> ImuSequence:
-    """Read a recording from its folder.
-
-    Raises:
-        ReadError: a file is missing or malformed.
-    """
+    """Read a recording from its folder."""
     files = _files(path)
     if files is None:
         raise ReadError(path, _PHONE, "no gyro.csv and accelerometer.csv", "an ADVIO recording")

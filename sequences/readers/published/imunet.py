@@ -32,11 +32,7 @@ _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 
 def read_imunet(path: Path) -> ImuSequence:
-    """Read a recording from its folder, processed or raw.
-
-    Raises:
-        ReadError: a file is missing or malformed.
-    """
+    """Read a recording from its folder, processed or raw."""
     if is_ridi(path):
         return read_ridi(path)
     folder = path if path.is_dir() else path.parent

@@ -44,11 +44,7 @@ _MAX_TILT_RAD = np.deg2rad(20.0)
 
 
 def read_ridi(path: Path) -> ImuSequence:
-    """Read a recording from its folder, its `processed` folder or its `data.csv`.
-
-    Raises:
-        ReadError: the file is missing or malformed, or there is a pickle instead.
-    """
+    """Read a recording from its folder, its `processed` folder or its `data.csv`."""
     file = data_file(path)
     if file is None:
         raise ReadError(path, "processed/data.csv", "no such file", "a RIDI or IMUNet recording")

@@ -36,11 +36,7 @@ _OWN = ("gt_q_w", "gt_p_x", "vio_q_w", "vio_p_x")
 
 
 def read_rnin(path: Path) -> ImuSequence:
-    """Read a recording from its folder or its `SenseINS.csv`.
-
-    Raises:
-        ReadError: the file is missing or malformed.
-    """
+    """Read a recording from its folder or its `SenseINS.csv`."""
     file = path / _FILE if path.is_dir() else path
     if not file.is_file():
         raise ReadError(file, "file", "no such file", f"a recording's {_FILE}")

@@ -45,11 +45,7 @@ _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
 
 def read_tlio(path: Path) -> ImuSequence:
-    """Read a recording from its folder (resampled if both exist) or from one of its files.
-
-    Raises:
-        ReadError: a file is missing or malformed, or holds pickled objects.
-    """
+    """Read a recording from its folder (resampled if both exist) or from one of its files."""
     file = _file(path)
     if file is None:
         raise ReadError(path, _RESAMPLED, "no such file", "a TLIO recording")
