@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from stario.sequences.lazy import lazy_attributes
+from stario.sequences.lazy import lazy_imports
 
 if TYPE_CHECKING:
     from stario.fusion.config import FilterConfig as FilterConfig
@@ -36,38 +36,4 @@ if TYPE_CHECKING:
     from stario.fusion.state import SmoothedPose as SmoothedPose
     from stario.fusion.state import Track as Track
 
-_MODULES = {
-    "Comparison": "evaluation.compare",
-    "ContinuousPose": "continuous",
-    "FilterConfig": "config",
-    "Fix": "fixes",
-    "GraphConfig": "config",
-    "Health": "state",
-    "Innovations": "state",
-    "LiveServer": "live.run",
-    "NavState": "state",
-    "Navigator": "navigator",
-    "NavigatorConfig": "config",
-    "Predictor": "imu.stateful",
-    "PreprocessedRecording": "recording",
-    "PriorPose": "filter.initial",
-    "Scores": "evaluation.summary",
-    "SmoothedPose": "state",
-    "StateCloningEkf": "filter.ekf",
-    "Track": "state",
-    "compare": "evaluation.compare",
-    "compare_recordings": "evaluation.many",
-    "demonstration": "evaluation.compare",
-    "inertial_track": "evaluation.tracks",
-    "network_track": "evaluation.tracks",
-    "position_fix": "fixes",
-    "read_config": "config",
-    "read_fixes": "fix_file",
-    "scores_of": "evaluation.summary",
-    "summary_table": "evaluation.summary",
-    "velocity_fix": "fixes",
-    "yaw_fix": "fixes",
-}
-
-__all__ = [*_MODULES]
-__getattr__ = lazy_attributes("stario.fusion", _MODULES)
+__all__, __getattr__ = lazy_imports(__name__)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from stario.sequences.lazy import lazy_attributes
+from stario.sequences.lazy import lazy_imports
 
 if TYPE_CHECKING:
     from stario.network.card import Calibration as Calibration
@@ -13,15 +13,4 @@ if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig as TrainingConfig
     from stario.network.training.train import train as train
 
-_MODULES = {
-    "Augmentation": "training.augment",
-    "Calibration": "card",
-    "Card": "card",
-    "DisplacementModel": "model",
-    "TrainingConfig": "training.config",
-    "load_model": "model",
-    "train": "training.train",
-}
-
-__all__ = [*_MODULES]
-__getattr__ = lazy_attributes("stario.network", _MODULES)
+__all__, __getattr__ = lazy_imports(__name__)

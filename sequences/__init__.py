@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from stario.sequences.lazy import lazy_attributes
+from stario.sequences.lazy import lazy_imports
 
 if TYPE_CHECKING:
     from stario.sequences.accuracy.metrics import align as align
@@ -45,47 +45,4 @@ if TYPE_CHECKING:
     from stario.sequences.units import with_units as with_units
     from stario.sequences.windows import world_streams as world_streams
 
-_MODULES = {
-    "ConfigError": "errors",
-    "DeviceAttitude": "sequence",
-    "GOOD_IMU": "simulation.imu",
-    "INDOOR_FIELD": "simulation.magnetometer",
-    "ImuErrors": "simulation.imu",
-    "ImuNoise": "noise",
-    "ImuSequence": "sequence",
-    "InputError": "errors",
-    "LegStream": "legs",
-    "MagneticField": "simulation.magnetometer",
-    "Magnetometer": "sequence",
-    "PERFECT_IMU": "simulation.imu",
-    "PHONE_IMU": "simulation.imu",
-    "PositionTrack": "sequence",
-    "ReadError": "errors",
-    "STANDARD_GRAVITY": "sequence",
-    "Skipped": "datasets.batch",
-    "StarioError": "errors",
-    "Trajectory": "sequence",
-    "WalkStyle": "simulation.walks",
-    "WeightsError": "errors",
-    "about_z": "attitude.rotations",
-    "align": "accuracy.metrics",
-    "check_units": "inspection.checks",
-    "evaluate_track": "accuracy.metrics",
-    "find_recordings": "readers",
-    "generate_walk": "simulation.walks",
-    "inspect_recording": "inspection.report",
-    "leg_streams": "legs",
-    "position_nees": "accuracy.nees",
-    "read_recording": "readers",
-    "read_tum": "files",
-    "simulate_imu": "simulation.imu",
-    "with_conventions": "conventions",
-    "with_units": "units",
-    "world_streams": "windows",
-    "write_csv": "readers.csv_writer",
-    "write_tum": "files",
-    "yaw_of": "attitude.rotations",
-}
-
-__all__ = [*_MODULES]
-__getattr__ = lazy_attributes("stario.sequences", _MODULES)
+__all__, __getattr__ = lazy_imports(__name__)

@@ -6,20 +6,34 @@ reader should not wait for them.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 
-def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a module's `__getattr__` (PEP 562) that imports names from the given modules."""
+def lazy_imports(package: str) -> tuple[list[str], Callable[[str], Any]]:
+    """Return the `__all__` and the `__getattr__` (PEP 562) of the package that calls this.
+
+    The names are those that its `__init__.py` imports below `if TYPE_CHECKING:`.
+    """
+    this: Any = sys.modules[package]
+    tree = ast.parse(this.__spec__.loader.get_source(package))
+    modules = {
+        alias.name: line.module
+        for block in tree.body
+        if isinstance(block, ast.If)
+        for line in block.body
+        if isinstance(line, ast.ImportFrom) and line.module
+        for alias in line.names
+    }
 
     def attribute(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
-        setattr(sys.modules[package], name, value)
+        value = getattr(importlib.import_module(modules[name]), name)
+        setattr(this, name, value)
         return value
 
-    return attribute
+    return sorted(modules), attribute
