@@ -11,15 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import assert_same_samples
+from phone_files import ZYX, field, gravity, ns, save, zyx
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-FIELD_W = np.array([18.0, 5.0, -43.0])
-ZYX = "time,seconds_elapsed,z,y,x"
 METADATA = (
     "version,device name,recording epoch time,recording time,recording timezone,platform,"
     "appVersion,device id,sensors,sampleRateMs,standardisation,platform version\n"
@@ -33,44 +30,9 @@ ANDROSENSOR = [
 ]
 
 
-@pytest.fixture(scope="module")
-def walk() -> ImuSequence:
-    style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
-    return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)
-
-
 def quaternion(walk: ImuSequence) -> FloatArray:
     assert walk.truth is not None
     return walk.truth.quat_xyzw
-
-
-def in_body(walk: ImuSequence, vector_W: FloatArray | list[float]) -> FloatArray:
-    assert walk.truth is not None
-    return np.asarray(walk.truth.attitude_WB.apply(vector_W, inverse=True))
-
-
-def field(walk: ImuSequence) -> FloatArray:
-    return in_body(walk, FIELD_W)
-
-
-def gravity(walk: ImuSequence) -> FloatArray:
-    return in_body(walk, [0.0, 0.0, STANDARD_GRAVITY])
-
-
-def ns(walk: ImuSequence) -> list[int]:
-    return [1_718_030_736_872_695_300 + round(t * 1e9) for t in walk.time.tolist()]
-
-
-def save(path: Path, header: str, *columns: object, sep: str = ",") -> None:
-    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
-    rows = [sep.join(str(x) for part in row for x in part) for row in zip(*parts, strict=True)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
-
-
-def zyx(folder: Path, walk: ImuSequence, **sensors: FloatArray) -> None:
-    for name, values in sensors.items():
-        save(folder / f"{name}.csv", ZYX, ns(walk), walk.time, values[:, ::-1])
 
 
 def android(folder: Path, walk: ImuSequence) -> None:
