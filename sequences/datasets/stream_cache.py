@@ -64,7 +64,7 @@ def recorded(
     folder: Path,
     jobs: int | None = None,
     attitude: Attitude = "levelled",
-) -> Iterator[list[Stream] | Skipped]:
+) -> Iterator[Sequence[Stream] | Skipped]:
     """Yield each recording's streams: from the cache, or read, checked and added to it.
 
     Args:
@@ -94,12 +94,8 @@ def cached(
 
     The key has plain values that determine the result, except for this package's code.
     """
-    file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
-    streams = _opened(file)
-    if streams is not None:
-        return streams
-    built = build()
-    return (_opened(file) if _written(file, built) else None) or built
+    kept = _kept(folder / (_digest({**key, "code": _code()}) + _SUFFIX), build)
+    return (_opened(kept) or build()) if isinstance(kept, Path) else kept
 
 
 def recording_key(path: Path, options: Mapping[str, object]) -> str:
@@ -148,14 +144,19 @@ def _stored(
     options: Mapping[str, object],
     folder: Path,
     attitude: Attitude,
-) -> Path | list[Stream]:
+) -> Path | Sequence[Stream]:
     """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
     file = folder / (recording_key(path, {**options, "attitude": attitude}) + _SUFFIX)
+    return _kept(file, lambda: _streams(read(path), attitude))
+
+
+def _kept(file: Path, build: Callable[[], Sequence[Stream]]) -> Path | Sequence[Stream]:
+    """Return a cache file, written if it is missing, or the streams if that fails."""
     if _opened(file) is not None:
         return file
-    streams = _streams(read(path), attitude)
+    streams = build()
     return file if _written(file, streams) else streams
 
 

@@ -16,7 +16,8 @@ from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.phones.sensor_layout import ColumnRef, Layout, by_header, by_rows
+from stario.sequences.readers.columns import Column
+from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
@@ -95,7 +96,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     Raises:
         ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
     """
-    places, clock = table.axes[axes], table.clock_of(axes)
+    places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     rows = _rows(table, [clock, *places, *table.biases])
     kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
@@ -115,7 +116,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     return Samples(stamps, values[kept], unit)
 
 
-def _rows(table: SensorTable, used: Sequence[ColumnRef]) -> Table:
+def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
     """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
     columns = max(indices) + 1
