@@ -121,9 +121,8 @@ class Table:
     frame: Any = None
 
     def numbers(self, column: int) -> NDArray[Any] | None:
-        """Return a column of the file, integers if all are written so; None without pandas."""
-        known = self.frame is not None and column in self.frame
-        return self.frame[column].to_numpy() if known else None
+        """Return a column that was read, integers if all are written so; None without pandas."""
+        return None if self.frame is None else self.frame[column].to_numpy()
 
     def stamps_ns(
         self, column: int = 0, per_second: int = 10**9, rows: IntArray | None = None

@@ -133,8 +133,6 @@ def _grows(column: FloatArray) -> bool:
 
 def by_rows(head: FloatArray) -> Layout | None:
     """Return the layout of rows (N, K) without titles: time is first or fourth, and grows."""
-    if len(head) < 2:
-        return None
     width = head.shape[1]
     for time, start in ((0, 1), (3, 0)):
         if time >= width or not (np.diff(head[:, time]) >= 0).all():

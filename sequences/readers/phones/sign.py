@@ -44,7 +44,7 @@ def accel_sign(
     files: PhoneFiles,
     accel: Samples,
     attitude: tuple[IntArray, Rotation] | None,
-    gravity_in_own_file: bool = False,
+    gravity_in_own_file: bool,
 ) -> float:
     """Return 1.0, or -1.0 if the accelerometer has Apple's sign.
 

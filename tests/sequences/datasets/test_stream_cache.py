@@ -257,3 +257,14 @@ def test_the_cache_folder_is_set_by_environment_variables(
     assert cache_folder() == tmp_path / "stario"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == Path.home() / ".cache" / "stario"
+
+
+def test_readers_levelling_windows_and_simulation_are_part_of_the_key() -> None:
+    names = {"/".join(file.parts[-2:]) for file in stream_cache.code_files()}
+    assert {
+        "sequences/windows.py",
+        "readers/generic_csv.py",
+        "attitude/levelling.py",
+        "simulation/imu.py",
+        "datasets/stream_cache.py",
+    } <= names
