@@ -42,7 +42,6 @@ _OPTIONAL = {
     "position_covariance_W": "truth/position_covariance",
 }
 
-
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
 """Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
@@ -154,10 +153,8 @@ def read_archive(path: Path) -> ImuSequence:
         if name is None and len(names) == 1:
             name = names[0]
         if name is None:
-            found = f"{len(names)} recordings"
-            raise ReadError(
-                file_path, "recording", found, "the name of one", f"use {path.name}:{names[0]}"
-            )
+            found, fix = f"{len(names)} recordings", f"use {path.name}:{names[0]}"
+            raise ReadError(file_path, "recording", found, "the name of one", fix)
         if name not in file:
             known = ", ".join(names[:3])
             raise ReadError(file_path, "recording", repr(name), f"a name in it, such as {known}")
@@ -165,11 +162,10 @@ def read_archive(path: Path) -> ImuSequence:
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    time = _column(path, group, "imu/t", finite=False)
     truth, positions = _truth(path, group)
     return ImuSequence(
         name=name,
-        time=time,
+        time=_column(path, group, "imu/t", finite=False),
         gyro=_column(path, group, "imu/gyro", finite=False),
         accel=_column(path, group, "imu/accel", finite=False),
         truth=truth,
@@ -177,7 +173,7 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         magnetometer=_magnetometer(path, group),
         positions=positions,
         device_attitude=_device_attitude(path, group),
-        attributes={key: _plain(value) for key, value in group.attrs.items()},
+        attributes=_attributes(group),
     )
 
 
@@ -210,7 +206,7 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
         return None, _positions(path, group, "positions", "truth/p")
     time = _column(path, group, "truth/t")
     keep = increasing_mask(time)
-    valid = _valid(path, group, "truth", time)[keep]
+    valid = _valid(group, "truth", time)[keep]
     quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
     # Invalid rows may hold anything, but each must become a rotation.
     usable = valid | np.isfinite(quat).all(axis=1)
@@ -231,10 +227,10 @@ def _positions(
     time = _column(path, group, f"{stem}/t")
     keep = increasing_mask(time)
     position_W = _column(path, group, field, finite=False)
-    return PositionTrack(time[keep], position_W[keep], kind, _valid(path, group, stem, time)[keep])
+    return PositionTrack(time[keep], position_W[keep], kind, _valid(group, stem, time)[keep])
 
 
-def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
+def _valid(group: Any, stem: str, time: FloatArray) -> BoolArray:
     field = f"{stem}/valid"
     if field not in group:
         return np.ones(len(time), dtype=np.bool_)

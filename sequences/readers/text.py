@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import logging
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -254,9 +253,7 @@ def _read_carefully(
             numbered.pop()
     rows = [line for _, line in numbered]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
+        values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
     except (ValueError, IndexError):
         values = np.array([_row(path, k, line, columns, delimiter, wanted) for k, line in numbered])
     return Table(

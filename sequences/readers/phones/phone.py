@@ -56,7 +56,6 @@ from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
-    FloatArray,
     ImuSequence,
     Magnetometer,
 )
@@ -72,7 +71,7 @@ def read_phone(path: Path) -> ImuSequence:
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
     name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
-    return assemble_recording(folder, name, files, pose_files(folder, files.key))
+    return assemble_recording(name, files, pose_files(folder, files.key))
 
 
 def read_wide(path: Path) -> ImuSequence:
@@ -83,7 +82,7 @@ def read_wide(path: Path) -> ImuSequence:
         found = repr(lines[0].strip()[:60]) if lines else "no lines"
         expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
-    return assemble_recording(path.parent, path.stem, files, _wide_poses(path, files))
+    return assemble_recording(path.stem, files, _wide_poses(path, files))
 
 
 def is_wide(path: Path) -> bool:
@@ -121,7 +120,6 @@ def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
 
 
 def assemble_recording(
-    folder: Path,
     name: str,
     files: PhoneFiles,
     poses: list[Path],
@@ -131,7 +129,6 @@ def assemble_recording(
     """Assemble the recording of a set of files.
 
     Args:
-        folder: folder of the files, for errors.
         name: name of the recording.
         files: files by sensor.
         poses: pose files alongside them.
@@ -141,9 +138,10 @@ def assemble_recording(
     Raises:
         ReadError: a file is malformed or the sensors do not overlap in time.
     """
+    folder = files.gyro.parent
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
-    accel, converted = _force(files, gyro, attitude, core_motion)
+    accel, converted = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
@@ -188,9 +186,8 @@ def _chosen(path: Path) -> PhoneFiles:
     if not chosen:
         names = ", ".join(sorted(p.name for p in folder.glob("*"))[:6]) or "nothing"
         expected = "a gyroscope file and an accelerometer file of one recording"
-        raise ReadError(
-            folder, "files", names, expected, "put each recording into a separate folder"
-        )
+        fix = "put each recording into a separate folder"
+        raise ReadError(folder, "files", names, expected, fix)
     return chosen[0]
 
 
@@ -203,10 +200,7 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 
 
 def _force(
-    files: PhoneFiles,
-    gyro: Samples,
-    attitude: tuple[IntArray, Rotation] | None,
-    core_motion: bool,
+    files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
 ) -> tuple[Samples, set[str]]:
     """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
@@ -256,5 +250,4 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if not inside.any():
         _log.warning("magnetometer skipped: none of its samples is within the recording")
         return None
-    time: FloatArray = seconds(samples.stamps_ns, start_ns)
-    return magnetometer(time, samples.values)
+    return magnetometer(seconds(samples.stamps_ns, start_ns), samples.values)

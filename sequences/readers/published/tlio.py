@@ -74,8 +74,8 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     checked(file, "array", table[:, :width], first_row=0)
     order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
     attitude_WB = rotations(file, quat_name, quat, order, first_row=0)
-    stamps_us = np.rint(table[:, places["ts_us"]][:, 0]).astype(np.int64)
-    time = (table[:, places["ts_us"]][:, 0] - table[0, places["ts_us"]]) * 1e-6
+    us = table[:, places["ts_us"].start]
+    time = (us - us[0]) * 1e-6
     gyro = table[:, places["gyr_compensated_rotated_in_World"]]
     accel = table[:, places["acc_compensated_rotated_in_World"]]
     if not _in_body_axes(time, gyro, attitude_WB):
@@ -88,7 +88,7 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
         accel=accel,
         truth=trajectory(time, table[:, places["pos_World_Device"]], attitude_WB, velocity_W),
     )
-    return stamps_us, sequence
+    return np.rint(us).astype(np.int64), sequence
 
 
 def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
