@@ -241,14 +241,13 @@ def _sweep(file: Path) -> None:
 def _opened(file: Path) -> list[Stream] | None:
     """Return memory-mapped streams, or None if the file is missing or incomplete."""
     try:
-        size = file.stat().st_size
-        with file.open("rb") as source:
-            length = int.from_bytes(source.read(8), "little")
-            header = json.loads(source.read(min(length, size)))
+        mapped = np.memmap(file, dtype=np.uint8, mode="r")  # once: each map keeps a file open
+        begin = 8 + int.from_bytes(mapped[:8].tobytes(), "little")
+        header = json.loads(mapped[8:begin].tobytes())
         metadata = json.loads(header.pop("__metadata__")["streams"])
-        if size != 8 + length + max(tensor["data_offsets"][1] for tensor in header.values()):
-            raise ValueError(f"{size} bytes")
-        whole = {name: _mapped(file, 8 + length, tensor) for name, tensor in header.items()}
+        if len(mapped) != begin + max(tensor["data_offsets"][1] for tensor in header.values()):
+            raise ValueError(f"{len(mapped)} bytes")
+        whole = {name: _array(mapped[begin:], tensor) for name, tensor in header.items()}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -268,7 +267,7 @@ def _opened(file: Path) -> list[Stream] | None:
     return streams
 
 
-def _mapped(file: Path, begin: int, tensor: Mapping[str, Any]) -> NDArray[Any]:
-    offset, shape = begin + tensor["data_offsets"][0], tuple(tensor["shape"])
+def _array(content: NDArray[np.uint8], tensor: Mapping[str, Any]) -> NDArray[Any]:
+    begin, stop = tensor["data_offsets"]
     dtype = {"F32": "<f4", "F64": "<f8"}[tensor["dtype"]]
-    return np.asarray(np.memmap(file, dtype=dtype, mode="r", offset=offset, shape=shape))
+    return np.asarray(content[begin:stop].view(dtype).reshape(tensor["shape"]))
