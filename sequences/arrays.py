@@ -23,6 +23,14 @@ def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatA
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
 
 
+def number_in(text: str) -> float:
+    """Return the number that a text holds, NaN if it holds anything else."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s], checked to be finite and strictly increasing.
 

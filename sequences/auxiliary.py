@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +13,24 @@ from stario.sequences.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
-class PositionTrack:
+class _Timed:
+    """Rows at increasing times."""
+
+    time: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def slice(self, start: float, stop: float) -> Self | None:
+        """Return the rows with start <= time <= stop [s], or None if there are none."""
+        keep = (self.time >= start) & (self.time <= stop)
+        if not keep.any():
+            return None
+        return replace(self, **{k: v[keep] for k, v in vars(self).items() if k != "kind"})
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTrack(_Timed):
     """Known positions without attitude: a position track, or waypoints that the user passed.
 
     Attributes:
@@ -26,7 +43,6 @@ class PositionTrack:
         InputError: lengths differ, time does not increase, or a valid value is not finite.
     """
 
-    time: FloatArray
     position_W: FloatArray
     kind: Literal["positions", "waypoints"]
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
@@ -43,19 +59,9 @@ class PositionTrack:
         for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
             object.__setattr__(self, name, value)
 
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def slice(self, start: float, stop: float) -> PositionTrack | None:
-        """Return the positions with start <= time <= stop [s], or None if there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        if not keep.any():
-            return None
-        return PositionTrack(self.time[keep], self.position_W[keep], self.kind, self.valid[keep])
-
 
 @dataclass(frozen=True, eq=False)
-class Magnetometer:
+class Magnetometer(_Timed):
     """Magnetic field measured alongside the IMU, at its own times.
 
     Attributes:
@@ -66,7 +72,6 @@ class Magnetometer:
         InputError: the shapes do not agree, time does not increase or a value is not finite.
     """
 
-    time: FloatArray
     field: FloatArray
 
     def __post_init__(self) -> None:
@@ -76,22 +81,14 @@ class Magnetometer:
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "field", field)
 
-    def __len__(self) -> int:
-        return len(self.time)
-
     @property
     def rate(self) -> float:
         """Median sampling rate [Hz]; 0 for a single sample."""
         return float(1.0 / np.median(np.diff(self.time))) if len(self) > 1 else 0.0
 
-    def slice(self, start: float, stop: float) -> Magnetometer | None:
-        """Return the samples with start <= time <= stop [s], or None if there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        return Magnetometer(self.time[keep], self.field[keep]) if keep.any() else None
-
 
 @dataclass(frozen=True, eq=False)
-class DeviceAttitude:
+class DeviceAttitude(_Timed):
     """Attitude estimated by the device's own sensor fusion, in its own world frame with z up.
 
     Attributes:
@@ -102,7 +99,6 @@ class DeviceAttitude:
         InputError: the lengths differ or time does not increase.
     """
 
-    time: FloatArray
     attitude_WB: Rotation
 
     def __post_init__(self) -> None:
@@ -111,11 +107,3 @@ class DeviceAttitude:
             found = f"{len(self.attitude_WB)} rotations"
             raise InputError("device attitude", found, f"{len(time)} as time")
         object.__setattr__(self, "time", time)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def slice(self, start: float, stop: float) -> DeviceAttitude | None:
-        """Return the attitudes with start <= time <= stop [s], or None if there are none."""
-        keep = (self.time >= start) & (self.time <= stop)
-        return DeviceAttitude(self.time[keep], self.attitude_WB[keep]) if keep.any() else None

@@ -129,12 +129,11 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
     Raises:
         InputError: there is no attitude, or none at the time of any sample.
     """
-    found = "removed"
+    field, expected = f"{sequence.name}: gravity", "an attitude to restore gravity with"
     fix = "record the raw accelerometer, or add the attitude: truth with px,py,pz,qx,qy,qz,qw"
-    expected = "an attitude to restore gravity with"
     truth = _attitude_of(sequence)
     if truth is None or truth.valid.sum() < 2:
-        raise InputError(f"{sequence.name}: gravity", f"{found} and no truth", expected, fix)
+        raise InputError(field, "removed and no truth", expected, fix)
     times, index = np.unique(sequence.time, return_inverse=True)
     finite = np.isfinite(times)
     pose = truth.at(times[finite])
@@ -142,9 +141,7 @@ def with_gravity(sequence: ImuSequence) -> ImuSequence:
     known[finite] = pose.valid
     kept = known[index]
     if not kept.any():
-        raise InputError(
-            f"{sequence.name}: gravity", f"{found} and no sample with an attitude", expected, fix
-        )
+        raise InputError(field, "removed and no sample with an attitude", expected, fix)
     if not kept.all():
         log.warning(
             "%s: %d of %d samples dropped: gravity cannot be restored without an attitude",

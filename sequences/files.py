@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import number_in
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -61,18 +62,11 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             there.
     """
     path = Path(path)
-    with _os_errors_translated(path):
-        if not path.parent.is_dir():
-            raise InputError("path", str(path), "a file in an existing folder", "create the folder")
+    with _temporary(path, "a file") as temporary:
         if path.is_dir():
             raise InputError("path", f"the folder {path}", "a file")
-        temporary = _temporary_path(path)
-        try:
-            yield temporary
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        yield temporary
+        temporary.replace(path)
 
 
 @contextmanager
@@ -90,33 +84,32 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
             system refuses to write there.
     """
     path = Path(path)
-    with _os_errors_translated(path):
-        if not path.parent.is_dir():
-            expected = "a folder in an existing folder"
-            raise InputError("path", str(path), expected, "create the folder")
+    with _temporary(path, "a folder") as temporary:
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
             raise InputError("path", f"{path}, which exists", "a new folder")
-        temporary = _temporary_path(path)
-        try:
-            temporary.mkdir()
-            yield temporary
-            if path.exists():
-                path.rmdir()
-            temporary.rename(path)
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
-
-
-def _temporary_path(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+        temporary.mkdir()
+        yield temporary
+        if path.exists():
+            path.rmdir()
+        temporary.rename(path)
 
 
 @contextmanager
-def _os_errors_translated(path: Path) -> Iterator[None]:
-    """Turn an `OSError` about a path into an `InputError` with a remedy."""
+def _temporary(path: Path, kind: str) -> Iterator[Path]:
+    """Yield a path next to `path`, removed after an exception; `OSError`s get a remedy."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        yield
+        if not path.parent.is_dir():
+            expected = f"{kind} in an existing folder"
+            raise InputError("path", str(path), expected, "create the folder")
+        try:
+            yield temporary
+        except BaseException:
+            if temporary.is_dir():
+                shutil.rmtree(temporary, ignore_errors=True)
+            else:
+                temporary.unlink(missing_ok=True)
+            raise
     except OSError as error:
         found = f"{path}: {error.strerror or error}"
         fix = "choose another folder, fix its permissions or free disk space"
@@ -214,21 +207,11 @@ def _tum_row(path: Path, number: int, line: str) -> list[float]:
     if len(words) != len(_TUM_FIELDS):
         expected = f"{len(_TUM_FIELDS)}: " + " ".join(_TUM_FIELDS)
         raise ReadError(path, f"line {number}", f"{len(words)} values", expected)
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        row = [math.nan]
-    if not all(map(math.isfinite, row)):
-        k = next(k for k, word in enumerate(words) if not _is_finite(word))
-        raise ReadError(path, f"line {number}, {_TUM_FIELDS[k]}", repr(words[k]), "a finite number")
+    row = [number_in(word) for word in words]
+    for name, word, value in zip(_TUM_FIELDS, words, row, strict=True):
+        if not math.isfinite(value):
+            raise ReadError(path, f"line {number}, {name}", repr(word), "a finite number")
     return row
-
-
-def _is_finite(word: str) -> bool:
-    try:
-        return math.isfinite(float(word))
-    except ValueError:
-        return False
 
 
 def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:

@@ -15,7 +15,7 @@ from stario.sequences.files import atomic_folder, atomic_write
 from stario.sequences.inspection.checks import MIN_SECONDS, check_units
 from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence
 
 log = logging.getLogger(__name__)
 
@@ -115,22 +115,20 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
     """
     if not np.isfinite(sequence.time).all():
         row = int(np.argmin(np.isfinite(sequence.time)))
-        raise InputError(
-            f"{sequence.name}: time of sample {row}",
-            str(sequence.time[row]),
-            "finite seconds: the EuRoC layout holds integer nanoseconds",
-            "convert to csv",
-        )
+        field, found = f"{sequence.name}: time of sample {row}", str(sequence.time[row])
+        expected = "finite seconds: the EuRoC layout holds integer nanoseconds"
+        raise InputError(field, found, expected, "convert to csv")
     truth = sequence.truth
-    valid = None if truth is None else truth.valid
-    times = [sequence.time] if truth is None else [sequence.time, truth.time[valid]]
+    times = [sequence.time] if truth is None else [sequence.time, truth.time[truth.valid]]
     first = min(float(part.min()) for part in times if len(part))
     tables = {
         "imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel])),
     }
     if truth is not None and truth.valid.any():
-        header = _POSE_HEADER + (_VELOCITY_HEADER if truth.velocity_W is not None else "")
-        poses = _poses(truth)[truth.valid]
+        header, columns = _POSE_HEADER, [truth.position_W, truth.quat_xyzw[:, [3, 0, 1, 2]]]
+        if truth.velocity_W is not None:
+            header, columns = header + _VELOCITY_HEADER, [*columns, truth.velocity_W]
+        poses = np.hstack(columns)[truth.valid]
         tables["state_groundtruth_estimate0"] = (header, truth.time[truth.valid], poses)
     with atomic_folder(path) as folder:
         for name, (header, time, values) in tables.items():
@@ -138,13 +136,6 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
             inner.mkdir(parents=True)
             _write_table(inner / "data.csv", header, _nanoseconds(time, first), values)
     return [path / "mav0" / name / "data.csv" for name in tables]
-
-
-def _poses(truth: Trajectory) -> FloatArray:
-    columns = [truth.position_W, truth.quat_xyzw[:, [3, 0, 1, 2]]]
-    if truth.velocity_W is not None:
-        columns.append(truth.velocity_W)
-    return np.hstack(columns)
 
 
 def _nanoseconds(time: FloatArray, first: float) -> NDArray[np.int64]:
@@ -171,9 +162,8 @@ def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
     if truth is not None and truth.position_covariance_W is not None:
         lost.append("the truth's covariance has no column")
     if sequence.positions is not None and layout == "euroc":
-        lost.append(
-            f"{sequence.positions.kind} have no file in the EuRoC layout: write .csv or .h5"
-        )
+        kind = sequence.positions.kind
+        lost.append(f"{kind} have no file in the EuRoC layout: write .csv or .h5")
     if sequence.magnetometer is not None and layout == "euroc":
         lost.append("the magnetometer has no file in the EuRoC layout: write .csv or .h5")
     if sequence.device_attitude is not None:

@@ -12,8 +12,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.text import read_lines
 
-_PAPER_SHARES = (8, 1, 1)
-
 
 @dataclass(frozen=True)
 class ListEntry:
@@ -49,12 +47,8 @@ def read_list(file: Path, data: Path) -> list[ListEntry]:
             continue
         path = data / name
         if not split_name(path)[0].exists():
-            raise InputError(
-                str(path),
-                "no such file",
-                f"a recording of {file.name}",
-                "set the data folder: --data",
-            )
+            expected, fix = f"a recording of {file.name}", "set the data folder: --data"
+            raise InputError(str(path), "no such file", expected, fix)
         listed.append(ListEntry(path, group))
     return listed
 
@@ -98,6 +92,6 @@ def random_split(recordings: Iterable[Path], seed: int) -> Split:
     if len(known) < 3:
         raise InputError("recordings", str(len(known)), "at least 3 to split")
     order = np.random.default_rng(seed).permutation(len(known))
-    each = max(1, round(len(known) * _PAPER_SHARES[1] / sum(_PAPER_SHARES)))
+    each = max(1, round(len(known) / 10))
     parts = order[2 * each :], order[:each], order[each : 2 * each]
     return Split(*(tuple(known[k] for k in sorted(part)) for part in parts))

@@ -45,8 +45,7 @@ log = logging.getLogger(__name__)
 Stream = WorldStream | LegStream
 """Training data of a network: with poses, or with legs between known positions."""
 
-_TABLES = {"poses": ("imu_W", "position_W", "facing_W"), "legs": ("imu_N", "facing_N", "legs")}
-
+_POSES = "poses"
 _SUFFIX = ".streams"
 _ABANDONED_S = 3600.0
 
@@ -65,7 +64,7 @@ def recorded(
     folder: Path,
     jobs: int | None = None,
     attitude: Attitude = "levelled",
-) -> Iterator[list[Stream] | Skipped]:
+) -> Iterator[Sequence[Stream] | Skipped]:
     """Yield each recording's streams: from the cache, or read, checked and added to it.
 
     Args:
@@ -93,25 +92,16 @@ def cached(
 ) -> Sequence[Stream]:
     """Return the cached streams of a key, or else build them and add them to the cache.
 
-    Args:
-        key: plain values that determine the result, except for this package's code.
-        build: function that makes the streams.
-        folder: cache folder.
+    The key has plain values that determine the result, except for this package's code.
     """
-    file = folder / (_digest({**key, "code": _code()}) + _SUFFIX)
-    streams = _opened(file)
-    if streams is not None:
-        return streams
-    built = build()
-    return (_opened(file) if _written(file, built) else None) or built
+    kept = _kept(folder / (_digest({**key, "code": _code()}) + _SUFFIX), build)
+    return (_opened(kept) or build()) if isinstance(kept, Path) else kept
 
 
 def recording_key(path: Path, options: Mapping[str, object]) -> str:
-    """Return a digest of a recording's path, files and options and of this package's code.
+    """Return a digest of a recording's path and files, the options and this package's code.
 
-    Args:
-        path: path of a recording that exists.
-        options: everything that the result depends on besides the files and this package's code.
+    The options are everything else that the result depends on.
     """
     stamps = [
         (str(file), stat.st_size, stat.st_mtime_ns)
@@ -154,14 +144,19 @@ def _stored(
     options: Mapping[str, object],
     folder: Path,
     attitude: Attitude,
-) -> Path | list[Stream]:
+) -> Path | Sequence[Stream]:
     """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
     file = folder / (recording_key(path, {**options, "attitude": attitude}) + _SUFFIX)
+    return _kept(file, lambda: _streams(read(path), attitude))
+
+
+def _kept(file: Path, build: Callable[[], Sequence[Stream]]) -> Path | Sequence[Stream]:
+    """Return a cache file, written if it is missing, or the streams if that fails."""
     if _opened(file) is not None:
         return file
-    streams = _streams(read(path), attitude)
+    streams = build()
     return file if _written(file, streams) else streams
 
 
@@ -208,10 +203,17 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     """Write streams to the cache; return False, with a warning, if they cannot be written."""
     if not streams:
         return False
-    tables = [_tables(stream) for stream in streams]
+    tables = [
+        {name: value for name, value in vars(stream).items() if isinstance(value, np.ndarray)}
+        for stream in streams
+    ]
     metadata = [
-        {"name": s.name, "kind": getattr(s, "kind", "poses"), "rows": [len(v) for v in t.values()]}
-        for s, t in zip(streams, tables, strict=True)
+        {
+            "name": stream.name,
+            "kind": getattr(stream, "kind", _POSES),
+            "rows": {name: len(array) for name, array in table.items()},
+        }
+        for stream, table in zip(streams, tables, strict=True)
     ]
     content = safetensors.numpy.save(
         {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
@@ -236,57 +238,36 @@ def _sweep(file: Path) -> None:
                 abandoned.unlink()
 
 
-def _tables(stream: Stream) -> dict[str, NDArray[Any]]:
-    """Return a stream's arrays by name; those of the same name are stacked over all streams."""
-    if isinstance(stream, WorldStream):
-        return {name: getattr(stream, name) for name in _TABLES["poses"]}
-    legs = [stream.start, stream.stop, stream.displacement, stream.sigma]
-    return {
-        "imu_N": stream.imu_N,
-        "facing_N": stream.facing_N,
-        "legs": np.column_stack(legs).astype(np.float64),
-    }
-
-
-def _stream(name: str, kind: str, tables: Mapping[str, NDArray[Any]]) -> Stream:
-    """Rebuild a stream from the arrays of `_tables`."""
-    if kind == "poses":
-        return WorldStream(name, **tables)
-    legs = tables["legs"]
-    return LegStream(
-        name, kind, tables["imu_N"], tables["facing_N"],
-        legs[:, 0], legs[:, 1], legs[:, 2:5], legs[:, 5:7],
-    )  # fmt: skip
-
-
 def _opened(file: Path) -> list[Stream] | None:
     """Return memory-mapped streams, or None if the file is missing or incomplete."""
     try:
-        size = file.stat().st_size
-        with file.open("rb") as source:
-            length = int.from_bytes(source.read(8), "little")
-            header = json.loads(source.read(min(length, size)))
+        mapped = np.memmap(file, dtype=np.uint8, mode="r")  # once: each map keeps a file open
+        begin = 8 + int.from_bytes(mapped[:8].tobytes(), "little")
+        header = json.loads(mapped[8:begin].tobytes())
         metadata = json.loads(header.pop("__metadata__")["streams"])
-        if size != 8 + length + max(tensor["data_offsets"][1] for tensor in header.values()):
-            raise ValueError(f"{size} bytes")
-        whole = {name: _mapped(file, 8 + length, tensor) for name, tensor in header.items()}
+        if len(mapped) != begin + max(tensor["data_offsets"][1] for tensor in header.values()):
+            raise ValueError(f"{len(mapped)} bytes")
+        whole = {name: _array(mapped[begin:], tensor) for name, tensor in header.items()}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.warning("%s: incomplete, will be rebuilt: %s", file, error)
         return None
-    names = list(_TABLES["poses" if metadata[0]["kind"] == "poses" else "legs"])
-    first = dict.fromkeys(names, 0)
-    streams = []
+    first = dict.fromkeys(whole, 0)
+    streams: list[Stream] = []
     for entry in metadata:
-        rows = dict(zip(names, entry["rows"], strict=True))
-        tables = {name: whole[name][first[name] : first[name] + rows[name]] for name in names}
-        first = {name: first[name] + rows[name] for name in names}
-        streams.append(_stream(entry["name"], entry["kind"], tables))
+        arrays = {}
+        for name, rows in entry["rows"].items():
+            arrays[name] = whole[name][first[name] : first[name] + rows]
+            first[name] += rows
+        if entry["kind"] == _POSES:
+            streams.append(WorldStream(entry["name"], **arrays))
+        else:
+            streams.append(LegStream(entry["name"], entry["kind"], **arrays))
     return streams
 
 
-def _mapped(file: Path, begin: int, tensor: Mapping[str, Any]) -> NDArray[Any]:
-    offset, shape = begin + tensor["data_offsets"][0], tuple(tensor["shape"])
+def _array(content: NDArray[np.uint8], tensor: Mapping[str, Any]) -> NDArray[Any]:
+    begin, stop = tensor["data_offsets"]
     dtype = {"F32": "<f4", "F64": "<f8"}[tensor["dtype"]]
-    return np.asarray(np.memmap(file, dtype=dtype, mode="r", offset=offset, shape=shape))
+    return np.asarray(content[begin:stop].view(dtype).reshape(tensor["shape"]))

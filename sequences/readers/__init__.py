@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from stario.sequences.errors import InputError, ReadError
@@ -13,7 +15,6 @@ from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,
     is_archive,
-    is_archive_member,
     read_archive,
     split_name,
 )
@@ -49,7 +50,8 @@ class Format:
     Attributes:
         recognises: whether a path (file or folder) holds a recording in this format; must neither
             raise nor read more than a few lines.
-        read: function that reads the recording or raises ReadError.
+        read: function that reads the recording; it raises ReadError if a file is missing or
+            malformed, InputError if a package is not installed.
         words: name shown to users if the reader does not set a more specific one.
         options: names of further arguments of `read`, all of them strings.
     """
@@ -60,41 +62,28 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-def _is_archive_or_member(path: Path) -> bool:
-    return is_archive(path) or is_archive_member(path)
-
-
-def _read_zip(path: Path) -> ImuSequence:
-    """Read the only recording in a zip; errors name the zip and the file in it."""
-    with unpacked(path) as folder:
-        found = sorted(_below(folder)) if not _is_recording(folder) else [folder]
-        if len(found) > 1:
-            names = ", ".join(str(path_inside.relative_to(folder)) for path_inside in found[:4])
-            raise ReadError(
-                path, "content", f"{len(found)} recordings ({names})", "one", "unpack the zip"
-            )
-        return _read_unpacked(path, folder, found[0] if found else folder)
-
-
-def _read_json(path: Path) -> ImuSequence:
-    with unpack_json(path) as folder:
-        return _read_unpacked(path, folder, folder)
-
-
-def _read_unpacked(path: Path, folder: Path, inside: Path) -> ImuSequence:
-    """Read the recording unpacked from `path`; errors name `path` instead of `folder`."""
-    try:
-        sequence = read_recording(inside)
-    except ReadError as error:
-        file = str(error.path).replace(str(folder), str(path))
-        field = error.field.removeprefix(f"{error.path}: ")
-        found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
-        raise ReadError(file, field, found, error.expected, fix) from None
-    return replace(sequence, name=path.stem) if inside == folder else sequence
+def _read_unpacked(
+    unpack: Callable[[Path], AbstractContextManager[Path]], path: Path
+) -> ImuSequence:
+    """Read the only recording unpacked from `path`; errors name `path` and the file in it."""
+    with unpack(path) as folder:
+        inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
+        if len(inside) > 1:
+            names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
+            found = f"{len(inside)} recordings ({names})"
+            raise ReadError(path, "content", found, "one", f"unpack the {path.suffix[1:].lower()}")
+        try:
+            sequence = read_recording(inside[0])
+        except ReadError as error:
+            file = str(error.path).replace(str(folder), str(path))
+            field = error.field.removeprefix(f"{error.path}: ")
+            found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
+            raise ReadError(file, field, found, error.expected, fix) from None
+    return replace(sequence, name=path.stem) if inside == [folder] else sequence
 
 
 FORMATS: dict[str, Format] = {
-    "archive": Format(_is_archive_or_member, read_archive, "archive"),
+    "archive": Format(lambda path: is_archive(split_name(path)[0]), read_archive, "archive"),
     "ronin": Format(is_ronin, read_ronin, "RoNIN"),
     "ridi": Format(is_ridi, read_ridi, "RIDI"),
     "imunet": Format(is_imunet, read_imunet, "IMUNet recorder"),
@@ -107,12 +96,14 @@ FORMATS: dict[str, Format] = {
     "phone": Format(is_phone, read_phone, "phone"),
     "wide": Format(is_wide, read_wide, "phone"),
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
-    "zip": Format(is_zip, _read_zip, "zip"),
-    "json": Format(is_json_export, _read_json, "Sensor Logger"),
+    "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
+    "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings."""
+
+_KNOWN = f"one of the formats {', '.join(FORMATS)}"
 
 _SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
@@ -192,13 +183,11 @@ def find_recordings(
         return _with_attributes([path], where)
     if is_list(path):
         return _listed(path, on_error, where)
-    if path.is_file():
-        return _with_attributes([path], where)
-    found = sorted(_below(path))
+    found = [path] if path.is_file() else sorted(_below(path))
     if not found:
         if pose_files(path) or incomplete_sensors(path):
             raise _unknown(path)
-        raise ReadError(path, "folder", "no recording", f"recordings in {_names()}")
+        raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)
 
 
@@ -206,16 +195,12 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     """Return the recordings whose attributes match; only those in archives have any."""
     if not where or not found:
         return found
-    members: dict[Path, list[Path]] = {}
-    for path in found:
-        if is_archive_member(path):
-            members.setdefault(split_name(path)[0], []).append(path)
     chosen: list[Path] = []
     errors: list[ReadError] = []
-    for file, paths in members.items():
+    for file in dict.fromkeys(file for file, name in map(split_name, found) if name):
         try:
             matching = set(archive_members(file, where))
-            chosen += [path for path in paths if path in matching]
+            chosen += [path for path in found if path in matching]
         except ReadError as error:
             errors.append(error)
     if errors and not chosen:
@@ -255,9 +240,10 @@ def _listed(
         try:
             if isinstance(entry, ReadError):
                 raise entry
-            if not _is_recording(entry.path) and is_list(entry.path):
-                raise ReadError(path, "list", f"another list, {entry.path.name}", "recordings")
-            found += find_recordings(entry.path, where=entry.where)
+            inside, of_entry = entry
+            if not _is_recording(inside) and is_list(inside):
+                raise ReadError(path, "list", f"another list, {inside.name}", "recordings")
+            found += find_recordings(inside, where=of_entry)
         except ReadError as error:
             if on_error is None:
                 raise
@@ -274,16 +260,6 @@ def _recognised(path: Path) -> str | None:
     return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
 
 
-def _names() -> str:
-    return f"one of the formats {', '.join(FORMATS)}"
-
-
-def _poses_alone(path: Path, pose: Path) -> ReadError:
-    expected = "a gyroscope file and an accelerometer file"
-    fix = "put the IMU files into the same folder"
-    return ReadError(path, "content", f"only poses, {pose.name}", expected, fix)
-
-
 def _unknown(path: Path) -> ReadError:
     """Return an error that describes what was found instead of a recording."""
     fix = ""
@@ -293,7 +269,9 @@ def _unknown(path: Path) -> ReadError:
         expected = "a gyroscope and an accelerometer"
         return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
     elif path.is_dir() and (poses := pose_files(path)):
-        return _poses_alone(path, poses[0])
+        expected = "a gyroscope file and an accelerometer file"
+        fix = "put the IMU files into the same folder"
+        return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
     elif path.is_dir():
         entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
         names = ", ".join(entries[:5]) + (
@@ -310,4 +288,4 @@ def _unknown(path: Path) -> ReadError:
         found, fix = "no line of text", "is it empty or compressed?"
     else:
         found, fix = f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"
-    return ReadError(path, "content", found, _names(), fix)
+    return ReadError(path, "content", found, _KNOWN, fix)

@@ -42,7 +42,6 @@ _OPTIONAL = {
     "position_covariance_W": "truth/position_covariance",
 }
 
-
 _DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
 """Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
@@ -55,12 +54,6 @@ def split_name(path: Path) -> tuple[Path, str | None]:
         if stop >= len(suffix) and text[stop + 1 :]:
             return Path(text[:stop]), text[stop + 1 :]
     return path, None
-
-
-def is_archive_member(path: Path) -> bool:
-    """Return whether a path names a recording in an archive."""
-    file, name = split_name(path)
-    return name is not None and is_archive(file)
 
 
 def is_archive(path: Path) -> bool:
@@ -95,13 +88,13 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
     wanted = where or {}
     with _opened(path) as file:
         known = {
-            name: {key: _plain(value) for key, value in group.attrs.items()} if wanted else {}
+            name: {"name": name, **(_attributes(group) if wanted else {})}
             for name, group in file.items()
             if "imu/t" in group
         }
-    chosen = [name for name, attributes in known.items() if matches(name, attributes, wanted)]
+    chosen = [name for name, attributes in known.items() if _matches(attributes, wanted)]
     if known and not chosen:
-        raise _none_chosen(path, known, wanted)
+        raise _none_chosen(path, list(known.values()), wanted)
     return [Path(f"{path}:{name}") for name in chosen]
 
 
@@ -111,35 +104,34 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
     if name is None:
         return {}
     with _opened(file_path) as file:
-        return {key: _plain(value) for key, value in file[name].attrs.items()}
+        return _attributes(file[name])
 
 
-def matches(name: str, attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
-    """Return whether a recording's attributes, including its `name`, match the filter."""
-    values = {"name": name, **attributes}
+def _attributes(group: Any) -> dict[str, str | float]:
+    return {key: _plain(value) for key, value in group.attrs.items()}
+
+
+def _matches(attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
     return all(
-        any(fnmatchcase(_text(values.get(key, "")), pattern) for pattern in patterns)
+        any(fnmatchcase(_text(attributes.get(key, "")), pattern) for pattern in patterns)
         for key, patterns in where.items()
     )
 
 
 def _none_chosen(
-    path: Path, known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter
+    path: Path, known: list[dict[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    wanted = ", ".join(
-        f"{key}={pattern}" for key, patterns in where.items() for pattern in patterns
+    wanted = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+    none_match = (
+        key
+        for key, patterns in where.items()
+        if not any(_matches(attributes, {key: patterns}) for attributes in known)
     )
-    key = next(
-        (k for k, patterns in where.items() if not _any(known, {k: patterns})), next(iter(where))
-    )
-    values = sorted({_text({"name": n, **a}.get(key, "")) for n, a in known.items()} - {""})
+    key = next(none_match, next(iter(where)))
+    values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
     listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
     return ReadError(path, f"recordings with {wanted}", "none", expected)
-
-
-def _any(known: Mapping[str, Mapping[str, str | float]], where: AttributeFilter) -> bool:
-    return any(matches(name, attributes, where) for name, attributes in known.items())
 
 
 def _text(value: str | float) -> str:
@@ -161,10 +153,8 @@ def read_archive(path: Path) -> ImuSequence:
         if name is None and len(names) == 1:
             name = names[0]
         if name is None:
-            found = f"{len(names)} recordings"
-            raise ReadError(
-                file_path, "recording", found, "the name of one", f"use {path.name}:{names[0]}"
-            )
+            found, fix = f"{len(names)} recordings", f"use {path.name}:{names[0]}"
+            raise ReadError(file_path, "recording", found, "the name of one", fix)
         if name not in file:
             known = ", ".join(names[:3])
             raise ReadError(file_path, "recording", repr(name), f"a name in it, such as {known}")
@@ -172,11 +162,10 @@ def read_archive(path: Path) -> ImuSequence:
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    time = _column(path, group, "imu/t", finite=False)
     truth, positions = _truth(path, group)
     return ImuSequence(
         name=name,
-        time=time,
+        time=_column(path, group, "imu/t", finite=False),
         gyro=_column(path, group, "imu/gyro", finite=False),
         accel=_column(path, group, "imu/accel", finite=False),
         truth=truth,
@@ -184,7 +173,7 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         magnetometer=_magnetometer(path, group),
         positions=positions,
         device_attitude=_device_attitude(path, group),
-        attributes={key: _plain(value) for key, value in group.attrs.items()},
+        attributes=_attributes(group),
     )
 
 
@@ -217,7 +206,7 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
         return None, _positions(path, group, "positions", "truth/p")
     time = _column(path, group, "truth/t")
     keep = increasing_mask(time)
-    valid = _valid(path, group, "truth", time)[keep]
+    valid = _valid(group, "truth", time)[keep]
     quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
     # Invalid rows may hold anything, but each must become a rotation.
     usable = valid | np.isfinite(quat).all(axis=1)
@@ -238,10 +227,10 @@ def _positions(
     time = _column(path, group, f"{stem}/t")
     keep = increasing_mask(time)
     position_W = _column(path, group, field, finite=False)
-    return PositionTrack(time[keep], position_W[keep], kind, _valid(path, group, stem, time)[keep])
+    return PositionTrack(time[keep], position_W[keep], kind, _valid(group, stem, time)[keep])
 
 
-def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
+def _valid(group: Any, stem: str, time: FloatArray) -> BoolArray:
     field = f"{stem}/valid"
     if field not in group:
         return np.ones(len(time), dtype=np.bool_)

@@ -27,7 +27,7 @@ from stario.sequences.readers.checked import (
     trajectory,
 )
 from stario.sequences.readers.text import IntArray, first_bytes, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 
 _IMU = "sensor_msgs/msg/Imu"
@@ -69,14 +69,17 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         for part in (_GYRO, _ACCEL)
     )
     truth = next((m for kind, m in messages.items() if kind not in (_IMU, _MAGNETIC)), None)
-    field = messages.get(_MAGNETIC)
+    magnetic = None
+    if (field := messages.get(_MAGNETIC)) is not None:
+        tesla = field.values[:, :3]
+        magnetic = magnetometer(seconds(field.stamps_ns, stamps[0]), tesla * MAGNETIC_UNITS["T"])
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
         gyro=gyro,
         accel=accel,
         truth=None if truth is None else _truth(path, truth, stamps[0]),
-        magnetometer=None if field is None else _magnetometer(field, stamps[0]),
+        magnetometer=magnetic,
     )
 
 
@@ -155,12 +158,6 @@ def _magnetic_topic(topics: dict[str, str], imu_topic: str) -> list[str]:
     return [candidates[shared.index(max(shared))]] if candidates else []
 
 
-def _magnetometer(field: _Messages, start_ns: np.int64) -> Magnetometer | None:
-    order = np.argsort(field.stamps_ns, kind="stable")
-    time = seconds(field.stamps_ns[order], start_ns)
-    return magnetometer(time, field.values[order, :3] * MAGNETIC_UNITS["T"])
-
-
 def _named(path: Path, field: str, wanted: str, candidates: list[str]) -> str:
     if wanted not in candidates:
         raise ReadError(
@@ -178,19 +175,20 @@ def _decoded(
     shortest = min(map(len, raws), default=0)
     if shortest < _STAMP.stop + size:
         raise ReadError(path, topic, f"a message of {shortest} bytes", f"a complete {kind}")
-    order = "<" if little_endian or raws[0][1] & 1 else ">"
-    parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{order}u4").reshape(-1, 2)
+    endian = "<" if little_endian or raws[0][1] & 1 else ">"
+    parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{endian}u4").reshape(-1, 2)
     stamps = parts.astype(np.int64) @ np.array([10**9, 1])
     if not stamps.any():
         stamps = np.array([time for time, _ in received], dtype=np.int64)
-    doubles = np.frombuffer(b"".join(raw[-size:] for raw in raws), f"{order}f8")
+    doubles = np.frombuffer(b"".join(raw[-size:] for raw in raws), f"{endian}f8")
     values = doubles.astype(np.float64).reshape(-1, _DOUBLES[kind])
+    if kind != _IMU:  # whose order is reported and mended for all formats
+        order = np.argsort(stamps, kind="stable")
+        stamps, values = stamps[order], values[order]
     return _Messages(topic, stamps, values)
 
 
 def _truth(path: Path, poses: _Messages, start_ns: np.int64) -> Trajectory:
-    order = np.argsort(poses.stamps_ns, kind="stable")
-    values = poses.values[order]
-    position = checked(path, f"{poses.topic}, position", values[:, :3], first_row=0)
-    attitude_WB = rotations(path, f"{poses.topic}, quaternion", values[:, 3:7], "xyzw", 0)
-    return trajectory(seconds(poses.stamps_ns[order], start_ns), position, attitude_WB)
+    position = checked(path, f"{poses.topic}, position", poses.values[:, :3], first_row=0)
+    attitude_WB = rotations(path, f"{poses.topic}, quaternion", poses.values[:, 3:7], "xyzw", 0)
+    return trajectory(seconds(poses.stamps_ns, start_ns), position, attitude_WB)

@@ -18,16 +18,10 @@ _HELD_SHARE = 1.0 / 3.0
 
 
 def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
-    """Return the values if all of them are finite.
-
-    Args:
-        path: the file that holds the values.
-        field: name of the values, for the error.
-        values: (N,) or (N, K) values to be checked.
-        first_row: number of the first row in the file, for the error.
+    """Return values (N,) or (N, K) if all are finite.
 
     Raises:
-        ReadError: a value is not finite; the error names its row.
+        ReadError: one is not; the error names the field and its row, counted from `first_row`.
     """
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
@@ -41,17 +35,11 @@ def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> F
 def rotations(
     path: Path, field: str, quat: FloatArray, order: str = "wxyz", first_row: int = 1
 ) -> Rotation:
-    """Return rotations from unit quaternions.
-
-    Args:
-        path: the file that holds the quaternions.
-        field: name of the quaternions, for the error.
-        quat: (N, 4) quaternions.
-        order: order of the components, `wxyz` or `xyzw`.
-        first_row: number of the first row in the file, for the error.
+    """Return rotations from unit quaternions (N, 4) in the order `wxyz` or `xyzw`.
 
     Raises:
-        ReadError: a component is not finite or a norm differs from 1 by more than a percent.
+        ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
+            error names the field and its row, counted from `first_row`.
     """
     norm = np.linalg.norm(checked(path, field, quat, first_row), axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE

@@ -24,14 +24,8 @@ def resample_to_gyro(
     """Interpolate the accelerometer to the gyroscope's samples in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
-    unknown.
-
-    Args:
-        path: the recording, for errors.
-        gyro_ns: (N,) gyroscope times [ns].
-        gyro: (N, 3) gyroscope samples.
-        accel_ns: (M,) accelerometer times [ns], with the same origin.
-        accel: (M, 3) accelerometer samples.
+    unknown. Times are in ns from one origin: (N,) with samples (N, 3) of the gyroscope, (M,) with
+    samples (M, 3) of the accelerometer.
 
     Returns:
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
@@ -59,11 +53,6 @@ def resample_to_gyro(
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     """Return the number of time units in a second, inferred from the rate if no unit is named.
-
-    Args:
-        file: the file that holds the times, for errors.
-        time: (N,) times in any unit.
-        unit: the unit's name, or empty.
 
     Raises:
         ReadError: the unit is unknown, or no unit gives a plausible sample rate.

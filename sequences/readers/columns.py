@@ -52,11 +52,11 @@ _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]
 
 @dataclass(frozen=True)
 class Column:
-    """A quantity's position in a row, its title in the header, and its unit."""
+    """A quantity's position in a row, and its title and unit in the header, if there are any."""
 
     index: int
-    title: str
-    unit: str
+    title: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -38,7 +38,6 @@ from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.columns import (
     IMU,
     MAGNETIC,
-    POSITION,
     TRUTH,
     Column,
     Header,
@@ -46,12 +45,17 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.text import first_lines, read_lines, read_quickly
+from stario.sequences.readers.text import (
+    first_lines,
+    is_row,
+    read_lines,
+    read_quickly,
+    rows_below,
+)
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,
     ImuSequence,
-    Magnetometer,
     PositionTrack,
     Trajectory,
 )
@@ -68,38 +72,35 @@ _HEAD_LINES = 200
 
 
 def read_generic_csv(path: Path) -> ImuSequence:
-    """Read a generic CSV in the format that the module's docstring describes.
-
-    Raises:
-        ReadError: header, unit, row or number is invalid; the error names line and column.
-    """
+    """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
-    columns = header.columns
     if _ends_within_a_row(path, lines, header):
         # The recorder was killed while it wrote: all earlier rows are complete.
         _log.warning("%s: skipped the last line, %d, which is cut short", path, len(lines))
         rows = _rows_carefully(path, lines[:-1], header)
     else:
         rows = _rows_quickly(path, header) or _rows_carefully(path, lines, header)
-    is_imu, table = rows.is_imu, rows.table
-    factors = {
-        sensor: np.array([unit_factor(path, columns[sensor[0] + axis], known) for axis in "xyz"])
-        for sensor, known in (("gyro", GYRO_UNITS), ("accel", ACCEL_UNITS))
-    }
-    gyro, accel = (
-        np.stack([table[sensor[0] + axis] for axis in "xyz"], axis=1) * factors[sensor]
-        for sensor in factors
-    )
+    gyro, gyro_converted = _vectors(path, header, rows, "g", GYRO_UNITS)
+    accel, accel_converted = _vectors(path, header, rows, "a", ACCEL_UNITS)
+    truth, positions = _ground_truth(path, rows)
+    field = None
+    if "mx" in rows.table:
+        vectors, _ = _vectors(path, header, rows, "m", MAGNETIC_UNITS)
+        field = magnetometer(rows.time, vectors, held=False)
     return ImuSequence(
         name=path.stem,
-        time=rows.time[is_imu],
-        gyro=gyro[is_imu],
-        accel=accel[is_imu],
-        truth=_truth(path, rows) if "qx" in table else None,
-        positions=_positions(path, rows) if "px" in table and "qx" not in table else None,
-        magnetometer=_magnetometer(path, header, rows) if "mx" in table else None,
-        converted=frozenset(sensor for sensor in factors if (factors[sensor] != 1.0).any()),
+        time=rows.time[rows.is_imu],
+        gyro=gyro[rows.is_imu],
+        accel=accel[rows.is_imu],
+        truth=truth,
+        positions=positions,
+        magnetometer=field,
+        converted=frozenset(
+            sensor
+            for sensor, done in (("gyro", gyro_converted), ("accel", accel_converted))
+            if done
+        ),
     )
 
 
@@ -115,7 +116,7 @@ class _Rows:
 
 def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
     """Return whether the last line has no line end and fewer cells than the row before it."""
-    if len(lines) < header.lines + 2 or not _is_row(lines[-2]):
+    if len(lines) < header.lines + 2 or not is_row(lines[-2]):
         return False
     if lines[-1].count(header.separator) >= lines[-2].count(header.separator):
         return False
@@ -150,10 +151,8 @@ def _rows_quickly(path: Path, header: Header) -> _Rows | None:
 
 
 def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
-    first, columns = header.lines + 1, header.columns
-    numbered = [(k, line) for k, line in enumerate(lines[first - 1 :], first) if _is_row(line)]
-    if not numbered:
-        raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    columns = header.columns
+    numbered = rows_below(path, lines, header.lines)
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
     values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
@@ -170,11 +169,6 @@ def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
 def is_generic_csv(path: Path) -> bool:
     """Return whether a file starts with a header that names columns of this format."""
     return is_header(first_lines(path, _HEAD_LINES, comments=True))
-
-
-def _is_row(line: str) -> bool:
-    text = line.strip()
-    return bool(text) and not text.startswith("#")
 
 
 def _numbers(
@@ -248,10 +242,14 @@ def _seconds(
     return np.array([float((stamp - start) / per_second) for stamp in stamps])
 
 
-def _magnetometer(path: Path, header: Header, rows: _Rows) -> Magnetometer | None:
-    units = [unit_factor(path, header.columns[name], MAGNETIC_UNITS) for name in MAGNETIC]
-    field = np.stack([rows.table[name] for name in MAGNETIC], axis=1) * np.array(units)
-    return magnetometer(rows.time, field, held=False)
+def _vectors(
+    path: Path, header: Header, rows: _Rows, letter: str, known: Mapping[str, float]
+) -> tuple[FloatArray, bool]:
+    """Return three columns (N, 3) in the first unit of `known`, and whether they were converted."""
+    names = [letter + axis for axis in "xyz"]
+    factors = np.array([unit_factor(path, header.columns[name], known) for name in names])
+    values = np.stack([rows.table[name] for name in names], axis=1)
+    return values * factors, bool((factors != 1.0).any())
 
 
 def _per_second(path: Path, column: Column, time: FloatArray) -> int:
@@ -262,39 +260,28 @@ def _per_second(path: Path, column: Column, time: FloatArray) -> int:
     return unit_factor(path, column, TIME_UNITS)
 
 
-def _positions(path: Path, rows: _Rows) -> PositionTrack | None:
-    """Return the positions of the rows that hold one; None if fewer than two do."""
-    names = [name for name in POSITION if name in rows.table]
-    known = np.stack([rows.table[name] for name in names], axis=1)
-    kept = np.flatnonzero(np.isfinite(known).all(axis=1) & np.isfinite(rows.time))
+def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
+    """Return the poses, or else the positions; None if fewer than two rows hold them."""
+    names = [name for name in TRUTH if name in rows.table]
+    if not names:
+        return None, None
+    values = np.stack([rows.table[name] for name in names], axis=1)
+    kept = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(rows.time))
     kept = kept[increasing_mask(rows.time[kept])]
+    has_attitude = "qx" in names
     if len(kept) < 2:
-        _log.warning("%s: %d rows hold a position, too few for a track", path, len(kept))
-        return None
-    time = rows.time[kept]
-    sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
-    return PositionTrack(time, known[kept], "waypoints" if sparse else "positions")
-
-
-def _truth(path: Path, rows: _Rows) -> Trajectory | None:
-    """Return the trajectory of the rows that hold truth; None if fewer than two do."""
-    time = rows.time
-    poses = np.stack([rows.table[name] for name in TRUTH], axis=1)
-    kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(time))
-    kept = kept[increasing_mask(time[kept])]
-    if len(kept) < 2:
-        _log.warning("%s: %d rows hold ground truth, too few for a trajectory", path, len(kept))
-        return None
-    norm = np.linalg.norm(poses[kept, 3:], axis=1)
+        what = ("ground truth", "trajectory") if has_attitude else ("a position", "track")
+        _log.warning("%s: %d rows hold %s, too few for a %s", path, len(kept), *what)
+        return None, None
+    time, values = rows.time[kept], values[kept]
+    if not has_attitude:
+        sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
+        return None, PositionTrack(time, values, "waypoints" if sparse else "positions")
+    norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
         k = int(np.argmax(bad))
         where = f"line {rows.line_numbers[kept[k]]}, qx qy qz qw"
-        raise ReadError(
-            path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "leave the row's truth blank"
-        )
-    return Trajectory(
-        time=time[kept],
-        position_W=poses[kept, :3],
-        attitude_WB=Rotation.from_quat(poses[kept, 3:]),
-    )
+        fix = "leave the row's truth blank"
+        raise ReadError(path, where, f"norm {norm[k]:.4g}", "a unit quaternion", fix)
+    return Trajectory(time, values[:, :3], Rotation.from_quat(values[:, 3:])), None

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
@@ -34,16 +33,8 @@ def is_list(path: Path) -> bool:
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
 
 
-@dataclass(frozen=True)
-class Entry:
-    """An entry of a list: a path and the filter of its recordings."""
-
-    path: Path
-    where: AttributeFilter
-
-
-def list_entries(path: Path) -> Iterator[Entry | ReadError]:
-    """Yield the files and folders that a list names, in its order, or the error of a line.
+def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadError]:
+    """Yield the paths that a list names, each with the filter of its recordings, or a line's error.
 
     Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
     may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
@@ -55,25 +46,23 @@ def list_entries(path: Path) -> Iterator[Entry | ReadError]:
     lines = read_lines(path)
     while lines and not lines[-1].strip():
         lines.pop()
-    entries = [(k, line.split("#")[0]) for k, line in enumerate(lines, 1)]
-    written = [(k, text) for k, text in entries if text.strip() or not lines[k - 1].strip()]
+    numbered = enumerate(lines, 1)
+    written = [(k, x.split("#")[0]) for k, x in numbered if not x.lstrip().startswith("#")]
     if not written:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
     for number, text in written:
         text, where = _split_filters(text)
         name = text.split(",")[0].strip()
+        line = f"line {number}"
         if not name:
-            yield ReadError(
-                path, f"line {number}", "an empty entry", "a recording's name", "delete the line"
-            )
-            continue
-        found = _located(bases, Path(name))
-        fix = "remove the line or fetch the recording"
-        if found is None:
-            yield ReadError(path, f"line {number}", f"no {name}", "a recording", fix)
+            fix = "delete the line"
+            yield ReadError(path, line, "an empty entry", "a recording's name", fix)
+        elif (found := _located(bases, Path(name))) is None:
+            fix = "remove the line or fetch the recording"
+            yield ReadError(path, line, f"no {name}", "a recording", fix)
         else:
-            yield Entry(found, where)
+            yield found, where
 
 
 def _split_filters(text: str) -> tuple[str, AttributeFilter]:

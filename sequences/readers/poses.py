@@ -107,11 +107,8 @@ def with_pose(
     candidates = [
         candidate for file in files for candidate in pose_rows(file) if candidate.order in orders
     ]
-    fits = [
-        (candidate, fit)
-        for candidate in candidates
-        if (fit := _fitted(sequence, start_ns, candidate)) is not None
-    ]
+    fitted = (_fitted(sequence, start_ns, candidate) for candidate in candidates)
+    fits = [fit for fit in fitted if fit is not None]
     if not fits:
         if candidates:
             names = ", ".join(dict.fromkeys(candidate.file.name for candidate in candidates))
@@ -120,13 +117,11 @@ def with_pose(
             names = ", ".join(file.name for file in files)
             _log.warning("%s: no row in %s holds a pose", sequence.name, names)
         return sequence
-    best = max(fit.aligned.correlation for _, fit in fits)
-    near = [
-        (candidate, fit) for candidate, fit in fits if fit.aligned.correlation > best - _TIE_MARGIN
-    ]
-    candidate, fit = min(near, key=lambda item: item[1].turn)
-    _log_choice(sequence, fits, candidate, fit)
-    return _posed(sequence, candidate, fit)
+    best = max(fit.aligned.correlation for fit in fits)
+    near = [fit for fit in fits if fit.aligned.correlation > best - _TIE_MARGIN]
+    chosen = min(near, key=lambda fit: fit.turn)
+    _log_choice(sequence, fits, chosen)
+    return _posed(sequence, chosen)
 
 
 def pose_rows(file: Path) -> list[PoseCandidate]:
@@ -149,32 +144,28 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     numbers = table.values[:, 1:]
     if columns == 13:
         matrices = numbers.reshape(-1, 3, 4)
-        good = np.abs(np.linalg.det(matrices[:, :, :3]) - 1.0) < NORM_TOLERANCE
-        good &= np.isfinite(numbers[:, :12]).all(axis=1)
-        return [
-            PoseCandidate(
-                file, stamps[good], matrices[good, :, 3],
-                Rotation.from_matrix(matrices[good, :, :3]), "matrix",
-            )
-        ]  # fmt: skip
-    quaternion = numbers[:, 3:7]
-    good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
-    good &= np.isfinite(numbers[:, :7]).all(axis=1)
-    orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+        position, rotation = matrices[:, :, 3], matrices[:, :, :3]
+        size = np.linalg.det(rotation)
+    else:
+        position, rotation = numbers[:, :3], numbers[:, 3:]
+        size = np.linalg.norm(rotation, axis=1)
+    good = (np.abs(size - 1.0) < NORM_TOLERANCE) & np.isfinite(numbers).all(axis=1)
+    if not good.any():
+        return []
+    stamps, position, rotation = stamps[good], position[good], rotation[good]
+    if columns == 13:
+        return [PoseCandidate(file, stamps, position, Rotation.from_matrix(rotation), "matrix")]
     return [
-        PoseCandidate(
-            file, stamps[good], numbers[good, :3],
-            Rotation.from_quat(quaternion[good][:, order]), name,
-        )
-        for name, order in orders.items()
-        if good.any()
-    ]  # fmt: skip
+        PoseCandidate(file, stamps, position, Rotation.from_quat(rotation[:, order]), name)
+        for name, order in (("xyzw", [0, 1, 2, 3]), ("wxyz", [1, 2, 3, 0]))
+    ]
 
 
 @dataclass(frozen=True)
 class _Fit:
     """Fit of poses to the IMU: times on the IMU's clock, their rows, alignment and mount R_PB."""
 
+    candidate: PoseCandidate
     time: FloatArray
     rows: IntArray
     aligned: BodyAlignment
@@ -197,9 +188,8 @@ def _fitted(
     attitude = candidate.attitude[rows]
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
-        overlap = pose_time[0] < time[-1] and pose_time[-1] > time[0]
         aligned = None
-        if overlap:
+        if pose_time[0] < time[-1] and pose_time[-1] > time[0]:
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
         if (
             aligned is None
@@ -213,7 +203,7 @@ def _fitted(
     if aligned.correlation < _MIN_CORRELATION:
         return None
     mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
-    return _Fit(pose_time, rows, aligned, mount)
+    return _Fit(candidate, pose_time, rows, aligned, mount)
 
 
 def _squared(mount: Rotation) -> Rotation:
@@ -223,26 +213,23 @@ def _squared(mount: Rotation) -> Rotation:
     return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
 
 
-def _log_choice(
-    sequence: ImuSequence,
-    fits: list[tuple[PoseCandidate, _Fit]],
-    candidate: PoseCandidate,
-    fit: _Fit,
-) -> None:
+def _log_choice(sequence: ImuSequence, fits: list[_Fit], chosen: _Fit) -> None:
+    name = chosen.candidate.file.name
     _log.info(
         "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
-        sequence.name, candidate.file.name, candidate.order, np.degrees(fit.turn),
-        fit.aligned.correlation,
+        sequence.name, name, chosen.candidate.order, np.degrees(chosen.turn),
+        chosen.aligned.correlation,
     )  # fmt: skip
-    for other, other_fit in fits:
-        if other.file != candidate.file and other_fit.turn > _SAME_AXES_RAD:
+    for other in fits:
+        if other.candidate.file != chosen.candidate.file and other.turn > _SAME_AXES_RAD:
             _log.warning(
                 "%s: the ground truth is %s; %s is rotated %.0f degrees from the IMU's axes",
-                sequence.name, candidate.file.name, other.file.name, np.degrees(other_fit.turn),
+                sequence.name, name, other.candidate.file.name, np.degrees(other.turn),
             )  # fmt: skip
 
 
-def _posed(sequence: ImuSequence, candidate: PoseCandidate, fit: _Fit) -> ImuSequence:
+def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
+    candidate = fit.candidate
     aligned = fit.aligned
     attitude_PB = candidate.attitude[fit.rows] * fit.mount
     time = fit.time + aligned.lag

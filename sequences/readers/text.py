@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import importlib
 import logging
-import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,23 +45,16 @@ def read_lines(path: Path) -> list[str]:
 
 
 def first_line(path: Path, comments: bool = False) -> str | None:
-    """Return the first non-blank line of a text file, or None if it has none or is not text.
-
-    Args:
-        path: the file.
-        comments: whether to include lines that start with `#`.
-    """
+    """Return the first line as in `first_lines`, None if there is none."""
     return next(iter(first_lines(path, 1, comments)), None)
 
 
 def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
-    """Return up to `count` lines selected as in `first_line`, reading little of the file.
+    """Return up to `count` lines of a text file that are neither blank nor (by default) comments.
 
-    Never raises: used to recognise formats.
+    Reads little of the file, and never raises: used to recognise formats.
     """
-    lines = head_lines(path)
-    kept = [x for x in lines if x.strip() and (comments or not x.lstrip().startswith("#"))]
-    return kept[:count]
+    return [x for x in head_lines(path) if is_row(x) or (comments and x.strip())][:count]
 
 
 def _decoded(content: bytes) -> str:
@@ -108,6 +101,7 @@ def first_numbers(path: Path) -> list[float]:
     return numbers_in(first_line(path) or "")
 
 
+@dataclass(frozen=True)
 class Table:
     """Rows of numbers as they are in a file.
 
@@ -115,20 +109,19 @@ class Table:
         path: the file.
         values: (N, K) numbers; `nan` and empty cells are NaN.
         first_row: line number of the first row in the file, counted from 1.
-        numbers: function that returns a column of the file, as integers if all of it is written
-            so; None if unavailable.
+        cells: function that returns the text of a column of the file.
+        frame: the numbers as pandas read them, None otherwise.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        values: FloatArray,
-        first_row: int,
-        cells: Callable[[int], list[str]],
-        numbers: Callable[[int], NDArray[Any] | None] = lambda column: None,
-    ) -> None:
-        self.path, self.values, self.first_row = path, values, first_row
-        self._cells, self.numbers = cells, numbers
+    path: Path
+    values: FloatArray
+    first_row: int
+    cells: Callable[[int], list[str]]
+    frame: Any = None
+
+    def numbers(self, column: int) -> NDArray[Any] | None:
+        """Return a column that was read, integers if all are written so; None without pandas."""
+        return None if self.frame is None else self.frame[column].to_numpy()
 
     def stamps_ns(
         self, column: int = 0, per_second: int = 10**9, rows: IntArray | None = None
@@ -151,7 +144,7 @@ class Table:
             return np.asarray(numbers.astype(np.int64) * unit_ns, dtype=np.int64)
         if numbers is not None and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
             return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
-        cells = self._cells(column)
+        cells = self.cells(column)
         try:
             stamps = [int(cells[k]) * unit_ns for k in rows]
         except ValueError:
@@ -234,12 +227,9 @@ def read_quickly(
 
     def cells(column: int) -> list[str]:
         rows = _read_carefully(path, column + 1, skip, delimiter, [column], decimal)
-        return rows._cells(column)
+        return rows.cells(column)
 
-    def numbers(column: int) -> NDArray[Any] | None:
-        return frame[column].to_numpy() if column in wanted else None
-
-    return Table(path, values, skip + 1, cells, numbers)
+    return Table(path, values, skip + 1, cells, frame)
 
 
 def _read_carefully(
@@ -254,9 +244,7 @@ def _read_carefully(
     lines = [_unquoted(line, delimiter) for line in read_lines(path)]
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
-    numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if _is_row(line)]
-    if not numbered:
-        raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    numbered = rows_below(path, lines, skip)
     if killed and len(numbered) > 1:
         try:
             _row(path, *numbered[-1], columns, delimiter, wanted)
@@ -265,9 +253,7 @@ def _read_carefully(
             numbered.pop()
     rows = [line for _, line in numbered]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
+        values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
     except (ValueError, IndexError):
         values = np.array([_row(path, k, line, columns, delimiter, wanted) for k, line in numbered])
     return Table(
@@ -293,7 +279,20 @@ def _unquoted(line: str, delimiter: str | None) -> str:
     return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
 
 
-def _is_row(line: str) -> bool:
+def rows_below(path: Path, lines: list[str], skip: int) -> list[tuple[int, str]]:
+    """Return a file's lines below its header that hold cells, with their numbers.
+
+    Raises:
+        ReadError: there is none.
+    """
+    numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if is_row(line)]
+    if not numbered:
+        raise ReadError(path, "rows", "none below the header", "rows of numbers")
+    return numbered
+
+
+def is_row(line: str) -> bool:
+    """Return whether a line is neither blank nor a comment."""
     text = line.strip()
     return bool(text) and text[0] != "#"
 
@@ -304,13 +303,8 @@ def _row(
     """Parse one row slowly, to raise an error that names its line and column."""
     cells = text.split(delimiter)
     if len(cells) < columns:
-        raise ReadError(
-            path,
-            f"line {number}",
-            f"{len(cells)} values",
-            f"{columns}",
-            "the file looks cut short" if number > 1 else "",
-        )
+        fix = "the file looks cut short" if number > 1 else ""
+        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{columns}", fix)
     values = []
     for k in wanted:
         try:

@@ -37,16 +37,13 @@ def unpacked(path: Path) -> Iterator[Path]:
     """
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         try:
-            size = _extract(path, Path(folder), _MAX_BYTES)
+            left = _extract(path, path, Path(folder), _MAX_BYTES)
             for inner in sorted(Path(folder).rglob("*.zip")):
-                size += _extract(inner, inner.with_suffix(""), _MAX_BYTES - size)
+                left = _extract(path, inner, inner.with_suffix(""), left)
                 inner.unlink()
         except _DAMAGED as error:
             found = " ".join(str(error).split())
             raise ReadError(path, "zip", found, "an intact zip", "is the zip complete?") from None
-        except _TooLargeError:
-            found = f"more than {_MAX_BYTES / 2**30:.0f} GiB of text"
-            raise ReadError(path, "zip", found, "a recording") from None
         yield Path(folder)
 
 
@@ -54,20 +51,16 @@ _DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, Not
 """Exceptions raised for a zip that is damaged, encrypted or compressed in a rare way."""
 
 
-class _TooLargeError(Exception):
-    """Error for a zip that unpacks to more than the maximum size."""
-
-
-def _extract(path: Path, folder: Path, max_size: int) -> int:
-    """Unpack the wanted files of a zip; return their size [bytes]."""
-    with zipfile.ZipFile(path) as file:
+def _extract(path: Path, inner: Path, folder: Path, max_bytes: int) -> int:
+    """Unpack the wanted files of a zip in `path`; return how many more bytes are allowed."""
+    with zipfile.ZipFile(inner) as file:
         wanted = [info for info in file.infolist() if _is_wanted(info)]
-        size = sum(info.file_size for info in wanted)
-        if size > max_size:
-            raise _TooLargeError
-        for info in wanted:
-            file.extract(info, folder)
-    return size
+        left = max_bytes - sum(info.file_size for info in wanted)
+        if left < 0:
+            found = f"more than {_MAX_BYTES / 2**30:.0f} GiB of text"
+            raise ReadError(path, "zip", found, "a recording")
+        file.extractall(folder, wanted)
+    return left
 
 
 def _is_wanted(info: zipfile.ZipInfo) -> bool:

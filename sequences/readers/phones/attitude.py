@@ -16,7 +16,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.phones.files import PhoneFiles
 from stario.sequences.readers.phones.sensor_table import Samples, read_quaternion
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import DeviceAttitude, FloatArray
 from stario.sequences.time_order import increasing_mask
 
 _ORDERS = ([0, 1, 2, 3], [1, 2, 3, 0])
@@ -38,6 +38,13 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     except ReadError:  # attitude is optional
         return None
     return agreeing_attitude(stamps, quaternion, gyro, table.quaternion[0].title != "")
+
+
+def device_attitude(
+    attitude: tuple[IntArray, Rotation] | None, start_ns: np.int64
+) -> DeviceAttitude | None:
+    """Return an attitude, as the functions here return it, in seconds since a time."""
+    return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
 
 
 def agreeing_attitude(

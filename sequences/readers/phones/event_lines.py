@@ -15,24 +15,20 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
-from stario.sequences.readers.phones.attitude import agreeing_attitude
+from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
 from stario.sequences.readers.text import IntArray, head_lines, read_lines, seconds
-from stario.sequences.sequence import (
-    DeviceAttitude,
-    FloatArray,
-    ImuSequence,
-    PositionTrack,
-)
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
@@ -50,33 +46,27 @@ _EARTH_M = 6_371_000.0
 Rows = tuple[IntArray, FloatArray]
 """Time stamps (N,) [ns] and values (N, K) of one sensor's events."""
 
+Events = tuple[dict[str, Rows], tuple[IntArray, Rotation] | None, Rows | None]
+"""Rows of each sensor, the device's own attitude, and known points."""
+
 
 def read_event_lines(path: Path) -> ImuSequence:
-    """Read a trace or a log file.
-
-    Raises:
-        ReadError: a sensor is missing, a line is malformed, or the sensors do not overlap.
-    """
+    """Read a trace or a log file."""
     trace = any(_TRACE.match(line) for line in head_lines(path))
-    sensors, points = _trace(path) if trace else _logfile(path)
+    sensors, attitude, points = _trace(path) if trace else _logfile(path)
     for name in ("gyro", "accel"):
         if name not in sensors:
             found = ", ".join(sensors) or "no sensor"
             raise ReadError(path, "events", f"those of {found}", "those of gyro and accel")
     stamps, gyro, accel = resample_to_gyro(path, *sensors["gyro"], *sensors["accel"])
     field = sensors.get("mag")
-    attitude = _attitude(sensors)
     return ImuSequence(
         name=path.stem,
         time=seconds(stamps, stamps[0]),
         gyro=gyro,
         accel=accel,
-        magnetometer=None
-        if field is None
-        else magnetometer(seconds(field[0], stamps[0]), field[1]),
-        device_attitude=None
-        if attitude is None
-        else DeviceAttitude(seconds(attitude[0], stamps[0]), attitude[1]),
+        magnetometer=field and magnetometer(seconds(field[0], stamps[0]), field[1]),
+        device_attitude=device_attitude(attitude, stamps[0]),
         positions=None if points is None else _waypoints(points, stamps[0]),
     )
 
@@ -88,28 +78,19 @@ def is_event_lines(path: Path) -> bool:
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
 
 
-def _add_attitude(
-    sensors: dict[str, Rows],
-    path: Path,
-    kind: str,
-    rows: list[list[str]],
-    unit_ns: int,
-    used: slice,
-) -> None:
+def _attitude(
+    path: Path, kind: str, rows: list[list[str]], unit_ns: int, used: slice, gyro: Rows | None
+) -> tuple[IntArray, Rotation] | None:
+    """Return the device's own attitude if it was logged and agrees with the gyroscope."""
+    if not rows or gyro is None:
+        return None
     try:
-        if rows:
-            sensors["attitude"] = _rows(path, kind, rows, unit_ns, used)
+        stamps, xyz = _rows(path, kind, rows, unit_ns, used)
     except ReadError as error:  # attitude is optional
         _log.info("attitude skipped: %s", error)
-
-
-def _attitude(sensors: dict[str, Rows]) -> tuple[IntArray, Rotation] | None:
-    """Return the device's own attitude if it was logged and agrees with the gyroscope."""
-    if "attitude" not in sensors:
         return None
-    stamps, xyz = sensors["attitude"]
     w = np.sqrt(np.clip(1.0 - np.sum(xyz**2, axis=1), 0.0, None))
-    return agreeing_attitude(stamps, np.column_stack([xyz, w]), Samples(*sensors["gyro"]))
+    return agreeing_attitude(stamps, np.column_stack([xyz, w]), Samples(*gyro))
 
 
 def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
@@ -125,20 +106,10 @@ def _whole_lines(path: Path, separator: str) -> list[str]:
     if len(lines) < 2 or path.read_bytes()[-1:] in (b"\n", b"\r"):
         return lines
     last = lines[-1].split(separator)
-    previous = next((c for c in _cells(lines[-2::-1], separator) if _kind(c) == _kind(last)), None)
-    is_complete = previous is not None and len(last) >= len(previous) and _is_number(last[-1])
-    return lines if is_complete else lines[:-1]
-
-
-def _cells(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
-    return (line.split(separator) for line in lines)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+    earlier = (line.split(separator) for line in lines[-2::-1])
+    previous = next((cells for cells in earlier if _kind(cells) == _kind(last)), None)
+    is_complete = previous is not None and len(last) >= len(previous)
+    return lines if is_complete and math.isfinite(number_in(last[-1])) else lines[:-1]
 
 
 def _kind(cells: Sequence[str]) -> str:
@@ -146,7 +117,7 @@ def _kind(cells: Sequence[str]) -> str:
     return next((cell for cell in cells if cell[:1].isalpha()), "")
 
 
-def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
+def _trace(path: Path) -> Events:
     text = _GLUED.sub(r"\n\1", "\n".join(_whole_lines(path, "\t")))
     events: dict[str, list[list[str]]] = {}
     for line in text.splitlines():
@@ -161,12 +132,13 @@ def _trace(path: Path) -> tuple[dict[str, Rows], Rows | None]:
         elif raw is not None:
             stamps, values = _rows(path, kind, raw, 10**6, slice(1, 7))
             sensors[sensor] = stamps, values[:, :3] - values[:, 3:]
-    _add_attitude(sensors, path, _ROTATION, events.get(_ROTATION, []), 10**6, slice(1, 4))
-    taps = events.get(_WAYPOINT)
-    return sensors, None if taps is None else _rows(path, _WAYPOINT, taps, 10**6, slice(1, 3))
+    vectors, taps = events.get(_ROTATION, []), events.get(_WAYPOINT)
+    attitude = _attitude(path, _ROTATION, vectors, 10**6, slice(1, 4), sensors.get("gyro"))
+    points = None if taps is None else _rows(path, _WAYPOINT, taps, 10**6, slice(1, 3))
+    return sensors, attitude, points
 
 
-def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
+def _logfile(path: Path) -> Events:
     events: dict[str, list[list[str]]] = {}
     for line in _whole_lines(path, ";"):
         cells = line.strip().split(";")
@@ -177,14 +149,14 @@ def _logfile(path: Path) -> tuple[dict[str, Rows], Rows | None]:
         for sensor, code in _CODES.items()
         if code in events
     }
-    _add_attitude(
-        sensors, path, _AHRS, [row[1:] for row in events.get(_AHRS, [])], 10**9, slice(4, 7)
-    )
+    vectors = [row[1:] for row in events.get(_AHRS, [])]
+    attitude = _attitude(path, _AHRS, vectors, 10**9, slice(4, 7), sensors.get("gyro"))
     if _POINT not in events or "ACCE" not in events:
-        return sensors, None
+        return sensors, attitude, None
     offsets = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
     stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
-    return sensors, (stamps - round(float(np.median(offsets)) * 1e9), _metres(degrees))
+    stamps = stamps - round(float(np.median(offsets)) * 1e9)
+    return sensors, attitude, (stamps, _metres(degrees))
 
 
 def _metres(degrees: FloatArray) -> FloatArray:

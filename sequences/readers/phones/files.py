@@ -1,4 +1,4 @@
-"""The sensor and the recording that each file of a folder belongs to, determined by its name.
+"""The sensor and the recording that each file of a folder belongs to, and the app that wrote them.
 
 A file belongs to the one sensor that its name contains (`Gyroscope.csv`, `acce.txt`,
 `Eight_gyr.csv`). The rest of the name identifies the recording, so files of two recordings in one
@@ -7,6 +7,7 @@ folder are read as two recordings, each named by its gyroscope file.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,12 +19,31 @@ from stario.sequences.readers.phones.sensor_words import (
     sensor_of,
     words_of,
 )
+from stario.sequences.readers.text import head_lines
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
 """Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
 
-_NEEDED: tuple[Sensor, ...] = ("accel", "linear")
+
+_BY_HEADER = {
+    "seconds_elapsed": "Sensor Logger",
+    "Time since start in ms": "AndroSensor",
+    '"Time (s)"': "phyphox",
+    "loggingTime(txt)": "SensorLog",
+    "gFx": "Physics Toolbox",
+}
+"""Text in the headers of an app's files."""
+
+_BY_FILE = {
+    "record.properties": "SensLogs on Android",
+    "description.txt": "SensLogs on iOS",
+    "arposes.txt": "iOS Logger",
+    "motmagnfull.txt": "iOS Logger",
+    "acce_uncalib.txt": "RoNIN-style logger",
+    "game_rv.txt": "RoNIN-style logger",
+}
+"""Files that an app writes alongside its sensor files."""
 
 
 @dataclass
@@ -55,11 +75,16 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
         group.tables.setdefault(sensor, []).append(table)
-    complete = [group for group in groups.values() if _is_complete(group)]
+    complete = [group for group in groups.values() if is_complete(group.tables)]
     if complete:
         return complete
     merged = _merged_groups(list(groups.values()))
-    return [merged] if _is_complete(merged) else []
+    return [merged] if is_complete(merged.tables) else []
+
+
+def is_complete(sensors: Collection[str]) -> bool:
+    """Return whether sensors include a gyroscope and an accelerometer of either kind."""
+    return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
 
 
 def incomplete_sensors(path: Path) -> list[Sensor]:
@@ -68,19 +93,17 @@ def incomplete_sensors(path: Path) -> list[Sensor]:
     Empty if it holds both, or no sensor at all.
     """
     sensors = _sensors(path)
-    complete = "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
-    return [] if complete else sensors
+    return [] if is_complete(sensors) else sensors
 
 
 def _sensors(path: Path) -> list[Sensor]:
-    tables: list[tuple[Sensor | None, SensorTable | None]]
-    if path.is_dir():
-        files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
-        tables = [(sensor_of(words_of(file.stem)), sensor_table(file)) for file in files]
-        return list(dict.fromkeys(s for s, table in tables if s is not None and table is not None))
-    table = sensor_table(path) if _may_hold(path) else None
-    sensors: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
-    return [sensor for sensor in sensors if table is not None and sensor in table.axes]
+    if not path.is_dir():
+        table = sensor_table(path) if _may_hold(path) else None
+        order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
+        return [sensor for sensor in order if table is not None and sensor in table.axes]
+    files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
+    named = [(sensor_of(words_of(file.stem)), file) for file in files]
+    return list(dict.fromkeys(s for s, file in named if s is not None and sensor_table(file)))
 
 
 def _may_hold(file: Path) -> bool:
@@ -98,10 +121,6 @@ def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
     return is_uncalibrated(words), "total" not in words, not calibrated, file
 
 
-def _is_complete(group: PhoneFiles) -> bool:
-    return "gyro" in group.tables and any(sensor in group.tables for sensor in _NEEDED)
-
-
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
     """Merge groups into one recording, which is empty if a sensor occurs in several of them."""
     merged = PhoneFiles("")
@@ -111,3 +130,18 @@ def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
                 return PhoneFiles("")
             merged.tables[sensor] = tables
     return merged
+
+
+def app_of(files: PhoneFiles) -> str:
+    """Return the name of the app that wrote the files, or else the kind of logger; for display."""
+    header = "\n".join(head_lines(files.gyro)[:8])
+    for words, app in _BY_HEADER.items():
+        if words in header:
+            return app
+    names = {file.name.lower() for file in files.gyro.parent.iterdir()}
+    for name, app in _BY_FILE.items():
+        if name in names:
+            return app
+    accel = files.first("accel") or files.first("linear")
+    one = accel is not None and accel.file == files.gyro
+    return "logger with all sensors in one file" if one else "logger with one file per sensor"

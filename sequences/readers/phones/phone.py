@@ -30,9 +30,14 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.generic_csv import is_generic_csv
-from stario.sequences.readers.phones.apps import app_of
-from stario.sequences.readers.phones.attitude import logged_attitude
-from stario.sequences.readers.phones.files import SUFFIXES, PhoneFiles, phone_recordings
+from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
+from stario.sequences.readers.phones.files import (
+    SUFFIXES,
+    PhoneFiles,
+    app_of,
+    is_complete,
+    phone_recordings,
+)
 from stario.sequences.readers.phones.reference_points import reference_points
 from stario.sequences.readers.phones.sensor_table import (
     Samples,
@@ -51,8 +56,6 @@ from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
-    DeviceAttitude,
-    FloatArray,
     ImuSequence,
     Magnetometer,
 )
@@ -64,31 +67,22 @@ _GRAVITY_REMOVED = 5.0
 
 
 def read_phone(path: Path) -> ImuSequence:
-    """Read a logger's folder, or the recording of one gyroscope file in a folder with several.
-
-    Raises:
-        ReadError: a file is missing or malformed, the folder holds more than one recording, or the
-            two sensors do not overlap in time.
-    """
+    """Read a logger's folder, or the recording of one gyroscope file in a folder with several."""
     folder = path if path.is_dir() else path.parent
     files = _chosen(path)
     name = folder.resolve().name if path.is_dir() else without_sensor(path.stem) or path.stem
-    return assemble_recording(folder, name, files, pose_files(folder, files.key))
+    return assemble_recording(name, files, pose_files(folder, files.key))
 
 
 def read_wide(path: Path) -> ImuSequence:
-    """Read one file that holds all sensors in separate columns.
-
-    Raises:
-        ReadError: the file is malformed.
-    """
+    """Read one file that holds all sensors in separate columns."""
     files = _wide(path)
     if files is None:
         lines = head_lines(path)[:1]
         found = repr(lines[0].strip()[:60]) if lines else "no lines"
         expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
-    return assemble_recording(path.parent, path.stem, files, _wide_poses(path, files))
+    return assemble_recording(path.stem, files, _wide_poses(path, files))
 
 
 def is_wide(path: Path) -> bool:
@@ -109,7 +103,7 @@ def is_wide(path: Path) -> bool:
 
 def _wide(path: Path) -> PhoneFiles | None:
     table = sensor_table(path)
-    if table is None or not {"gyro"} < set(table.axes) or not {"accel", "linear"} & set(table.axes):
+    if table is None or not is_complete(table.axes):
         return None
     words = words_of(path.stem)
     key = " ".join(word for word in words if word != "imu" and not is_sensor_word(word))
@@ -126,7 +120,6 @@ def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
 
 
 def assemble_recording(
-    folder: Path,
     name: str,
     files: PhoneFiles,
     poses: list[Path],
@@ -136,7 +129,6 @@ def assemble_recording(
     """Assemble the recording of a set of files.
 
     Args:
-        folder: folder of the files, for errors.
         name: name of the recording.
         files: files by sensor.
         poses: pose files alongside them.
@@ -146,9 +138,10 @@ def assemble_recording(
     Raises:
         ReadError: a file is malformed or the sensors do not overlap in time.
     """
+    folder = files.gyro.parent
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
-    accel, converted = _force(files, gyro, attitude, core_motion)
+    accel, converted = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(
         folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
@@ -161,7 +154,7 @@ def assemble_recording(
         accel=force,
         converted=frozenset(converted),
         magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
-        device_attitude=_device_attitude(attitude, stamps[0]),
+        device_attitude=device_attitude(attitude, stamps[0]),
         source="" if core_motion else app_of(files),
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
@@ -193,9 +186,8 @@ def _chosen(path: Path) -> PhoneFiles:
     if not chosen:
         names = ", ".join(sorted(p.name for p in folder.glob("*"))[:6]) or "nothing"
         expected = "a gyroscope file and an accelerometer file of one recording"
-        raise ReadError(
-            folder, "files", names, expected, "put each recording into a separate folder"
-        )
+        fix = "put each recording into a separate folder"
+        raise ReadError(folder, "files", names, expected, fix)
     return chosen[0]
 
 
@@ -208,22 +200,17 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 
 
 def _force(
-    files: PhoneFiles,
-    gyro: Samples,
-    attitude: tuple[IntArray, Rotation] | None,
-    core_motion: bool,
+    files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
 ) -> tuple[Samples, set[str]]:
     """Return the specific force, and {"accel"} if its unit or sign was converted."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
-    gravity = _gravity(files)
+    gravity_table = files.first("gravity")
+    gravity = None if gravity_table is None else _read(gravity_table, "gravity")
     total = _with_gravity(candidates, or_g=gravity is None)
-    linear = files.first("linear")
-    if total is None and not candidates and linear is not None:
-        candidates = [_read(linear, "linear")]
-    accel = total or candidates[0]
+    accel = total or (candidates[0] if candidates else _read(files.tables["linear"][0], "linear"))
     separate_gravity = total is None and gravity is not None
-    if separate_gravity and gravity is not None:
-        folder = gyro_folder(files)
+    if total is None and gravity is not None:
+        folder = files.gyro.parent
         stamps, force, gravity_B = resample_to_gyro(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
@@ -239,11 +226,6 @@ def _force(
     return replace(accel, values=factor * accel.values), converted
 
 
-def gyro_folder(files: PhoneFiles) -> Path:
-    """Return the folder of a recording's files."""
-    return files.gyro.parent
-
-
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
     """Return the first candidate with gravity in m/s^2, else the steadiest that may be in g."""
     sizes = [np.linalg.norm(candidate.values, axis=1) for candidate in candidates]
@@ -253,17 +235,6 @@ def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:
     shares = [float(np.percentile(size, 10) / max(np.median(size), 1e-9)) for size in sizes]
     maybe = [k for k, candidate in enumerate(candidates) if or_g and is_in_g(candidate.values)]
     return candidates[max(maybe, key=shares.__getitem__)] if maybe else None
-
-
-def _gravity(files: PhoneFiles) -> Samples | None:
-    table = files.first("gravity")
-    return None if table is None else _read(table, "gravity")
-
-
-def _device_attitude(
-    attitude: tuple[IntArray, Rotation] | None, start_ns: np.int64
-) -> DeviceAttitude | None:
-    return None if attitude is None else DeviceAttitude(seconds(attitude[0], start_ns), attitude[1])
 
 
 def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> Magnetometer | None:
@@ -279,5 +250,4 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if not inside.any():
         _log.warning("magnetometer skipped: none of its samples is within the recording")
         return None
-    time: FloatArray = seconds(samples.stamps_ns, start_ns)
-    return magnetometer(time, samples.values)
+    return magnetometer(seconds(samples.stamps_ns, start_ns), samples.values)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     bias_axis_of,
@@ -30,15 +31,6 @@ _SAME_PACE = 0.02
 """Relative tolerance within which a column as fast as the time, in any unit, is another clock."""
 
 
-@dataclass(frozen=True)
-class ColumnRef:
-    """A column: its index, its title and the unit named in the title."""
-
-    index: int
-    title: str = ""
-    unit: str = ""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """Content of the columns.
@@ -51,43 +43,37 @@ class Layout:
         clocks: a sensor's own clock, by the key of its axes, if one precedes them.
     """
 
-    clock: ColumnRef
-    axes: dict[str, tuple[ColumnRef, ColumnRef, ColumnRef]]
-    quaternion: tuple[ColumnRef, ...] = ()
-    biases: tuple[ColumnRef, ...] = ()
-    clocks: dict[str, ColumnRef] = field(default_factory=dict)
-
-    def clock_of(self, axes: str) -> ColumnRef:
-        """Return the clock of the sensor with these axes."""
-        return self.clocks.get(axes, self.clock)
+    clock: Column
+    axes: dict[str, tuple[Column, Column, Column]]
+    quaternion: tuple[Column, ...] = ()
+    biases: tuple[Column, ...] = ()
+    clocks: dict[str, Column] = field(default_factory=dict)
 
 
 def by_header(titles: list[str], head: FloatArray) -> Layout | None:
     """Return the layout that titles describe; None if they name no clock or no sensor.
 
-    Args:
-        titles: the header's cells.
-        head: (N, K) first rows; NaN where a cell is not a number.
+    `head` has the first rows (N, K), NaN where a cell is not a number.
     """
-    groups: dict[tuple[str, ...], dict[str, ColumnRef]] = {}
-    quaternion: dict[str, ColumnRef] = {}
-    biases: dict[str, ColumnRef] = {}
+    groups: dict[tuple[str, ...], dict[str, Column]] = {}
+    quaternion: dict[str, Column] = {}
+    biases: dict[str, Column] = {}
     for k, title in enumerate(titles):
         part, axis, bias = quaternion_of(title), axis_of(title), bias_axis_of(title)
         if part is not None:
-            quaternion.setdefault(part, ColumnRef(k, title))
+            quaternion.setdefault(part, Column(k, title))
         elif axis is not None and not is_time(title):
-            place = ColumnRef(k, title, unit_of(title))
+            place = Column(k, title, unit_of(title))
             groups.setdefault(axis[1], {}).setdefault(axis[0], place)
         elif bias is not None:
-            biases.setdefault(bias, ColumnRef(k, title))
-    axes: dict[str, tuple[ColumnRef, ColumnRef, ColumnRef]] = {}
+            biases.setdefault(bias, Column(k, title))
+    axes: dict[str, tuple[Column, Column, Column]] = {}
     for words in sorted(groups, key=_preference):
         sensor = sensor_of(words)
         if set(groups[words]) == set("xyz") and sensor != "attitude":
             x, y, z = (groups[words][axis] for axis in "xyz")
             if "gf" in words and not x.unit:
-                x = ColumnRef(x.index, x.title, "g")
+                x = Column(x.index, x.title, "g")
             axes.setdefault(sensor or "", (x, y, z))
     attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
     clocks = _clocks(titles, head)
@@ -109,17 +95,17 @@ def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
     return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)
 
 
-def _clocks(titles: list[str], head: FloatArray) -> list[ColumnRef]:
+def _clocks(titles: list[str], head: FloatArray) -> list[Column]:
     return [
-        ColumnRef(k, title, time_unit_of(title))
+        Column(k, title, time_unit_of(title))
         for k, title in enumerate(titles)
         if is_time(title) and _grows(head[:, k])
     ]
 
 
-def _run_before(clocks: list[ColumnRef], column: int) -> list[ColumnRef]:
+def _run_before(clocks: list[Column], column: int) -> list[Column]:
     """Return the adjacent clocks that most closely precede a column."""
-    run: list[ColumnRef] = []
+    run: list[Column] = []
     for clock in reversed(clocks):
         if clock.index < (run[-1].index if run else column):
             if run and clock.index < run[-1].index - 1:
@@ -128,11 +114,11 @@ def _run_before(clocks: list[ColumnRef], column: int) -> list[ColumnRef]:
     return run[::-1]
 
 
-def _finest(clocks: list[ColumnRef], head: FloatArray) -> ColumnRef:
+def _finest(clocks: list[Column], head: FloatArray) -> Column:
     """Return the best clock: a sensor's own rather than the app's, then the finer unit."""
     order = {"ns": 0, "us": 1, "": 2, "s": 3, "ms": 4}
 
-    def rank(place: ColumnRef) -> tuple[bool, int]:
+    def rank(place: Column) -> tuple[bool, int]:
         own = "sensor" in place.title.lower()
         large = not place.unit and head[0, place.index] > 1e15
         return not own, 0 if large else order.get(place.unit, 2)
@@ -147,8 +133,6 @@ def _grows(column: FloatArray) -> bool:
 
 def by_rows(head: FloatArray) -> Layout | None:
     """Return the layout of rows (N, K) without titles: time is first or fourth, and grows."""
-    if len(head) < 2:
-        return None
     width = head.shape[1]
     for time, start in ((0, 1), (3, 0)):
         if time >= width or not (np.diff(head[:, time]) >= 0).all():
@@ -159,16 +143,14 @@ def by_rows(head: FloatArray) -> Layout | None:
             start += 1
         if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
             continue
-        x, y, z = (ColumnRef(start + k) for k in range(3))
+        x, y, z = (Column(start + k) for k in range(3))
         rest = width - start
-        quaternion = tuple(ColumnRef(start + k) for k in range(4)) if start and rest >= 4 else ()
-        biases: tuple[ColumnRef, ...] = ()
+        quaternion = tuple(Column(start + k) for k in range(4)) if start and rest >= 4 else ()
+        biases: tuple[Column, ...] = ()
         if rest == 6 and start and not np.ptp(head[:, start + 3 :], axis=0).any():
-            biases = tuple(ColumnRef(start + 3 + k) for k in range(3))
+            biases = tuple(Column(start + 3 + k) for k in range(3))
         clock = (
-            ColumnRef(start - 1)
-            if start > 1 and head[0, start - 1] <= _CLOCK_FROM
-            else ColumnRef(time)
+            Column(start - 1) if start > 1 and head[0, start - 1] <= _CLOCK_FROM else Column(time)
         )
         return Layout(clock=clock, axes={"": (x, y, z)}, quaternion=quaternion, biases=biases)
     return None

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.phones.sensor_layout import ColumnRef, Layout, by_header, by_rows
+from stario.sequences.readers.columns import Column
+from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
@@ -86,21 +88,15 @@ def sensor_table(file: Path) -> SensorTable | None:
     return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
 
 
-def read_samples(
-    table: SensorTable, sensor: str, axes: str = "", per_second: int | None = None
-) -> Samples:
-    """Read a sensor's samples, in rad/s, m/s^2 or uT if the file names a unit.
+def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
+    """Read a sensor's samples in the columns `table.axes[axes]`.
 
-    Args:
-        table: the file's layout.
-        sensor: the sensor, a key of `UNITS`.
-        axes: the key of its columns in `table.axes`.
-        per_second: number of the clock's units in a second if its header names no unit.
+    They are in rad/s, m/s^2 or uT if the file names a unit.
 
     Raises:
         ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
     """
-    places, clock = table.axes[axes], table.clock_of(axes)
+    places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     rows = _rows(table, [clock, *places, *table.biases])
     kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
@@ -113,15 +109,14 @@ def read_samples(
         raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
     values = values * (known[unit] if unit else 1.0)
     _check_size(table.file, titles, sensor, values[kept])
-    if per_second is None or clock.unit:
-        per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
+    per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
     if sensor != "mag":
         checked(table.file, titles, np.where(kept.reshape(-1, 1), values, 0.0), rows.first_row)
     return Samples(stamps, values[kept], unit)
 
 
-def _rows(table: SensorTable, used: Sequence[ColumnRef]) -> Table:
+def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
     """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
     columns = max(indices) + 1
@@ -140,17 +135,14 @@ def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> Non
         )  # fmt: skip
 
 
-def read_quaternion(
-    table: SensorTable, per_second: int | None = None
-) -> tuple[IntArray, FloatArray]:
+def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
     """Read the times (N,) [ns] and quaternions (N, 4) of an attitude, in the table's order.
 
     Raises:
         ReadError: a row is malformed.
     """
     rows = _rows(table, [table.clock, *table.quaternion])
-    if per_second is None or table.clock.unit:
-        per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
+    per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
 
 
@@ -161,11 +153,9 @@ _MARK_ROWS = 5
 def first_row(
     numbered: list[tuple[int, str]], least: int = 4
 ) -> tuple[int, str | None, str] | None:
-    """Return the index of the first row of numbers, its delimiter and its decimal mark.
+    """Return the index of the first row of `least` numbers, its delimiter and its decimal mark.
 
-    Args:
-        numbered: a file's lines with their numbers, without blank lines.
-        least: minimum count of numbers in a row.
+    The lines have their numbers in the file; there are no blank ones among them.
     """
     for k, (_, line) in enumerate(numbered):
         if line.lstrip().startswith("#"):
@@ -196,7 +186,4 @@ def _cells(line: str, delimiter: str | None, decimal: str) -> list[str]:
 
 
 def _number(cell: str) -> float:
-    try:
-        return float(cell.strip(" \"'"))
-    except ValueError:
-        return float("nan")
+    return number_in(cell.strip(" \"'"))

@@ -21,34 +21,19 @@ _WITH_G = re.compile(r"\bwith[-_ ]g\b", flags=re.IGNORECASE)
 _WITHOUT_G = re.compile(r"\bwithout[-_ ]g\b", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
-_BEGINNINGS: tuple[tuple[str, Sensor], ...] = (
-    ("lin", "linear"),
-    ("user", "linear"),
-    ("grav", "gravity"),
-    ("gyr", "gyro"),
-    ("angular", "gyro"),
-    ("omega", "gyro"),
-    ("mag", "mag"),
-    ("acc", "accel"),
-    ("aceler", "accel"),
-    ("beschleunig", "accel"),
-    ("giro", "gyro"),
-    ("quat", "attitude"),
-    ("orient", "attitude"),
-    ("attitude", "attitude"),
-    ("rotation", "attitude"),
-    ("game", "attitude"),
-)
-_WHOLE: dict[str, Sensor] = {
-    "a": "accel",
-    "gf": "accel",
-    "force": "accel",
-    "g": "gyro",
-    "w": "gyro",
-    "m": "mag",
-    "b": "mag",
-    "rv": "attitude",
-    "ori": "attitude",
+_BEGINNINGS: dict[Sensor, tuple[str, ...]] = {
+    "linear": ("lin", "user"),
+    "gravity": ("grav",),
+    "gyro": ("gyr", "giro", "angular", "omega"),
+    "mag": ("mag",),
+    "accel": ("acc", "aceler", "beschleunig"),
+    "attitude": ("quat", "orient", "attitude", "rotation", "game"),
+}
+_WHOLE: dict[Sensor, tuple[str, ...]] = {
+    "accel": ("a", "gf", "force"),
+    "gyro": ("g", "w"),
+    "mag": ("m", "b"),
+    "attitude": ("rv", "ori"),
 }
 _NOT_SAMPLES = {
     *("bias", "drift", "offset", "calib", "calibration", "accuracy", "std", "variance"),
@@ -93,9 +78,10 @@ def sensor_of(words: Iterable[str]) -> Sensor | None:
 
 
 def _sensor(word: str) -> Sensor | None:
-    if word in _WHOLE:
-        return _WHOLE[word]
-    return next((sensor for start, sensor in _BEGINNINGS if word.startswith(start)), None)
+    for sensor, beginnings in _BEGINNINGS.items():
+        if word.startswith(beginnings) or word in _WHOLE.get(sensor, ()):
+            return sensor
+    return None
 
 
 def is_sensor_word(word: str) -> bool:

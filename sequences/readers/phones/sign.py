@@ -44,15 +44,11 @@ def accel_sign(
     files: PhoneFiles,
     accel: Samples,
     attitude: tuple[IntArray, Rotation] | None,
-    gravity_in_own_file: bool = False,
+    gravity_in_own_file: bool,
 ) -> float:
     """Return 1.0, or -1.0 if the accelerometer has Apple's sign.
 
-    Args:
-        files: files of the recording.
-        accel: samples of its accelerometer.
-        attitude: the phone's own attitude, as `logged_attitude` returns it.
-        gravity_in_own_file: whether gravity was added from a separate file.
+    `attitude` is the phone's own, as `logged_attitude` returns it.
     """
     folder = files.gyro.parent
     in_g = is_in_g(accel.values)

@@ -20,17 +20,13 @@ _POSES = ("ground-truth/pose.csv", "iphone/arkit.csv")
 
 
 def read_advio(path: Path) -> ImuSequence:
-    """Read a recording from its folder.
-
-    Raises:
-        ReadError: a file is missing or malformed.
-    """
+    """Read a recording from its folder."""
     files = _files(path)
     if files is None:
         raise ReadError(path, _PHONE, "no gyro.csv and accelerometer.csv", "an ADVIO recording")
     poses = [path / name for name in _POSES if (path / name).is_file()][:1]
     name = path.resolve().name
-    return assemble_recording(path / _PHONE, name, files, poses, orders=("wxyz",), core_motion=True)
+    return assemble_recording(name, files, poses, orders=("wxyz",), core_motion=True)
 
 
 def is_advio(path: Path) -> bool:

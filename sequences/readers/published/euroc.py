@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import read_lines, read_table, seconds
+from stario.sequences.readers.text import first_line, read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
 
@@ -28,11 +28,7 @@ TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "gt")
 
 
 def read_euroc(path: Path) -> ImuSequence:
-    """Read a recording from its folder, its `mav0` folder or its `imu0/data.csv`.
-
-    Raises:
-        ReadError: the IMU's file is missing or malformed.
-    """
+    """Read a recording from its folder, its `mav0` folder or its `imu0/data.csv`."""
     imu = imu_file(path)
     if imu is None:
         raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
@@ -71,16 +67,10 @@ def _truth_file(mav: Path) -> Path | None:
     return next((path for path in found if path.is_file()), None)
 
 
-def _holds_velocity(path: Path) -> bool:
-    """Return whether the truth has velocity, which some copies of EuRoC's files lack."""
-    if not path.parent.name.startswith("state_groundtruth"):
-        return False
-    rows = (line for line in read_lines(path) if not line.lstrip().startswith("#"))
-    return len(next(rows, "").split(",")) >= 11
-
-
 def _truth(path: Path, start_ns: np.int64) -> Trajectory:
-    columns = 11 if _holds_velocity(path) else 8
+    # Some copies of EuRoC's files lack the velocity; TUM-VI's never have it.
+    estimated = path.parent.name.startswith("state_groundtruth")
+    columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
     keep = increasing_mask(time)

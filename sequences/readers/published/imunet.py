@@ -18,7 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Slerp
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
@@ -32,11 +32,7 @@ _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 
 def read_imunet(path: Path) -> ImuSequence:
-    """Read a recording from its folder, processed or raw.
-
-    Raises:
-        ReadError: a file is missing or malformed.
-    """
+    """Read a recording from its folder, processed or raw."""
     if is_ridi(path):
         return read_ridi(path)
     folder = path if path.is_dir() else path.parent
@@ -87,11 +83,7 @@ def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray
     start = rotations(folder / "pose.txt", "quaternion", pose[:, 3:7], "xyzw")[0]
     R_WU = start * known(pose_time[0]).inv()
     attitude_WB, position = R_WU * known(pose_time), pose[:, :3]
-    if y_is_up(folder / "pose.txt", _force_attitude(R_WU, known, time), accel):
+    at_force = R_WU * known(np.clip(time, known.times[0], known.times[-1]))
+    if y_is_up(folder / "pose.txt", at_force, accel):
         attitude_WB, position = UPRIGHT * attitude_WB, UPRIGHT.apply(position)
     return trajectory(pose_time, position, attitude_WB)
-
-
-def _force_attitude(R_WU: Rotation, known: Slerp, time: FloatArray) -> Rotation:
-    """Return the attitude at the IMU's samples, used only for the force's direction."""
-    return R_WU * known(np.clip(time, known.times[0], known.times[-1]))

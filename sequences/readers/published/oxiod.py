@@ -19,7 +19,7 @@ is not quite level: see `stario.sequences.truth.alignment`.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,13 +39,7 @@ from stario.sequences.readers.text import (
     read_table,
     seconds,
 )
-from stario.sequences.sequence import (
-    BoolArray,
-    FloatArray,
-    ImuSequence,
-    Magnetometer,
-    Trajectory,
-)
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
 
@@ -63,17 +57,6 @@ _SPIKE_M = 0.1
 """Maximum distance of a tracked body from the median of the half second around it."""
 
 
-@dataclass(frozen=True)
-class _Phone:
-    """Samples of the phone; the stamps [ns] are None if only the row numbers give the time."""
-
-    time: FloatArray
-    gyro: FloatArray
-    accel: FloatArray
-    stamps_ns: IntArray | None
-    magnetometer: Magnetometer | None
-
-
 def read_oxiod(path: Path) -> ImuSequence:
     """Read `imuN.csv` and, if it lies alongside, the capture.
 
@@ -82,16 +65,9 @@ def read_oxiod(path: Path) -> ImuSequence:
     Raises:
         ReadError: a file is missing or cut short, or two of `syn` differ in their number of rows.
     """
-    phone = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
+    phone, start_ns = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
     capture = capture_file(path)
-    return ImuSequence(
-        name=_name(path),
-        time=phone.time,
-        gyro=phone.gyro,
-        accel=phone.accel,
-        truth=None if capture is None else _truth(capture, phone),
-        magnetometer=phone.magnetometer,
-    )
+    return phone if capture is None else replace(phone, truth=_truth(capture, phone, start_ns))
 
 
 def is_oxiod(path: Path) -> bool:
@@ -115,22 +91,23 @@ def _name(path: Path) -> str:
     return "-".join(p for p in parts if p not in ("/", "..", "."))
 
 
-def _phone(path: Path) -> _Phone:
+def _phone(path: Path) -> tuple[ImuSequence, np.int64 | None]:
+    """Return the samples and the first one's stamp [ns], None if only the rows give the time."""
     table = read_table(path, columns=16)
-    rows = table.values
-    gyro, accel = rows[:, 4:7], -_G * (rows[:, 7:10] + rows[:, 10:13])
-    field = rows[:, 13:16]
+    rows, start_ns = table.values, None
     if path.parent.name == "syn" or len(np.unique(rows[:, 0])) < len(rows) / 2:
         time = np.arange(len(rows)) / RATE
-        return _Phone(time, gyro, accel, None, magnetometer(time, field))
-    stamps = _stamps_ns(table)
-    order = np.argsort(stamps, kind="stable")
-    stamps = stamps[order]
-    time = seconds(stamps, stamps[0])
-    return _Phone(time, gyro[order], accel[order], stamps, magnetometer(time, field[order]))
+    else:
+        stamps = _stamps_ns(table)
+        order = np.argsort(stamps, kind="stable")
+        rows, start_ns = rows[order], stamps[order[0]]
+        time = seconds(stamps[order], start_ns)
+    accel = -_G * (rows[:, 7:10] + rows[:, 10:13])
+    field = magnetometer(time, rows[:, 13:16])
+    return ImuSequence(_name(path), time, rows[:, 4:7], accel, magnetometer=field), start_ns
 
 
-def _sensor_rows(path: Path) -> _Phone:
+def _sensor_rows(path: Path) -> tuple[ImuSequence, np.int64 | None]:
     """Read a file with a row for each sample of each sensor, at its own time."""
     table = read_table(path, columns=5)
     stamps, code = _stamps_ns(table), table.values[:, 1]
@@ -138,7 +115,8 @@ def _sensor_rows(path: Path) -> _Phone:
     xyz = table.values[:, 2:5]
     imu_ns, rate, force = resample_to_gyro(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
     field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
-    return _Phone(seconds(imu_ns, imu_ns[0]), rate, force, imu_ns, field)
+    time = seconds(imu_ns, imu_ns[0])
+    return ImuSequence(_name(path), time, rate, force, magnetometer=field), imu_ns[0]
 
 
 def _stamps_ns(table: Table) -> IntArray:
@@ -155,7 +133,7 @@ def capture_file(path: Path) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _truth(path: Path, phone: _Phone) -> Trajectory | None:
+def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Trajectory | None:
     table = read_table(path, columns=max(8, len(first_numbers(path))))
     position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
     norm = np.linalg.norm(quat_xyzw, axis=1)
@@ -166,10 +144,10 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
-        time, kept = _capture_time(table, phone)
+        time, kept = _capture_time(table, phone, start_ns)
         position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
         valid &= ~_position_glitches(time, position)
-        if phone.stamps_ns is not None:
+        if start_ns is not None:
             time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
         aligned = align_tracked_body(*imu, time, attitude_WV, valid, position)
     except InputError as error:
@@ -185,16 +163,18 @@ def _truth(path: Path, phone: _Phone) -> Trajectory | None:
     )
 
 
-def _capture_time(table: Table, phone: _Phone) -> tuple[FloatArray, IntArray]:
+def _capture_time(
+    table: Table, phone: ImuSequence, start_ns: np.int64 | None
+) -> tuple[FloatArray, IntArray]:
     """Return the capture's times since the phone's first sample [s], and their rows."""
     rows = np.arange(len(table.values))
-    if phone.stamps_ns is None:
+    if start_ns is None:
         if len(rows) != len(phone.time):
             expected = f"{len(phone.time)} as in the IMU's file"
             raise ReadError(table.path, "rows", str(len(rows)), expected)
         return phone.time, rows
     stamps, rows = np.unique(_stamps_ns(table), return_index=True)
-    return seconds(stamps, phone.stamps_ns[0]), rows
+    return seconds(stamps, start_ns), rows
 
 
 def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:

@@ -19,9 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import magnetometer, rotations, trajectory
-from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
-from stario.sequences.readers.text import seconds
+from stario.sequences.readers.checked import trajectory
+from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _log = logging.getLogger(__name__)
@@ -45,23 +44,16 @@ _MAX_TILT_RAD = np.deg2rad(20.0)
 
 
 def read_ridi(path: Path) -> ImuSequence:
-    """Read a recording from its folder, its `processed` folder or its `data.csv`.
-
-    Raises:
-        ReadError: the file is missing or malformed, or there is a pickle instead.
-    """
+    """Read a recording from its folder, its `processed` folder or its `data.csv`."""
     file = data_file(path)
     if file is None:
         raise ReadError(path, "processed/data.csv", "no such file", "a RIDI or IMUNet recording")
     if file.name in _PICKLES:
         fix = "write the table to data.csv next to it with pandas' to_csv"
         raise ReadError(file, "file", "a pickle, which may run code", "processed/data.csv", fix)
-    columns = NamedColumns(file, _COLUMNS, optional=("magnet",))
-    stamps = columns.table.stamps_ns(columns.file_column("time"))
-    time, accel = seconds(stamps, stamps[0]), columns.stack("acce")
-    first = columns.table.first_row
-    pose = rotations(file, "ori", columns.stack("ori", "wxyz"), first_row=first)
-    game_rv = rotations(file, "rv", columns.stack("rv", "wxyz"), first_row=first)
+    columns = NamedColumns(file, _COLUMNS, magnetic=("magnet",))
+    time, accel = columns.seconds("time"), columns.stack("acce")
+    pose, game_rv = columns.rotations("ori"), columns.rotations("rv")
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv
     if y_is_up(file, attitude_WB, accel):
         attitude_WB = UPRIGHT * attitude_WB
@@ -71,7 +63,7 @@ def read_ridi(path: Path) -> ImuSequence:
         gyro=columns.stack("gyro"),
         accel=accel,
         truth=trajectory(time, columns.stack("pos"), attitude_WB),
-        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
+        magnetometer=columns.magnetometer(time),
     )
 
 
@@ -93,12 +85,9 @@ def data_file(path: Path) -> Path | None:
 
 
 def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
-    """Return whether the world of an attitude has y up instead of z, from the mean specific force.
+    """Return whether an attitude's world has y up instead of z, by the mean specific force (N, 3).
 
-    Args:
-        path: the file, for the warning.
-        attitude_WB: N rotations.
-        accel: (N, 3) specific force [m/s^2].
+    A warning names the file if neither axis is near the force.
     """
     up = attitude_WB.apply(accel).mean(axis=0)
     cosines = up / max(float(np.linalg.norm(up)), 1e-9)

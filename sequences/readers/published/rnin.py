@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import magnetometer, rotations, trajectory
-from stario.sequences.readers.published.named import NamedColumns, axes_of, header_names
-from stario.sequences.readers.text import seconds
+from stario.sequences.readers.checked import trajectory
+from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
 from stario.sequences.sequence import ImuSequence
 
 _FILE = "SenseINS.csv"
@@ -37,30 +36,23 @@ _OWN = ("gt_q_w", "gt_p_x", "vio_q_w", "vio_p_x")
 
 
 def read_rnin(path: Path) -> ImuSequence:
-    """Read a recording from its folder or its `SenseINS.csv`.
-
-    Raises:
-        ReadError: the file is missing or malformed.
-    """
+    """Read a recording from its folder or its `SenseINS.csv`."""
     file = path / _FILE if path.is_dir() else path
     if not file.is_file():
         raise ReadError(file, "file", "no such file", f"a recording's {_FILE}")
     time_name = "times" if "times" in header_names(file) else "time"
-    columns = NamedColumns(file, (time_name, *_COLUMNS), optional=_MAGNETIC)
-    stamps = columns.table.stamps_ns(columns.file_column(time_name), per_second=1)
-    time = seconds(stamps, stamps[0])
+    columns = NamedColumns(file, (time_name, *_COLUMNS), magnetic=_MAGNETIC)
+    time = columns.seconds(time_name, per_second=1)
     captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
     source = "gt" if captured else "vio"
-    first = columns.table.first_row
-    quat_wxyz = columns.stack(f"{source}_q", "wxyz")
-    attitude_WB = rotations(file, f"{source}_q", quat_wxyz, first_row=first)
+    attitude_WB = columns.rotations(f"{source}_q")
     return ImuSequence(
         name=_name(file),
         time=time,
         gyro=columns.stack("gyro") - columns.stack("vio_gyro_bias")[-1],
         accel=columns.stack("acce") - columns.stack("vio_acce_bias")[-1],
         truth=trajectory(time, columns.stack(f"{source}_p"), attitude_WB),
-        magnetometer=None if (field := columns.optional()) is None else magnetometer(time, field),
+        magnetometer=columns.magnetometer(time),
     )
 
 

@@ -31,7 +31,7 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
-from stario.sequences.readers.published.json_fields import JsonFields
+from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import FloatArray, ImuSequence
 
@@ -53,12 +53,7 @@ _TRUSTED_DEG = 20.0
 
 
 def read_ronin(path: Path) -> ImuSequence:
-    """Read a recording from its folder or its `data.hdf5`.
-
-    Raises:
-        ReadError: a file is missing or cut short, or a field is missing or malformed.
-        InputError: h5py is not installed.
-    """
+    """Read a recording from its folder or its `data.hdf5`."""
     file = _data_file(path)
     info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)

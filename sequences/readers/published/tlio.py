@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import interpolated
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, rotations, trajectory
-from stario.sequences.readers.published.json_fields import JsonFields, as_array
+from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -45,11 +45,7 @@ _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
 
 def read_tlio(path: Path) -> ImuSequence:
-    """Read a recording from its folder (resampled if both exist) or from one of its files.
-
-    Raises:
-        ReadError: a file is missing or malformed, or holds pickled objects.
-    """
+    """Read a recording from its folder (resampled if both exist) or from one of its files."""
     file = _file(path)
     if file is None:
         raise ReadError(path, _RESAMPLED, "no such file", "a TLIO recording")
@@ -78,8 +74,8 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     checked(file, "array", table[:, :width], first_row=0)
     order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
     attitude_WB = rotations(file, quat_name, quat, order, first_row=0)
-    stamps_us = np.rint(table[:, places["ts_us"]][:, 0]).astype(np.int64)
-    time = (table[:, places["ts_us"]][:, 0] - table[0, places["ts_us"]]) * 1e-6
+    us = table[:, places["ts_us"].start]
+    time = (us - us[0]) * 1e-6
     gyro = table[:, places["gyr_compensated_rotated_in_World"]]
     accel = table[:, places["acc_compensated_rotated_in_World"]]
     if not _in_body_axes(time, gyro, attitude_WB):
@@ -92,7 +88,7 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
         accel=accel,
         truth=trajectory(time, table[:, places["pos_World_Device"]], attitude_WB, velocity_W),
     )
-    return stamps_us, sequence
+    return np.rint(us).astype(np.int64), sequence
 
 
 def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> bool:
@@ -208,12 +204,12 @@ def _imu_pose(
 
 def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
     """Return R_DI and p_DI [m], identity if missing, from [w, [x, y, z]] or [w, x, y, z]."""
-    quat = calibration.get("T_Device_Imu.UnitQuaternion")
+    name = "T_Device_Imu.UnitQuaternion"
+    quat = calibration.get(name)
     if quat is None:
         return Rotation.identity(), np.zeros(3)
     nested = isinstance(quat, list) and len(quat) == 2 and isinstance(quat[1], list)
     flat = [quat[0], *quat[1]] if nested else quat
-    name = "T_Device_Imu.UnitQuaternion"
-    quat_wxyz = as_array(calibration.path, name, flat, 4)[None]
+    quat_wxyz = calibration.as_array(name, flat, 4)[None]
     R_DI = rotations(calibration.path, name, quat_wxyz, first_row=0)[0]
     return R_DI, calibration.array("T_Device_Imu.Translation", 3)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import mmap
 import os
 import signal
 import subprocess
@@ -60,11 +61,16 @@ def assert_equal(found: list[WorldStream], expected: list[WorldStream]) -> None:
         assert a.imu_W.dtype == a.position_W.dtype == np.float32
 
 
-def is_mapped(array: np.ndarray) -> bool:
+def map_of(array: np.ndarray) -> object:
+    """The file mapped into memory that holds an array, or something else."""
     base: object = array
-    while isinstance(base, np.ndarray) and not isinstance(base, np.memmap):
+    while isinstance(base, np.ndarray):
         base = base.base
-    return isinstance(base, np.memmap)
+    return base
+
+
+def is_mapped(array: np.ndarray) -> bool:
+    return isinstance(map_of(array), mmap.mmap)
 
 
 def test_cached_streams_equal_built_streams(recording: Path, tmp_path: Path) -> None:
@@ -76,6 +82,13 @@ def test_cached_streams_equal_built_streams(recording: Path, tmp_path: Path) -> 
         assert_equal(found, expected)
         assert all(is_mapped(s.imu_W) and is_mapped(s.position_W) for s in found)
     assert read.calls == 1
+
+
+def test_a_cached_recording_keeps_a_single_file_open(recording: Path, tmp_path: Path) -> None:
+    """Each map does, and a training set has more recordings than a process may open files."""
+    streams_of(recording, tmp_path / "cache", Reader())
+    streams = streams_of(recording, tmp_path / "cache", Reader())
+    assert len({id(map_of(array)) for s in streams for array in (s.imu_W, s.position_W)}) == 1
 
 
 def test_changed_content_options_or_code_change_the_key(
@@ -257,3 +270,14 @@ def test_the_cache_folder_is_set_by_environment_variables(
     assert cache_folder() == tmp_path / "stario"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == Path.home() / ".cache" / "stario"
+
+
+def test_readers_levelling_windows_and_simulation_are_part_of_the_key() -> None:
+    names = {"/".join(file.parts[-2:]) for file in stream_cache.code_files()}
+    assert {
+        "sequences/windows.py",
+        "readers/generic_csv.py",
+        "attitude/levelling.py",
+        "simulation/imu.py",
+        "datasets/stream_cache.py",
+    } <= names

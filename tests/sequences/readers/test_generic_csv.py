@@ -250,13 +250,6 @@ def test_an_error_is_reported_in_one_line(tmp_path: Path, lines: list[str], mess
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, walk: ImuSequence) -> None:
-    with pytest.raises(InputError, match="existing folder"):
-        write_csv(tmp_path / "missing" / "walk.csv", walk)
-    write_csv(tmp_path / "walk.csv", walk)
-    assert [path.name for path in tmp_path.iterdir()] == ["walk.csv"]
-
-
 @pytest.mark.parametrize("suffix", [".csv", ".txt"])
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_separators_and_comments_above_the_header_are_recognised(

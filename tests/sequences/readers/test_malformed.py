@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import published_formats as formats
 import pytest
 
 from stario.sequences.errors import ReadError
@@ -40,7 +41,7 @@ def change(path: Path, row: int, column: str, cell: str) -> None:
 
 
 @pytest.fixture
-def ronin(tmp_path, walks, formats) -> Path:
+def ronin(tmp_path, walks) -> Path:
     pytest.importorskip("h5py")
     return formats.ronin(tmp_path / "a000_1", walks(200.0)).path
 
@@ -110,7 +111,7 @@ def test_an_info_that_is_missing_or_not_json_is_refused(ronin) -> None:
     ("which", "quaternion", "missing"), [("ridi", "rv", "rv_w"), ("rnin", "gt_q", "vio_p_z")]
 )
 def test_a_damaged_csv_with_named_columns_is_refused(
-    tmp_path, walks, formats, which, quaternion, missing
+    tmp_path, walks, which, quaternion, missing
 ) -> None:
     path = getattr(formats, which)(tmp_path / "seq", walks(200.0)).path
     csv = csv_of(path)
@@ -135,7 +136,7 @@ def test_a_damaged_csv_with_named_columns_is_refused(
     assert_refused(path, "rows: found none below the header")
 
 
-def test_pickles_are_refused_without_being_loaded(tmp_path, walks, formats) -> None:
+def test_pickles_are_refused_without_being_loaded(tmp_path, walks) -> None:
     class Harm:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "harm",))
@@ -154,7 +155,7 @@ def test_pickles_are_refused_without_being_loaded(tmp_path, walks, formats) -> N
     assert not (tmp_path / "harm").exists()
 
 
-def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks, formats) -> None:
+def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks) -> None:
     path = formats.tlio(tmp_path / "7", walks(200.0)).path
     file, description = path / "imu0_resampled.npy", path / "imu0_resampled_description.json"
     table, text = np.load(file), description.read_text()
@@ -182,7 +183,7 @@ def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks, fo
     assert_refused(path, "imu0_resampled_description.json: file: found no such file")
 
 
-def test_raw_samples_without_a_valid_calibration_are_refused(tmp_path, walks, formats) -> None:
+def test_raw_samples_without_a_valid_calibration_are_refused(tmp_path, walks) -> None:
     path = formats.tlio_raw(tmp_path / "7", walks(1000.0)).path
     calibration = path.with_name("calibration.json")
     fields = json.loads(calibration.read_text())
@@ -193,8 +194,8 @@ def test_raw_samples_without_a_valid_calibration_are_refused(tmp_path, walks, fo
     assert_refused(path, "calibration.json: file: found no such file")
 
 
-def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path, formats) -> None:
-    walk = formats.walk(100.0, 2.0)
+def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path) -> None:
+    walk = formats.walk_of(100.0, 2.0)
     path = formats.bag(tmp_path / "b", walk)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -213,7 +214,7 @@ def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path, formats) -> Non
     assert_refused(folder, "two: file: found ", "expected an intact bag")
 
 
-def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks, formats) -> None:
+def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks) -> None:
     path = formats.android(tmp_path / "log", walks(200.0)).path
     gyro = path / "Gyroscope.csv"
     lines = gyro.read_text().splitlines()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from alike import turned_and_measured
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
@@ -343,14 +344,11 @@ def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_de
     sequence = read_recording(DATA / name)
     truth = true_track(sequence)
     inside = (sequence.time >= truth.time[0]) & (sequence.time <= truth.time[-1])
-    time, gyro = sequence.time[inside], sequence.gyro[inside]
-    pose = truth.at(time)
+    pose = truth.at(sequence.time[inside])
     stride = round(0.04 * sequence.rate)
-    turned = (pose.attitude_WB[:-stride].inv() * pose.attitude_WB[stride:]).as_rotvec()
-    turned = turned / (time[stride:] - time[:-stride])[:, None]
-    mean = np.stack([np.convolve(gyro[:, k], np.ones(stride) / stride) for k in range(3)], axis=1)
+    turned, measured = turned_and_measured(sequence, pose, stride)
     good = pose.valid[:-stride] & pose.valid[stride:]
-    pair = np.corrcoef(turned[good].ravel(), mean[stride : len(gyro)][good].ravel())
+    pair = np.corrcoef(turned[good].ravel(), measured[good].ravel())
     assert pair[0, 1] > least
     assert pose.valid.mean() > 0.85
     up = pose.attitude_WB.apply(sequence.accel[inside])[pose.valid].mean(axis=0)

@@ -5,6 +5,7 @@ import json
 import sys
 
 import numpy as np
+import published_formats as formats
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +34,7 @@ def relative_to_first(attitude: Rotation) -> Rotation:
     ],
 )
 def test_ronin_uses_the_attitude_source_that_its_authors_use(
-    tmp_path, walks, formats, errors, source
+    tmp_path, walks, errors, source
 ) -> None:
     walk = walks(200.0)
     recording = formats.ronin(tmp_path / "a000_1", walk, **errors)
@@ -48,7 +49,7 @@ def test_ronin_uses_the_attitude_source_that_its_authors_use(
         assert max_angle(relative_to_first(attitude), relative_to_first(true[100:])) > 1e-9
 
 
-def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks, formats) -> None:
+def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks) -> None:
     h5py = pytest.importorskip("h5py")
     recording = formats.ronin(tmp_path / "a", walks(200.0), grv_ori_error=30.0)
     with h5py.File(recording.path / "data.hdf5", "a") as data:
@@ -57,7 +58,7 @@ def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks, formats) -
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
 
 
-def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks, formats) -> None:
+def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks) -> None:
     recording = formats.rnin(tmp_path, walks(200.0), captured=False)
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
     assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
@@ -67,14 +68,14 @@ def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks, formats)
     assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
 
 
-def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks, formats) -> None:
+def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks) -> None:
     recording = formats.tlio(tmp_path / "7", walks(200.0), order="wxyz")
     read = read_recording(recording.path)
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 1e-6
     assert np.abs(read.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks, formats) -> None:
+def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks) -> None:
     """The calibration rotates a pose of the device, but not a pose of the IMU."""
     R_DI = Rotation.from_euler("zyx", [90.0, 10.0, -170.0], degrees=True)
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0), R_DI)
@@ -87,7 +88,7 @@ def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks, formats) -> None:
     assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks, formats) -> None:
+def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks) -> None:
     """RIDI's raw folders contain IMUNet's files, from a Tango."""
     recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
@@ -95,9 +96,7 @@ def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks, formats) -> No
     assert max_angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
 
 
-def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(
-    tmp_path, walks, formats
-) -> None:
+def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path, walks) -> None:
     walk = walks(200.0)
     formats.imunet_raw(tmp_path / "seq", walk)
     formats.ridi(tmp_path / "seq", walk)
@@ -116,8 +115,8 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(
         "nav_msgs/msg/Odometry",
     ],
 )
-def test_each_type_of_pose_message_is_read_as_truth(tmp_path, formats, version, kind) -> None:
-    walk = formats.walk(100.0, 3.0)
+def test_each_type_of_pose_message_is_read_as_truth(tmp_path, version, kind) -> None:
+    walk = formats.walk_of(100.0, 3.0)
     path = formats.bag(tmp_path / "b", walk, version, pose_topics=(("/pose", kind),))
     read = read_recording(path)
     assert np.abs(read.truth.position_W - walk.truth.position_W).max() < 1e-9
@@ -125,8 +124,8 @@ def test_each_type_of_pose_message_is_read_as_truth(tmp_path, formats, version, 
     assert np.abs(read.truth.time - walk.time).max() < 2e-9
 
 
-def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path, formats) -> None:
-    walk = formats.walk(100.0, 3.0)
+def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path) -> None:
+    walk = formats.walk_of(100.0, 3.0)
     kind = "geometry_msgs/msg/PoseStamped"
     path = formats.bag(
         tmp_path / "b", walk, imu_topics=("/imu", "/imu_old"),
@@ -147,8 +146,8 @@ def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path, for
         read_recording(tmp_path / "a.csv", imu_topic="/imu")
 
 
-def test_a_bag_without_an_imu_is_refused_with_its_topics(tmp_path, formats) -> None:
-    path = formats.bag(tmp_path / "b", formats.walk(100.0, 1.0), imu_topics=())
+def test_a_bag_without_an_imu_is_refused_with_its_topics(tmp_path) -> None:
+    path = formats.bag(tmp_path / "b", formats.walk_of(100.0, 1.0), imu_topics=())
     with pytest.raises(
         ReadError, match=r"found /odom \(Odometry\), /mag .*, expected one topic with sens"
     ):
@@ -168,9 +167,9 @@ def rows(time, values, sep=",", last=False) -> str:
     )
 
 
-def test_loggers_with_different_conventions_are_read(tmp_path, formats) -> None:
+def test_loggers_with_different_conventions_are_read(tmp_path) -> None:
     """Seconds with units in a header; milliseconds without any; the time after the values."""
-    walk = formats.walk(200.0, 5.0)
+    walk = formats.walk_of(200.0, 5.0)
     t, gyro, accel = walk.time, walk.gyro, walk.accel
     header = '"Time (s)","Gyroscope x (deg/s)","Gyroscope y (deg/s)","Gyroscope z (deg/s)"\n'
     g_header = "timestamp [s];ax [g];ay [g];az [g]\n"
@@ -192,9 +191,9 @@ def test_loggers_with_different_conventions_are_read(tmp_path, formats) -> None:
     assert find_recordings(tmp_path) == [tmp_path / name for name in sorted(conventions)]
 
 
-def write_sensor_files(folder, formats, *names: str) -> None:
+def write_sensor_files(folder, *names: str) -> None:
     """Write files of gyroscope samples, or of the accelerometer's if the name contains "acc"."""
-    walk = formats.walk(100.0, 3.0)
+    walk = formats.walk_of(100.0, 3.0)
     folder.mkdir()
     for name in names:
         values = walk.accel if "acc" in name.lower() else walk.gyro
@@ -211,38 +210,36 @@ def write_sensor_files(folder, formats, *names: str) -> None:
         (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"a folder with acc_1\.csv, acc_2\.csv, gyr_3"),
     ],
 )
-def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, formats, names, message) -> None:
-    write_sensor_files(tmp_path / "s", formats, *names)
+def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, names, message) -> None:
+    write_sensor_files(tmp_path / "s", *names)
     with pytest.raises(ReadError, match=message):
         read_recording(tmp_path / "s")
 
 
-def test_files_with_two_prefixes_are_two_recordings(tmp_path, formats) -> None:
-    write_sensor_files(
-        tmp_path / "s", formats, "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv"
-    )
+def test_files_with_two_prefixes_are_two_recordings(tmp_path) -> None:
+    write_sensor_files(tmp_path / "s", "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv")
     (tmp_path / "s/Two_gyr.csv").write_text(rows(np.arange(99) / 100.0, np.ones((99, 3))))
     found = find_recordings(tmp_path)
     assert found == [tmp_path / "s/Two_gyr.csv", tmp_path / "s/one_gyr.csv"]
     two, one = map(read_recording, found)
     assert (two.name, one.name) == ("Two", "one")
     assert (two.gyro == 1.0).all()
-    assert np.array_equal(one.gyro, formats.walk(100.0, 3.0).gyro)
+    assert np.array_equal(one.gyro, formats.walk_of(100.0, 3.0).gyro)
 
 
-def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path, formats) -> None:
-    write_sensor_files(tmp_path / "s", formats, "watch_acc.csv", "watch_gyr.csv")
+def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path) -> None:
+    write_sensor_files(tmp_path / "s", "watch_acc.csv", "watch_gyr.csv")
     expected = read_recording(tmp_path / "s")
     (tmp_path / "s/phone_acc.csv").write_text(rows(expected.time, 2.0 * expected.accel))
     assert np.array_equal(read_recording(tmp_path / "s").accel, expected.accel)
 
 
-def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path, formats) -> None:
+def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path) -> None:
     """Files written alongside the raw sensors; names that differ by more than the sensor."""
     names = ("Accelerometer.csv", "Gyroscope.csv")
     variants = ("AccelerometerUncalibrated.csv", "GyroscopeUncalibrated.csv", "Gravity.csv")
-    write_sensor_files(tmp_path / "s", formats, *names, *variants)
-    write_sensor_files(tmp_path / "t", formats, "acc_12-00-01.csv", "gyr_12-00-02.csv")
+    write_sensor_files(tmp_path / "s", *names, *variants)
+    write_sensor_files(tmp_path / "t", "acc_12-00-01.csv", "gyr_12-00-02.csv")
     assert same_samples(read_recording(tmp_path / "s"), read_recording(tmp_path / "t"))
     uncalibrated = tmp_path / "s/AccelerometerUncalibrated.csv"
     uncalibrated.write_text(rows(np.arange(9) / 100.0, np.ones((9, 3))))
@@ -250,8 +247,8 @@ def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path, forma
 
 
 @pytest.mark.parametrize("above", ["", "\n", "Device: Pixel\n\n", "# a\n\n# b\n"])
-def test_any_text_above_a_loggers_header_is_skipped(tmp_path, formats, above) -> None:
-    walk = formats.walk(100.0, 3.0)
+def test_any_text_above_a_loggers_header_is_skipped(tmp_path, above) -> None:
+    walk = formats.walk_of(100.0, 3.0)
     head = f"{above}time,x,y,z\n"
     write_phone_files(
         tmp_path / "s", head + rows(walk.time, walk.accel), head + rows(walk.time, walk.gyro)
@@ -261,15 +258,15 @@ def test_any_text_above_a_loggers_header_is_skipped(tmp_path, formats, above) ->
 
 @pytest.mark.parametrize("rate", [50.0, 1000.0, 1125.0])
 @pytest.mark.parametrize("start", [0.0, 12345.678])
-def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, formats, rate, start) -> None:
-    walk = formats.walk(rate, 2.0)
+def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, rate, start) -> None:
+    walk = formats.walk_of(rate, 2.0)
     t = np.round(start + walk.time, 6)
     write_phone_files(tmp_path / "s", rows(t, walk.accel), rows(t, walk.gyro))
     assert read_recording(tmp_path / "s").rate == pytest.approx(rate, rel=1e-3)
 
 
-def test_units_named_by_a_logger_are_used_or_refused(tmp_path, formats) -> None:
-    walk = formats.walk(100.0, 3.0)
+def test_units_named_by_a_logger_are_used_or_refused(tmp_path) -> None:
+    walk = formats.walk_of(100.0, 3.0)
 
     def read(time: str, gyro: str):
         texts = [
@@ -294,8 +291,8 @@ def test_files_with_both_sensors_are_separate_recordings(tmp_path, walks) -> Non
     assert len(find_recordings(tmp_path)) == 2
 
 
-def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path, formats) -> None:
-    walk = formats.walk(100.0, 5.0)
+def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path) -> None:
+    walk = formats.walk_of(100.0, 5.0)
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
     write_phone_files(
         tmp_path / "s", rows(walk.time, walk.accel - gravity), rows(walk.time, walk.gyro)
@@ -305,8 +302,8 @@ def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path, formats) -> None
     assert np.abs(read_recording(tmp_path / "s").accel - walk.accel).max() < 1e-9
 
 
-def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(tmp_path, formats) -> None:
-    walk = formats.walk(200.0, 10.0)
+def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(tmp_path) -> None:
+    walk = formats.walk_of(200.0, 10.0)
     t = walk.time
     accel_time = np.delete(t[:-1] + 0.0017, np.arange(800, 1000))
     force = np.stack([np.interp(accel_time, t, walk.accel[:, k]) for k in range(3)], axis=1)
@@ -331,9 +328,7 @@ def same_samples(a, b) -> bool:
     return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
 
 
-def test_large_files_are_read_equally_with_and_without_pandas(
-    tmp_path, walks, formats, monkeypatch
-) -> None:
+def test_large_files_are_read_equally_with_and_without_pandas(tmp_path, walks, monkeypatch) -> None:
     pytest.importorskip("pandas")
     walk = walks(200.0)
     paths = [
@@ -354,7 +349,7 @@ def test_large_files_are_read_equally_with_and_without_pandas(
             assert same_samples(read_recording(path), careful), path
 
 
-def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, formats, monkeypatch) -> None:
+def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch) -> None:
     monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     csv = path / "processed/data.csv"
@@ -367,14 +362,14 @@ def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, formats, monkeyp
         read_recording(path)
 
 
-def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, formats, monkeypatch) -> None:
+def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, monkeypatch) -> None:
     recording = formats.ronin(tmp_path / "a", walks(200.0))
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r'h5py: found not installed.*"stario\[readers\]"'):
         read_recording(recording.path)
 
 
-def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks, formats) -> None:
+def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks) -> None:
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0))
     calibration = recording.path.with_name("calibration.json")
     fields = json.loads(calibration.read_text())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import zipfile
 from collections.abc import Callable
@@ -10,15 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import assert_same_samples
+from phone_files import ZYX, field, gravity, ns, save, zyx
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-FIELD_W = np.array([18.0, 5.0, -43.0])
-ZYX = "time,seconds_elapsed,z,y,x"
 METADATA = (
     "version,device name,recording epoch time,recording time,recording timezone,platform,"
     "appVersion,device id,sensors,sampleRateMs,standardisation,platform version\n"
@@ -32,44 +30,9 @@ ANDROSENSOR = [
 ]
 
 
-@pytest.fixture(scope="module")
-def walk() -> ImuSequence:
-    style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
-    return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)
-
-
 def quaternion(walk: ImuSequence) -> FloatArray:
     assert walk.truth is not None
     return walk.truth.quat_xyzw
-
-
-def in_body(walk: ImuSequence, vector_W: FloatArray | list[float]) -> FloatArray:
-    assert walk.truth is not None
-    return np.asarray(walk.truth.attitude_WB.apply(vector_W, inverse=True))
-
-
-def field(walk: ImuSequence) -> FloatArray:
-    return in_body(walk, FIELD_W)
-
-
-def gravity(walk: ImuSequence) -> FloatArray:
-    return in_body(walk, [0.0, 0.0, STANDARD_GRAVITY])
-
-
-def ns(walk: ImuSequence) -> list[int]:
-    return [1_718_030_736_872_695_300 + round(t * 1e9) for t in walk.time.tolist()]
-
-
-def save(path: Path, header: str, *columns: object, sep: str = ",") -> None:
-    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
-    rows = [sep.join(str(x) for part in row for x in part) for row in zip(*parts, strict=True)]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
-
-
-def zyx(folder: Path, walk: ImuSequence, **sensors: FloatArray) -> None:
-    for name, values in sensors.items():
-        save(folder / f"{name}.csv", ZYX, ns(walk), walk.time, values[:, ::-1])
 
 
 def android(folder: Path, walk: ImuSequence) -> None:
@@ -156,6 +119,14 @@ def json_export(folder: Path, walk: ImuSequence) -> None:
     metadata = {"sensor": "Metadata", "device name": "Pixel 8", "platform": "android"}
     folder.mkdir()
     (folder / "2024-06-10.json").write_text(json.dumps([metadata, *rows]))
+
+
+def json_export_of_a_watch(folder: Path, walk: ImuSequence) -> None:
+    watch(folder, walk)
+    with (folder / "WristMotion.csv").open() as file:
+        rows = [{"sensor": "WristMotion", **row} for row in csv.DictReader(file)]
+    (folder / "WristMotion.csv").unlink()
+    (folder / "2024-06-10.json").write_text(json.dumps(rows))
 
 
 def zip_in_a_zip(folder: Path, walk: ImuSequence) -> None:
@@ -268,7 +239,7 @@ VARIANTS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         with_byte_order_mark, every_cell_quoted, readable_times, extra_sensors, watch, iphone,
-        iphone_standardised, iphone_uncalibrated, json_export, zip_in_a_zip,
+        iphone_standardised, iphone_uncalibrated, json_export, json_export_of_a_watch, zip_in_a_zip,
         phyphox_with_and_without_g, phyphox_one_table, androsensor_other_units,
         androsensor_garbled, androsensor_lost_symbols, senslogs_first_version,
         two_clocks_and_no_header, senslogs_ios, ios_logger, ios_logger_with_poses,

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import assert_same_samples
+from phone_files import ZYX, field, gravity, ns, save, zyx
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
@@ -26,21 +27,12 @@ from stario.sequences import (
     read_recording,
 )
 from stario.sequences.conventions import with_axes, with_gravity
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 RAW = DATA / "raw"
-FIELD_W = np.array([18.0, 5.0, -43.0])
-START_NS = 1_718_030_736_872_695_300
-ZYX = "time,seconds_elapsed,z,y,x"
 Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
-
-
-@pytest.fixture(scope="module")
-def walk() -> ImuSequence:
-    style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
-    return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)
 
 
 def pose(walk: ImuSequence) -> Trajectory:
@@ -48,59 +40,23 @@ def pose(walk: ImuSequence) -> Trajectory:
     return walk.truth
 
 
-def field(walk: ImuSequence) -> FloatArray:
-    return np.asarray(pose(walk).attitude_WB.apply(FIELD_W, inverse=True))
-
-
-def gravity(walk: ImuSequence) -> FloatArray:
-    up = [0.0, 0.0, STANDARD_GRAVITY]
-    return np.asarray(pose(walk).attitude_WB.apply(up, inverse=True))
-
-
-def ns(walk: ImuSequence) -> list[int]:
-    return [START_NS + round(t * 1e9) for t in walk.time.tolist()]
-
-
-def save(path: Path, header: str, *columns: object, sep: str = ",", decimal: str = ".") -> None:
-    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
-    rows = [
-        sep.join(str(x).replace(".", decimal) for part in row for x in part)
-        for row in zip(*parts, strict=True)
-    ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
-
-
 def sensor_logger(folder: Path, walk: ImuSequence) -> None:
     """Columns z, y, x; a linear acceleration that must not be mistaken for the total one."""
-    for name, values in (
-        ("TotalAcceleration", walk.accel), ("Gyroscope", walk.gyro),
-        ("Accelerometer", walk.accel - gravity(walk)), ("Magnetometer", field(walk)),
-        ("GyroscopeUncalibrated", walk.gyro + 1.0), ("MagnetometerUncalibrated", field(walk) + 99),
-    ):  # fmt: skip
-        save(
-            folder / f"{name}.csv",
-            "time,seconds_elapsed,z,y,x",
-            ns(walk),
-            walk.time,
-            values[:, ::-1],
-        )
+    zyx(
+        folder, walk, TotalAcceleration=walk.accel, Accelerometer=walk.accel - gravity(walk),
+        Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro + 1.0,
+        Magnetometer=field(walk), MagnetometerUncalibrated=field(walk) + 99,
+    )  # fmt: skip
     save(folder / "Metadata.csv", "version,device name,platform", [["3", "Pixel 8", "android"]])
     save(folder / "Annotation.csv", "time,seconds_elapsed,text", ns(walk)[:2], [[0.1, 2], [0.2, 3]])
 
 
 def sensor_logger_ios(folder: Path, walk: ImuSequence) -> None:
     """No total acceleration, Apple's sign."""
-    linear = walk.accel - gravity(walk)
-    for name, values in (("Accelerometer", -linear), ("Gravity", -gravity(walk)),
-                         ("Gyroscope", walk.gyro), ("Magnetometer", field(walk))):  # fmt: skip
-        save(
-            folder / f"{name}.csv",
-            "time,seconds_elapsed,z,y,x",
-            ns(walk),
-            walk.time,
-            values[:, ::-1],
-        )
+    zyx(
+        folder, walk, Accelerometer=gravity(walk) - walk.accel, Gravity=-gravity(walk),
+        Gyroscope=walk.gyro, Magnetometer=field(walk),
+    )  # fmt: skip
     header = "version,device name,platform,standardisation"
     save(folder / "Metadata.csv", header, [["3", "iPhone 14", "ios", "false"]])
 
@@ -110,15 +66,8 @@ def sensor_logger_attitude(folder: Path, walk: ImuSequence) -> None:
     sensor_logger_ios(folder, walk)
     (folder / "Metadata.csv").unlink()
     header = "time,seconds_elapsed,qz,qy,qx,qw,roll,pitch,yaw"
-    quaternion = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
-    save(
-        folder / "Orientation.csv",
-        header,
-        ns(walk),
-        walk.time,
-        quaternion,
-        np.zeros((len(walk), 3)),
-    )
+    columns = walk.time, pose(walk).quat_xyzw[:, [2, 1, 0, 3]], np.zeros((len(walk), 3))
+    save(folder / "Orientation.csv", header, ns(walk), *columns)
 
 
 def phyphox(folder: Path, walk: ImuSequence) -> None:
@@ -174,23 +123,10 @@ def androsensor(folder: Path, walk: ImuSequence) -> None:
     header = ";".join(f"{name} {axis} ({unit})" for name, unit in names for axis in "XYZ")
     header += ";ORIENTATION Z (azimuth °);Time since start in ms ;YYYY-MO-DD HH-MI-SS_SSS"
     clock = ["2015-10-30 10:13:40:921"] * len(walk)
-    columns: list[object] = [
-        walk.accel,
-        gravity(walk),
-        walk.accel - gravity(walk),
-        walk.gyro,
-        field(walk),
-    ]
-    millis = np.round(1e3 * walk.time).astype(np.int64)
-    save(
-        folder / "log_AndroSensor.csv",
-        header,
-        *columns,
-        np.zeros(len(walk)),
-        millis,
-        clock,
-        sep=";",
-    )
+    linear = walk.accel - gravity(walk)
+    forces = walk.accel, gravity(walk), linear
+    rest = walk.gyro, field(walk), np.zeros(len(walk)), np.round(1e3 * walk.time).astype(int)
+    save(folder / "log_AndroSensor.csv", header, *forces, *rest, clock, sep=";")
 
 
 def physics_toolbox(folder: Path, walk: ImuSequence) -> None:
@@ -382,6 +318,17 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
     error = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
     assert np.degrees(np.abs(error)).max() < 3.0
     np.testing.assert_allclose(read.truth.position_W, truth.position_W[every], atol=0.1)
+
+
+@pytest.mark.parametrize("columns", [7, 12])
+def test_a_pose_file_without_any_rotation_gives_a_warning(
+    columns: int, walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = np.ones((len(walk), columns))
+    for name, values in (("acce", walk.accel), ("gyro", walk.gyro), ("ARKit_pose", rows)):
+        save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, sep=" ")
+    assert read_recording(tmp_path / "s").truth is None
+    assert "no row in ARKit_pose.txt holds a pose" in caplog.text
 
 
 def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from alike import turned_and_measured
 
 from stario.sequences.readers import FORMATS, find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -64,11 +65,6 @@ def test_mean_force_is_gravity_and_rate_is_the_attitudes_derivative(written) -> 
     change = (speeds[-1] - speeds[0]) / (pose.time[-1] - pose.time[0])
     assert np.abs(force - change - [0.0, 0.0, STANDARD_GRAVITY]).max() < 0.05
     stride = max(1, round(0.03 / np.median(np.diff(pose.time))))
-    turned = (pose.attitude_WB[:-stride].inv() * pose.attitude_WB[stride:]).as_rotvec()
-    steps = 0.5 * (read.gyro[1:] + read.gyro[:-1]) * np.diff(read.time)[:, None]
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    at_poses = [np.interp(pose.time, read.time, angle[:, k]) for k in range(3)]
-    measured = np.stack(at_poses, axis=1)
-    measured = measured[stride:] - measured[:-stride]
+    turned, measured = turned_and_measured(read, pose, stride)
     assert np.corrcoef(turned.ravel(), measured.ravel())[0, 1] > 0.999
     assert np.sqrt(np.square(turned - measured).mean()) < 0.03 * measured.std()

@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import published_formats as formats
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +23,7 @@ def walk() -> ImuSequence:
     return simulate_imu(generate_walk(4, 60.0, style=WalkStyle("rig")), 100.0, PERFECT_IMU)
 
 
-def apple_rows(formats, walk: ImuSequence, stamps: list[int]) -> list[str]:
+def apple_rows(walk: ImuSequence, stamps: list[int]) -> list[str]:
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, -1.0], inverse=True)
     zeros = np.zeros((len(walk), 3))
     user = walk.accel / -9.81 - gravity
@@ -30,7 +31,6 @@ def apple_rows(formats, walk: ImuSequence, stamps: list[int]) -> list[str]:
 
 
 def capture_rows(
-    formats,
     walk: ImuSequence,
     every: int,
     start: int,
@@ -68,23 +68,23 @@ def assert_matches(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) ->
 @pytest.mark.parametrize("ahead", [0.02, -1.65, 5000.0])
 @pytest.mark.parametrize(("name", "unit_ns"), [("vi1", 1), ("hand1", 1000), ("tango1", 10**6)])
 def test_the_capture_is_synchronised_to_the_phones_clock(
-    tmp_path, walk, formats, ahead, name, unit_ns
+    tmp_path, walk, ahead, name, unit_ns
 ) -> None:
     """Nanoseconds, microseconds or milliseconds; seconds apart or of another origin."""
     raw = tmp_path / "pocket/data1/raw"
-    formats.save(raw / "imu1.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time)))
+    formats.save(raw / "imu1.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
     every = 3 if name == "tango1" else 1
     start = formats.stamps_ns(np.zeros(1))[0]
-    rows = capture_rows(formats, walk, every, start, unit_ns, ahead, frame=name != "tango1")
+    rows = capture_rows(walk, every, start, unit_ns, ahead, frame=name != "tango1")
     formats.save(raw / f"{name}.csv", "", rows)
     assert_matches(raw / "imu1.csv", walk, 3.0 if name == "tango1" else 1.0)
     assert read_recording(raw / "imu1.csv").name == "pocket-data1-raw-imu1"
 
 
-def test_poses_written_while_tracking_was_lost_are_masked(tmp_path, walk, formats) -> None:
+def test_poses_written_while_tracking_was_lost_are_masked(tmp_path, walk) -> None:
     stamps = formats.stamps_ns(walk.time)
-    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, stamps))
-    rows = capture_rows(formats, walk, 1, stamps[0], 1, 0.0)
+    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, stamps))
+    rows = capture_rows(walk, 1, stamps[0], 1, 0.0)
     for k in range(1000, 1300):
         rows[k] = ",".join(rows[k].split(",")[:2] + ["0.0"] * 6 + ["1.0"])
     formats.save(tmp_path / "raw/vi1.csv", "", rows)
@@ -94,8 +94,8 @@ def test_poses_written_while_tracking_was_lost_are_masked(tmp_path, walk, format
     assert truth.valid[1310:].mean() > 0.95
 
 
-def test_swapped_neighbouring_rows_are_put_in_order(tmp_path, walk, formats) -> None:
-    rows = apple_rows(formats, walk, formats.stamps_ns(walk.time))
+def test_swapped_neighbouring_rows_are_put_in_order(tmp_path, walk) -> None:
+    rows = apple_rows(walk, formats.stamps_ns(walk.time))
     for k in range(100, 5000, 500):
         rows[k], rows[k + 1] = rows[k + 1], rows[k]
     formats.save(tmp_path / "raw/imu1.csv", "", rows)
@@ -104,19 +104,15 @@ def test_swapped_neighbouring_rows_are_put_in_order(tmp_path, walk, formats) -> 
     assert read.truth is None
 
 
-def test_large_scale_recordings_have_their_truth_in_a_neighbouring_folder(
-    tmp_path, walk, formats
-) -> None:
+def test_large_scale_recordings_have_their_truth_in_a_neighbouring_folder(tmp_path, walk) -> None:
     floor, start = tmp_path / "large scale/floor4", formats.stamps_ns(np.zeros(1))[0]
-    formats.save(
-        floor / "imu/imu2.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time))
-    )
-    formats.save(floor / "tango/tango2.csv", "", capture_rows(formats, walk, 3, start, 10**6, 0.3))
+    formats.save(floor / "imu/imu2.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
+    formats.save(floor / "tango/tango2.csv", "", capture_rows(walk, 3, start, 10**6, 0.3))
     assert_matches(floor / "imu/imu2.csv", walk, 3.0)
     assert find_recordings(tmp_path) == [floor / "imu/imu2.csv"]
 
 
-def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk, formats) -> None:
+def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk) -> None:
     raw = tmp_path / "multi devices/nexus 5/raw"
     stamps = [k // 1000 for k in formats.stamps_ns(walk.time, EPOCH_NS)]
     code = {1: walk.accel, 4: walk.gyro, 2: np.ones((len(walk), 3))}
@@ -127,14 +123,12 @@ def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk, formats) -
         for row in formats.text([stamps[k]], [sensor], values[k : k + 1])
     ]
     formats.save(raw / "imu1.csv", "", rows)
-    formats.save(raw / "vi1.csv", "", capture_rows(formats, walk, 1, EPOCH_NS, 1, 0.25))
+    formats.save(raw / "vi1.csv", "", capture_rows(walk, 1, EPOCH_NS, 1, 0.25))
     assert_matches(raw / "imu1.csv", walk)
 
 
-def test_a_capture_of_another_motion_is_rejected(tmp_path, walk, formats, caplog) -> None:
-    formats.save(
-        tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, formats.stamps_ns(walk.time))
-    )
+def test_a_capture_of_another_motion_is_rejected(tmp_path, walk, caplog) -> None:
+    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
     rng = np.random.default_rng(0)
     poses = np.hstack([rng.normal(size=(3000, 3)), Rotation.random(3000, rng=rng).as_quat()])
     stamps = formats.stamps_ns(np.arange(3000) / 100.0)
@@ -145,10 +139,10 @@ def test_a_capture_of_another_motion_is_rejected(tmp_path, walk, formats, caplog
     assert "ground truth rejected" in caplog.text
 
 
-def test_times_rounded_too_coarsely_are_refused(tmp_path, walk, formats) -> None:
+def test_times_rounded_too_coarsely_are_refused(tmp_path, walk) -> None:
     stamps = formats.stamps_ns(walk.time)
-    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(formats, walk, stamps))
-    rows = capture_rows(formats, walk, 1, stamps[0], 1, 0.0)
+    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, stamps))
+    rows = capture_rows(walk, 1, stamps[0], 1, 0.0)
     rounded = [f"{float(row.split(',')[0]):.4e}," + row.split(",", 1)[1] for row in rows]
     formats.save(tmp_path / "raw/vi1.csv", "", rounded)
     with pytest.raises(ReadError, match=r"vi1\.csv: time: found a step of 0"):

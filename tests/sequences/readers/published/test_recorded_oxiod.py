@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from alike import turned_and_measured
 from recorded import DATA
 
 from stario.sequences.readers import find_recordings, read_recording
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 OXIOD = DATA / "oxiod"
 needs_data = pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
@@ -20,26 +20,15 @@ SELECTED = (
 ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
 
 
-def true_and_measured_rotations(
-    sequence: ImuSequence, truth: Trajectory, seconds: float
-) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors [rad] of the attitude and of the gyroscope over `seconds`, in B."""
-    stride = round(seconds * 100.0)
-    steps = 0.5 * np.diff(sequence.time)[:, None] * (sequence.gyro[1:] + sequence.gyro[:-1])
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    at = np.stack([np.interp(truth.time, sequence.time, angle[:, k]) for k in range(3)], axis=1)
-    inside = (truth.time > sequence.time[0]) & (truth.time < sequence.time[-1]) & truth.valid
-    good = inside[:-stride] & inside[stride:]
-    attitude = truth.attitude_WB
-    true = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
-    return true[good], (at[stride:] - at[:-stride])[good]
-
-
 def assert_consistent(path: Path) -> None:
     sequence = read_recording(path)
     truth = sequence.truth
     assert truth is not None
-    true, measured = true_and_measured_rotations(sequence, truth, 0.1)
+    stride = 10
+    true, measured = turned_and_measured(sequence, truth, stride)
+    inside = (truth.time > sequence.time[0]) & (truth.time < sequence.time[-1]) & truth.valid
+    good = inside[:-stride] & inside[stride:]
+    true, measured = true[good], measured[good]
     assert np.corrcoef(true.ravel(), measured.ravel())[0, 1] > 0.95
     # No flip or glitch remains: over 0.1 s the two rotations agree to a few degrees.
     difference = np.degrees(np.linalg.norm(true - measured, axis=1))
