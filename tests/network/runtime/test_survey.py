@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from stario.network.architectures import build_network
-from stario.network.runtime.memory import peak_bytes
-from stario.network.runtime.survey import measured, survey, survey_table
+from stario.network.runtime.survey import measured, peak_bytes, survey, survey_table
 from stario.sequences.errors import InputError
 
 
