@@ -57,6 +57,7 @@ from stario.sequences.windows import (
     VELOCITY_WEIGHTS,
     WINDOW_RATE,
     WINDOW_SAMPLES,
+    runs,
 )
 
 log = logging.getLogger(__name__)
@@ -144,12 +145,12 @@ class LegSampler:
         if not all(found):
             log.warning(
                 "%s: skipping %d of %d stretches, which hold no two legs within %d s",
-                streams[0].kind, sum(not runs for runs in found), len(found), seconds,
+                streams[0].kind, found.count([]), len(found), seconds,
             )  # fmt: skip
         self._runs = [
             (stream, first, count)
-            for stream, runs in zip(streams, found, strict=True)
-            for first, count in runs
+            for stream, beginnings in zip(streams, found, strict=True)
+            for first, count in beginnings
         ]
         counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
         self._cumulative = (counts / counts.sum()).cumsum(0)
@@ -165,9 +166,8 @@ class LegSampler:
         heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
-        varied = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
-        R_NH = varied.R_HW.mT * varied.mirror[:, None, 3:]
-        windows = varied.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
+        imu, R_NH = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
+        windows = imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
         leg_tensors = [*_padded(drawn, self._seconds), change]
         return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *leg_tensors)
 
@@ -184,8 +184,7 @@ def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
     # Counted as in `_inside`: legs are in order of time.
     over = np.searchsorted(stream.stop, begin + seconds, side="right")
     enough = over - np.searchsorted(stream.start, begin) >= 2
-    edges = np.flatnonzero(np.diff(enough, prepend=False, append=False)).reshape(-1, 2)
-    return [(int(first), int(stop - first)) for first, stop in edges]
+    return [(first, stop - first) for first, stop in runs(enough)]
 
 
 def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
