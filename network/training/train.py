@@ -87,8 +87,8 @@ def train(
         held_out = ValidationSet(
             validation,
             run.device,
-            validation_legs,
             config,
+            validation_legs,
             chosen_by_legs,
             run.network.is_recurrent,
         )

@@ -287,12 +287,12 @@ def test_legs_of_short_walks_can_select_the_weights_alone() -> None:
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), [part], TrainingConfig(), chosen_by_legs=True
+        world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part], chosen_by_legs=True
     )
     assert list(held_out.legs) == ["positions"]  # of eight seconds, though training uses twelve
     errors = {"walk": 5.0, "positions": 0.25}
     assert held_out.selection_error(errors) == 0.25
-    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
+    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part])
     assert combined.selection_error(errors) == 2.625
 
 
@@ -325,8 +325,8 @@ def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> 
 def test_validation_skips_legs_without_information(caplog: pytest.LogCaptureFixture) -> None:
     """Their error would be 0, the best possible."""
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), leg_streams(with_positions("waypoints", 25.0)),
-        TrainingConfig(), chosen_by_legs=True,
+        world_streams(WALK), torch.device("cpu"), TrainingConfig(),
+        leg_streams(with_positions("waypoints", 25.0)), chosen_by_legs=True,
     )  # fmt: skip
     assert held_out.legs == {}
     assert held_out.selection_error({"walk": 5.0}) == 5.0
