@@ -235,10 +235,13 @@ class TrainingRun:
         first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
         return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
 
-    def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
-        """Validate an epoch in the leading process and share the error with the others."""
+    def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
+        """Validate an epoch in the leading process, which shares the error with the others.
+
+        The weights are kept if they are the best so far; checkpoint and log are written.
+        """
         errors = held_out.errors(self.averaged) if self.workers.is_leader else {}
-        return EpochReport(
+        report = EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
             training_error=training_error,
             validation_error=self.workers.broadcast(held_out.selection_error(errors)),
@@ -246,19 +249,16 @@ class TrainingRun:
             windows_per_second=self._windows / (self._drawing_s + self._learning_s),
             drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
         )
-
-    def record(self, report: EpochReport) -> None:
-        """Keep the weights if they are the best so far; write checkpoint and log."""
         self.history.append(report)
         if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self._keep_averaged()
-        if not self.workers.is_leader:
-            return
-        history = [asdict(r) for r in self.history]
-        path, config = self._checkpoint, self.config
-        write_checkpoint(path, config, self._material, self.step, history, self._tensors())
-        with atomic_write(self.folder / "log.json") as file:
-            file.write(json.dumps(history, indent=1))
+        if self.workers.is_leader:
+            history = [asdict(r) for r in self.history]
+            path, config = self._checkpoint, self.config
+            write_checkpoint(path, config, self._material, self.step, history, self._tensors())
+            with atomic_write(self.folder / "log.json") as file:
+                file.write(json.dumps(history, indent=1))
+        return report
 
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint, from which `_restore` continues."""

@@ -84,17 +84,12 @@ def train(
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
+        recurrent = run.network.is_recurrent
         held_out = ValidationSet(
-            validation,
-            run.device,
-            config,
-            validation_legs,
-            chosen_by_legs,
-            run.network.is_recurrent,
+            validation, run.device, config, validation_legs, chosen_by_legs, recurrent
         )
         while run.step < config.steps and not run.should_stop():
-            report = run.report(run.epoch(on_step), held_out)
-            run.record(report)
+            report = run.validate(run.epoch(on_step), held_out)
             if processes.is_leader:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
