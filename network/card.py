@@ -100,10 +100,8 @@ def card_path(weights: Path) -> Path:
 def dump_card(card: Card) -> str:
     """Return the card as JSON text."""
     known = card.known_motion
-    content = {k: v for k, v in asdict(card).items() if k != "known_motion" or known is not None}
-    if known is not None:
-        content["known_motion"] = known.as_dict()
-    return json.dumps(content, indent=2) + "\n"
+    content = asdict(card) | {"known_motion": None if known is None else known.as_dict()}
+    return json.dumps({k: v for k, v in content.items() if v is not None}, indent=2) + "\n"
 
 
 def read_card(weights: Path) -> Card:

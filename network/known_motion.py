@@ -167,14 +167,13 @@ def step_rates(imu_N: NDArray[np.float32]) -> FloatArray:
 
 
 def known_motion(
-    streams: Sequence[WorldStream], legs: Sequence[LegStream] = (), seed: int = 0
+    streams: Sequence[WorldStream], legs: Sequence[LegStream] = ()
 ) -> KnownMotion | None:
     """Summarise the motion in training streams; return None for less than a minute of them.
 
     Args:
         streams: streams with full ground truth.
         legs: streams with weak truth.
-        seed: seed of the initial centres.
     """
     imus = [stream.imu_W for stream in streams] + [stream.imu_N for stream in legs]
     count = sum(len(imu) // WINDOW_SAMPLES for imu in imus)
@@ -187,7 +186,7 @@ def known_motion(
         "speed": np.concatenate([_speeds(stream, stride) for stream in streams]),
     }
     most = min(_CENTRES, count // _WINDOWS_OF_CENTRE)
-    centres, limit = _centres(scaled_features(values), most, seed)
+    centres, limit = _centres(scaled_features(values), most)
     columns = dict(zip(FEATURES, values.T, strict=True)) | told
     return KnownMotion(centres, limit, {k: _range(v) for k, v in columns.items() if len(v)})
 
@@ -206,14 +205,12 @@ def _speeds(stream: WorldStream, stride: int) -> FloatArray:
     return np.asarray(np.linalg.norm(moved[:, :2], axis=1) / WINDOW_SECONDS)
 
 
-def _centres(
-    known: FloatArray, count: int, seed: int
-) -> tuple[tuple[tuple[float, ...], ...], float]:
+def _centres(known: FloatArray, count: int) -> tuple[tuple[tuple[float, ...], ...], float]:
     from scipy.cluster.vq import kmeans2, vq
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about a centre without windows
-        found, _ = kmeans2(known, count, minit="points", seed=seed)
+        found, _ = kmeans2(known, count, minit="points", seed=0)
     rounded = np.round(found, 3)
     limit = max(float(np.percentile(vq(known, rounded)[1], _PERCENTILE)), 1e-3)
     return tuple(tuple(row) for row in rounded.tolist()), limit

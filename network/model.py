@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card, card_path, dump_card, read_card
-from stario.network.runtime.engines import Engine, TorchEngine
+from stario.network.runtime.engines import Engine, Float32Array, TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
@@ -61,7 +61,7 @@ class DisplacementModel:
         Returns:
             The model itself, or a `StatefulModel` if the network is recurrent.
         """
-        return StatefulModel(self, updates) if self._engine.is_recurrent else self
+        return StatefulModel(self, self._engine, updates) if self._engine.is_recurrent else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
@@ -81,35 +81,19 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self._engine.run(batch)
-        return self._calibrated(batch, mean, log_sigma)
+        return self.calibrated(batch, mean, log_sigma)
 
-    def predict_after(
-        self, window: NDArray[np.float32], state: NDArray[np.float32] | None
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
-        """Predict one window (1, 6, 200) with a recurrent network, from the previous state.
-
-        Returns:
-            Displacement (1, 3) [m], covariance (1, 3, 3) [m^2], and the new state.
-        """
-        if state is None:
-            state = self._engine.first_state()
-        mean, log_sigma, after = self._engine.run(window, state)
-        assert after is not None  # given a state, an engine returns one
-        return *self._calibrated(window, mean, log_sigma), after
-
-    def _calibrated(
-        self,
-        windows: NDArray[np.float32],
-        mean: NDArray[np.float32],
-        log_sigma: NDArray[np.float32],
+    def calibrated(
+        self, windows: Float32Array, mean: Float32Array, log_sigma: Float32Array
     ) -> tuple[FloatArray, FloatArray]:
+        """Return displacements and covariances, as `predict`, from the network's own outputs."""
         variance = self.card.calibration.variance(log_sigma.astype(np.float64))
         if self.card.known_motion is not None:
             variance *= self.card.known_motion.variance_factor(windows)[:, None]
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
-Memory = tuple[int, tuple[NDArray[np.float32] | None, ...]]
+Memory = tuple[int, tuple[Float32Array | None, ...]]
 """State along a track: number of windows so far, and the network's state for each series."""
 
 
@@ -118,6 +102,7 @@ class StatefulModel:
 
     Args:
         model: model with a recurrent network.
+        engine: engine that runs it.
         updates: number of windows that begin within the length of one; each such series of
             windows, one second apart, has its own state, as in training.
 
@@ -125,23 +110,23 @@ class StatefulModel:
         memory: number of windows so far and the state of each series; may be restored.
     """
 
-    def __init__(self, model: DisplacementModel, updates: int) -> None:
-        self._model = model
+    def __init__(self, model: DisplacementModel, engine: Engine, updates: int) -> None:
+        self._model, self._engine = model, engine
         self.memory: Memory = (0, (None,) * updates)
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the track's next windows, with the interface of `DisplacementModel.predict`."""
         batch = _checked_windows(windows)
-        mean, covariance = np.zeros((len(batch), 3)), np.zeros((len(batch), 3, 3))
-        count, (*states,) = self.memory
+        mean, log_sigma = np.zeros((2, len(batch), 3), np.float32)
+        first, (*states,) = self.memory
         for k in range(len(batch)):
-            series = count % len(states)
-            mean[k : k + 1], covariance[k : k + 1], states[series] = self._model.predict_after(
-                batch[k : k + 1], states[series]
+            series = (first + k) % len(states)
+            before = states[series]
+            mean[k], log_sigma[k], states[series] = self._engine.run(
+                batch[k : k + 1], self._engine.first_state() if before is None else before
             )
-            count += 1
-        self.memory = count, tuple(states)
-        return mean, covariance
+        self.memory = first + len(batch), tuple(states)
+        return self._model.calibrated(batch, mean, log_sigma)
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
@@ -238,7 +223,7 @@ def weights_named(name: str, runs: Path) -> str | Path:
     raise WeightsError(path, "file", "no such file", f"weights of {name}", fix)
 
 
-def _checked_windows(windows: ArrayLike) -> NDArray[np.float32]:
+def _checked_windows(windows: ArrayLike) -> Float32Array:
     batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):
         raise InputError("windows", f"shape {batch.shape}", f"(B, 6, {WINDOW_SAMPLES})")

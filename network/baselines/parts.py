@@ -24,13 +24,7 @@ class ConvNorm(nn.Sequential):
     ) -> None:
         super().__init__(
             nn.Conv1d(
-                inputs,
-                outputs,
-                kernel,
-                stride,
-                padding=kernel // 2,
-                groups=groups,
-                bias=False,
+                inputs, outputs, kernel, stride, padding=kernel // 2, groups=groups, bias=False
             ),
             nn.BatchNorm1d(outputs),
         )
@@ -41,25 +35,21 @@ class FCOut(nn.Sequential):
 
     Args:
         channels: channels C of the features (B, C, L).
-        transition: channels after the 1x1 convolution.
         length: length L of the features.
-        hidden: width of both hidden layers.
         outputs: number of outputs per window.
     """
 
-    def __init__(
-        self, channels: int, transition: int, length: int, hidden: int, outputs: int
-    ) -> None:
+    def __init__(self, channels: int, length: int, outputs: int) -> None:
         super().__init__(
-            ConvNorm(channels, transition),
+            ConvNorm(channels, 128),
             nn.Flatten(),
-            nn.Linear(transition * length, hidden),
+            nn.Linear(128 * length, 512),
             nn.ReLU(),
             nn.Dropout(0.5),
-            nn.Linear(hidden, hidden),
+            nn.Linear(512, 512),
             nn.ReLU(),
             nn.Dropout(0.5),
-            nn.Linear(hidden, outputs),
+            nn.Linear(512, outputs),
         )
 
 
@@ -170,10 +160,10 @@ def inverted_residuals(
     return nn.Sequential(*blocks)
 
 
-def mobile_head(inputs: int, activation: type[nn.Module], outputs: int) -> nn.Sequential:
-    """Return a head that maps features (B, C, L) to (B, outputs) by the mean of 1280 channels."""
+def mobile_head(activation: type[nn.Module], outputs: int) -> nn.Sequential:
+    """Return a head that maps features (B, 320, L) to (B, outputs) by the mean of 1280 channels."""
     return nn.Sequential(
-        ConvNorm(inputs, 1280),
+        ConvNorm(320, 1280),
         activation(),
         nn.AdaptiveAvgPool1d(1),
         nn.Flatten(),

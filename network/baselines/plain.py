@@ -54,7 +54,7 @@ class RoninResNet(nn.Module):
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
         self.trunk = nn.Sequential(resnet_stem(), residual_groups(self.block))
-        self.head = FCOut(512, 128, 7, 512, outputs)
+        self.head = FCOut(512, 7, outputs)
         initialise_as_ronin(self)
 
     def forward(self, windows: Tensor) -> Tensor:
@@ -69,8 +69,8 @@ class Tlio(nn.Module):
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
         self.trunk = nn.Sequential(resnet_stem(), residual_groups(BasicBlock))
-        self.mean = FCOut(512, 128, 7, 512, outputs // 2)
-        self.log_sigma = FCOut(512, 128, 7, 512, outputs // 2)
+        self.mean = FCOut(512, 7, outputs // 2)
+        self.log_sigma = FCOut(512, 7, outputs // 2)
         initialise_as_ronin(self)
 
     def forward(self, windows: Tensor) -> Tensor:
@@ -85,7 +85,7 @@ class RoninLstm(nn.Module):
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
         self.lstm = nn.LSTM(6, 100, num_layers=3, batch_first=True)
-        self.head = FCOut(100, 128, WINDOW_SAMPLES, 512, outputs)
+        self.head = FCOut(100, WINDOW_SAMPLES, outputs)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Map (B, 6, 200) to (B, outputs)."""
@@ -130,7 +130,7 @@ class MnasNet(_Layers):
             nn.ReLU6(),
             ConvNorm(32, 16),
             inverted_residuals(16, _MNAS_ROWS, nn.ReLU6),
-            mobile_head(320, nn.ReLU6, outputs),
+            mobile_head(nn.ReLU6, outputs),
         )
 
 
@@ -142,5 +142,5 @@ class EfficientNetB0(_Layers):
             ConvNorm(6, 32, 3, 2),
             nn.SiLU(),
             inverted_residuals(32, _EFFICIENT_ROWS, nn.SiLU),
-            mobile_head(320, nn.SiLU, outputs),
+            mobile_head(nn.SiLU, outputs),
         )

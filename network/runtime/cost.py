@@ -72,7 +72,7 @@ def _linear(module: nn.Linear, x: Tensor, y: Tensor) -> int:
 
 
 def _norm(module: nn.BatchNorm1d, x: Tensor, y: Tensor) -> int:
-    return (4 if module.affine else 2) * x.numel()
+    return 4 * x.numel()
 
 
 def _global_pool(module: nn.AdaptiveAvgPool1d, x: Tensor, y: Tensor) -> int:
@@ -83,8 +83,7 @@ def _lstm(module: nn.LSTM, x: Tensor, y: Any) -> int:
     hidden = module.hidden_size
     steps = x.shape[0] * x.shape[1]
     inputs = [module.input_size, *[hidden] * (module.num_layers - 1)]
-    bias = 2 * hidden if module.bias else 0
-    return steps * sum(4 * ((n + hidden) * hidden + hidden + bias) + 4 * hidden for n in inputs)
+    return steps * sum(4 * ((n + hidden) * hidden + 3 * hidden) + 4 * hidden for n in inputs)
 
 
 _RULES: dict[type[nn.Module], Callable[..., int]] = {

@@ -6,7 +6,7 @@ after the previous window and returns the state for the next one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,28 +22,6 @@ Answer = tuple[Float32Array, Float32Array, Float32Array | None]
 """Displacement (B, 3) [m], log sigma (B, 3), and the state after these windows."""
 
 _BATCH = 64
-
-
-class Engine(Protocol):
-    """Interface that a model requires of an engine."""
-
-    @property
-    def is_recurrent(self) -> bool:
-        """Whether the network is recurrent: it carries a state from window to window."""
-        ...
-
-    @property
-    def training_form(self) -> DisplacementNetwork:
-        """Network with trainable weights."""
-        ...
-
-    def first_state(self) -> Float32Array:
-        """Return the state (2, 1, H) of a recurrent network before the first window."""
-        ...
-
-    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
-        ...
 
 
 class TorchEngine:
@@ -131,3 +109,6 @@ class OnnxEngine:
             parts.append(self._session.run(["displacement", "log_sigma"], feed))
         mean, log_sigma = (np.concatenate(part) for part in zip(*parts, strict=True))
         return mean, log_sigma, None
+
+
+Engine = TorchEngine | OnnxEngine

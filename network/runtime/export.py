@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -47,16 +47,20 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
     """
     onnx_packages("onnx", "onnxscript")
     network = model.training_form
+    recurrent, batch = network.is_recurrent, torch.export.Dim("batch")
+    inputs = {"windows": torch.zeros(2, 6, WINDOW_SAMPLES)}
+    if recurrent:
+        inputs["state"] = network.first_state(2)
     with _quiet():
         program = torch.onnx.export(
-            _Step(network) if network.is_recurrent else network,
-            _examples(network),
+            _Step(network) if recurrent else network,
+            tuple(inputs.values()),
             dynamo=True,
             external_data=False,
             verbose=False,
-            input_names=["windows", "state"][: 1 + network.is_recurrent],
-            output_names=["displacement", "log_sigma", "next_state"][: 2 + network.is_recurrent],
-            dynamic_shapes=_shapes(network),
+            input_names=list(inputs),
+            output_names=["displacement", "log_sigma", "next_state"][: 2 + recurrent],
+            dynamic_shapes=({0: batch}, {1: batch})[: len(inputs)],
         )
     assert program is not None
     graph = program.model_proto
@@ -76,16 +80,6 @@ class _Step(nn.Module):
 
     def forward(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.network.step(windows, state)
-
-
-def _examples(network: DisplacementNetwork) -> tuple[Tensor, ...]:
-    windows = torch.zeros(2, 6, WINDOW_SAMPLES)
-    return (windows, network.first_state(2)) if network.is_recurrent else (windows,)
-
-
-def _shapes(network: DisplacementNetwork) -> tuple[dict[int, Any], ...]:
-    batch = torch.export.Dim("batch")
-    return ({0: batch}, {1: batch}) if network.is_recurrent else ({0: batch},)
 
 
 @contextmanager

@@ -35,8 +35,8 @@ from stario.network.runtime.folded_layers import (
     Scratch,
     Star,
     Wings,
+    affine,
 )
-from stario.network.runtime.folding import affine
 from stario.network.stario import Block, StarIO
 from stario.sequences.windows import WINDOW_SAMPLES
 

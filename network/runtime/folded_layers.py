@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from stario.network.runtime.folding import affine
 from stario.network.stario import EPSILON, DualWingStarBlock, GatedUnit
 
 
@@ -62,6 +61,15 @@ class Scratch:
         self.sums = torch.empty(2, batch, inner + length)
         self.wings = torch.empty(batch, inner + length)
         self.energy = torch.empty(batch, 1)
+
+
+def affine(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+    """Return the scale and offset (C,) of a trained batch norm, in double precision."""
+    assert norm.running_var is not None
+    assert norm.running_mean is not None
+    variance, mean = norm.running_var.double(), norm.running_mean.double()
+    scale = norm.weight.detach().double() / torch.sqrt(variance + norm.eps)
+    return scale, norm.bias.detach().double() - scale * mean
 
 
 class Depthwise:

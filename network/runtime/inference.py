@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import copy
+from typing import TYPE_CHECKING, Any
 
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from stario.network.baselines.parts import ConvNorm
 from stario.network.runtime.fast_stario import FastStarIO
-from stario.network.runtime.folding import folded
 from stario.network.stario import StarIO
 
 if TYPE_CHECKING:
@@ -23,6 +27,17 @@ def inference_form(network: DisplacementNetwork) -> DisplacementNetwork:
             evaluation mode.
     """
     inner = network.eval().network
-    fast = FastStarIO(inner) if isinstance(inner, StarIO) else folded(inner)
+    fast = FastStarIO(inner) if isinstance(inner, StarIO) else _folded(inner)
     # The same centring and clamping around the faster network.
     return type(network)(fast).eval()
+
+
+def _folded(network: nn.Module) -> nn.Module:
+    """Return a copy with every `ConvNorm` as one convolution with bias."""
+    network = copy.deepcopy(network).requires_grad_(False)
+    for parent in list(network.modules()):
+        for name, child in parent.named_children():
+            if isinstance(child, ConvNorm):
+                pair: Any = child.double()
+                setattr(parent, name, fuse_conv_bn_eval(pair[0], pair[1]).float())
+    return network

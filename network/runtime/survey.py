@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from stario.network.architectures import ARCHITECTURES, architecture, build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel
-from stario.network.runtime.cost import table_cost
+from stario.network.runtime.benchmark import milliseconds_in_turn, random_windows
+from stario.network.runtime.cost import cost
 from stario.network.runtime.engines import Engine, TorchEngine
+from stario.network.runtime.fast_stario import FastStarIO
 from stario.network.runtime.inference import inference_form
-from stario.network.runtime.memory import peak_bytes
-from stario.network.runtime.timing import seconds_in_turn
 from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WINDOW_SAMPLES
 
 BATCHES = (1, 64)
 
 _RUNS = {1: 60, 64: 10}
-
-_SEED = 0
 
 Milliseconds = dict[str, dict[str, float] | None]
 
@@ -95,25 +94,21 @@ def survey(
     Raises:
         InputError: a name is unknown.
     """
-    entries = [architecture(name) for name in names]
-    models = [_model(name) for name in names]
-    engines: dict[str, list[Engine] | None] = {
-        "torch": [TorchEngine(model.training_form) for model in models],
-        "onnxruntime": None,
-    }
+    engines: list[Engine] = [_engine(name) for name in names]
+    times = {"torch": _times(engines), "onnxruntime": None}
     if cache is not None and all(
         importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")
     ):
         graphs: list[Engine] = []
-        for done, model in enumerate(models, 1):
-            graphs.append(_graph_engine(model, cache))
-            progress(0.6 * done / len(models))
-        engines["onnxruntime"] = graphs
-    times = {name: _times(group) if group else None for name, group in engines.items()}
+        for name, engine in zip(names, engines, strict=True):
+            graphs.append(_graph_engine(name, engine, cache))
+            progress(0.6 * len(graphs) / len(names))
+        times["onnxruntime"] = _times(graphs)
     progress(0.9)
     rows = []
-    for column, (name, entry, model) in enumerate(zip(names, entries, models, strict=True)):
-        counted, whole = table_cost(name), build_network(name, entry.table_outputs)
+    for column, (name, engine) in enumerate(zip(names, engines, strict=True)):
+        whole = build_network(name, architecture(name).table_outputs)
+        counted = cost(whole)
         rows.append(
             ModelRow(
                 name=name,
@@ -121,10 +116,10 @@ def survey(
                 flops=counted.flops,
                 numel=sum(p.numel() for p in whole.parameters()),
                 milliseconds={
-                    engine: None if found is None else {b: row[column] for b, row in found.items()}
-                    for engine, found in times.items()
+                    runtime: None if found is None else {b: row[column] for b, row in found.items()}
+                    for runtime, found in times.items()
                 },
-                peak_memory_mb=_peak_memory(model.training_form) / 1e6,
+                peak_memory_mb=_peak_memory(engine.training_form) / 1e6,
             )
         )
     progress(1.0)
@@ -150,13 +145,12 @@ def survey_table(rows: Sequence[ModelRow]) -> str:
     return "\n".join([*aligned(table), *(f"{name}: {text}." for name, text in measured().items())])
 
 
-def _model(name: str) -> DisplacementModel:
-    torch.manual_seed(_SEED)
-    network = DisplacementNetwork(build_network(name))
-    return DisplacementModel(TorchEngine(network), Card(name))
+def _engine(name: str) -> TorchEngine:
+    torch.manual_seed(0)
+    return TorchEngine(DisplacementNetwork(build_network(name)))
 
 
-def _graph_engine(model: DisplacementModel, cache: Path) -> Engine:
+def _graph_engine(name: str, engine: Engine, cache: Path) -> Engine:
     """Return the exported graph, from the cache if the code that makes it is unchanged."""
     from stario.network.runtime.export import export_onnx
     from stario.network.runtime.onnx_file import load_onnx
@@ -164,40 +158,73 @@ def _graph_engine(model: DisplacementModel, cache: Path) -> Engine:
     sources = b"".join(
         path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py"))
     )
-    key = hashlib.sha256(sources + f"{torch.__version__} {model.name}".encode()).hexdigest()
+    key = hashlib.sha256(sources + f"{torch.__version__} {name}".encode()).hexdigest()
     path = cache / f"graph-{key[:16]}.onnx"
     if not path.exists():
         cache.mkdir(parents=True, exist_ok=True)
-        export_onnx(model, path)
+        export_onnx(DisplacementModel(engine, Card(name)), path)
     return load_onnx(path)[0]
 
 
 def _times(engines: Sequence[Engine]) -> dict[str, list[float]]:
     """Return the time per window [ms] of each engine, by batch size."""
-    generator = np.random.default_rng(_SEED)
-    result = {}
-    for batch in BATCHES:
-        windows = generator.standard_normal((batch, 6, WINDOW_SAMPLES)).astype(np.float32)
-        windows[:, 5] += STANDARD_GRAVITY
-        calls = [partial(engine.run, windows) for engine in engines]
-        medians = np.median(seconds_in_turn(calls, _RUNS[batch]), axis=0)
-        result[str(batch)] = (1e3 / batch * medians).tolist()
-    return result
+    return {
+        str(batch): np.median(
+            milliseconds_in_turn([e.run for e in engines], random_windows(batch), _RUNS[batch]),
+            axis=0,
+        ).tolist()
+        for batch in BATCHES
+    }
 
 
 def _peak_memory(network: DisplacementNetwork) -> int:
     form = inference_form(network)
-    window = torch.zeros(1, 6, WINDOW_SAMPLES)
-
-    return _weights(form) + peak_bytes(lambda: form(window))
-
-
-def _weights(form: nn.Module) -> int:
-    """Return the bytes of parameters and buffers, including the folded weights of `FastStarIO`."""
-    from stario.network.runtime.fast_stario import FastStarIO
-
     known = [*form.parameters(), *form.buffers()]
-    for module in form.modules():
-        if isinstance(module, FastStarIO):
-            known += module.weights()
-    return sum(t.numel() * t.element_size() for t in known)
+    if isinstance(form.network, FastStarIO):
+        known += form.network.weights()
+    weights = sum(t.numel() * t.element_size() for t in known)
+    window = torch.zeros(1, 6, WINDOW_SAMPLES)
+    return weights + peak_bytes(lambda: form(window))
+
+
+def peak_bytes(work: Callable[[], object]) -> int:
+    """Return the peak memory [bytes] of operations' results, in addition to existing tensors.
+
+    Memory that an operation takes and frees internally, such as a packed copy of its weights, is
+    not counted.
+    """
+    counter = _Counter()
+    with torch.no_grad(), counter:
+        work()
+    return counter.peak
+
+
+class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Counter of the bytes of all new tensors' storages that have not been freed."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.current: int = 0
+        self.peak: int = 0
+        self._alive: set[int] = set()
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        result = function(*args, **(kwargs or {}))
+        for value in tree_leaves(result):
+            if isinstance(value, torch.Tensor):
+                self._add(value.untyped_storage())
+        return result
+
+    def _add(self, storage: torch.UntypedStorage) -> None:
+        key, size = storage._cdata, storage.nbytes()
+        if key not in self._alive:
+            self._alive.add(key)
+            self.current += size
+            self.peak = max(self.peak, self.current)
+            weakref.finalize(storage, self._remove, key, size)
+
+    def _remove(self, key: int, size: int) -> None:
+        self._alive.discard(key)
+        self.current -= size

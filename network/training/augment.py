@@ -8,6 +8,7 @@ the device about a nearby point (`stario.network.training.lever_arm`).
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -20,6 +21,8 @@ from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, WorldStream
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,14 +88,14 @@ class WindowSampler:
     Streams may be memory-mapped: a batch reads the stretches it is cut from and keeps nothing.
 
     Args:
-        streams: one or more, each longer than the windows at the fastest replay.
+        streams: streams; those shorter than the windows at the fastest replay are skipped.
         weights: relative frequency of each stream, per second of its length.
         augmentation: extent of the random variation.
         seed: seed of all draws.
         successive: consecutive windows, one second apart, that are drawn and varied as one.
 
     Raises:
-        InputError: a stream is too short.
+        InputError: no stream is long enough.
     """
 
     def __init__(
@@ -105,15 +108,19 @@ class WindowSampler:
     ) -> None:
         self.augmentation = augmentation
         self._successive = successive
-        reach = reach_of(augmentation, successive)
-        for stream in streams:
-            if len(stream) < reach:
-                found = f"a stretch of {len(stream)} samples"
-                raise InputError(stream.name, found, f"at least {reach}, for the fastest replay")
-        self._streams = streams
-        self._reach = reach
-        self._starts = torch.tensor([len(s) - reach + 1 for s in streams])
-        share = self._starts.double() * torch.tensor(list(weights), dtype=torch.float64)
+        self._reach = reach = reach_of(augmentation, successive)
+        pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= reach]
+        if not pairs:
+            expected = "one long enough for the windows at the fastest replay"
+            raise InputError("streams", f"none with {reach} samples at 200 Hz", expected)
+        if len(pairs) < len(streams):
+            log.warning(
+                "skipping %d of %d stretches, shorter than the %.1f s that windows span",
+                len(streams) - len(pairs), len(streams), reach / WINDOW_RATE,
+            )  # fmt: skip
+        self._streams, kept = zip(*pairs, strict=True)
+        self._starts = torch.tensor([len(s) - reach + 1 for s in self._streams])
+        share = self._starts.double() * torch.tensor(kept, dtype=torch.float64)
         self._cumulative = (share / share.sum()).cumsum(0)
         self.generator = torch.Generator().manual_seed(seed)
 
@@ -126,7 +133,9 @@ class WindowSampler:
         stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._streams) - 1)
         # Whole samples: at speed 1, interpolation would smooth data that is not smoothed otherwise.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
-        speed = self._speeds(size)
+        low, high = self.augmentation.speeds
+        speed = low + (high - low) * self._uniform(size)
+        speed = torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
         steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
         at = offset.double()[:, None] + steps * speed[:, None].double()
         imu_W, position_W, facing_W = self._pieces(stream.tolist(), offset.long().tolist())
@@ -150,11 +159,6 @@ class WindowSampler:
                 array[row] = values[part]
         return [torch.from_numpy(array) for array in arrays]
 
-    def _speeds(self, size: int) -> Tensor:
-        low, high = self.augmentation.speeds
-        speed = low + (high - low) * self._uniform(size)
-        return torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
-
     def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
         """Add swings in W, then apply `augmented`, which rotates each second into its frame H.
 
@@ -168,10 +172,9 @@ class WindowSampler:
         imu, displacement = apply_swing(imu, displacement, swings)
         heading = heading_of(facing.view(size, seconds, -1, 2), swings)
         imu = imu.reshape(size * seconds, WINDOW_SAMPLES, 6)
-        varied = augmented(imu, heading.flatten(), a, self.generator, seconds)
-        displacement = displacement.reshape(-1, 1, 3) @ varied.R_HW.mT
-        displacement = displacement * varied.mirror[:, None, 3:]
-        return varied.imu.view(size, -1, 6), displacement.view(size, seconds, 3)
+        imu, R_WH = augmented(imu, heading.flatten(), a, self.generator, seconds)
+        displacement = displacement.reshape(-1, 1, 3) @ R_WH
+        return imu.view(size, -1, 6), displacement.view(size, seconds, 3)
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator)
@@ -185,28 +188,13 @@ def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
     return torch.cat([imu[..., :3] * s, accel], dim=2)
 
 
-@dataclass(frozen=True, eq=False)
-class AugmentedWindows:
-    """Windows as presented to the network.
-
-    Attributes:
-        imu: (B, 200, 6).
-        R_HW: (B, 3, 3) rotation from W to the frame of `imu`, before mirroring.
-        mirror: (B, 6) signs of the mirror image for axial vectors, then for polar ones.
-    """
-
-    imu: Tensor
-    R_HW: Tensor
-    mirror: Tensor
-
-
 def augmented(
     imu: Tensor,
     heading: Tensor,
     augmentation: Augmentation,
     generator: torch.Generator,
     together: int = 1,
-) -> AugmentedWindows:
+) -> tuple[Tensor, Tensor]:
     """Rotate windows (B, 200, 6) from W into frame H, as an imperfect device would measure them.
 
     They are rotated by minus the heading (B,) plus an error; mirrored left to right, which in H is
@@ -218,6 +206,10 @@ def augmented(
         augmentation: extent of the random variation.
         generator: generator of all draws.
         together: consecutive windows that share mirroring, tilt, biases and noise level.
+
+    Returns:
+        Windows (B, 200, 6) as presented to the network, and R_WH (B, 3, 3), which maps vectors such
+        as its displacements to W and undoes the mirroring.
     """
     a, groups = augmentation, len(imu) // together
 
@@ -245,7 +237,7 @@ def augmented(
     imu = tilted.reshape(imu.shape) + of_each(symmetric(groups, 6) * limits).unsqueeze(1)
     white = torch.randn(imu.shape, generator=generator)
     imu = imu + white * of_each(uniform(groups)[:, None, None] ** 2 * deviations)
-    return AugmentedWindows(imu, R_HW, mirror)
+    return imu, R_HW.mT * mirror[:, None, 3:]
 
 
 def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:
@@ -254,7 +246,7 @@ def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:
     angle = torch.atan2(facing[..., 1], facing[..., 0])
     if swings is not None:
         time = torch.arange(seconds * instants) * (HEADING_STEP / WINDOW_RATE)
-        turn = swings.angle.at(time)[0] * swings.axis[:, 2:]
+        turn = swings.angle(time)[0] * swings.axis[:, 2:]
         angle = angle + turn.view(size, seconds, instants)
     length = facing.norm(dim=-1)
     return torch.atan2((length * angle.sin()).sum(-1), (length * angle.cos()).sum(-1))

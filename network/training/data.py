@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -168,23 +167,19 @@ def _is_long(stream: Stream) -> bool:
 def cached_walks(
     count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
 ) -> list[WorldStream]:
-    """Return `generated_streams` of walks of one minute, cached in `folder`."""
-    build = partial(generated_streams, count, _WALK_SECONDS, seed, attitude)
+    """Return streams of a simulated phone's IMU along walks of one minute, cached in `folder`."""
+
+    def build() -> list[WorldStream]:
+        rng = np.random.default_rng(seed)
+        streams = []
+        for index in range(count):
+            walk, sensor = (int(k) for k in rng.integers(2**31, size=2))
+            trajectory = generate_walk(walk, _WALK_SECONDS)
+            name = f"walk-{index}"
+            simulated = simulate_imu(trajectory, 200.0, PHONE_IMU, sensor, name=name)
+            streams += world_streams(simulated, attitude=attitude)
+        return streams
+
     module = Path(__file__).read_text(encoding="utf-8")
     key = {"kind": "generated", "values": [count, seed, attitude], "module": module}
     return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
-
-
-def generated_streams(
-    count: int, seconds: float, seed: int, attitude: Attitude = "levelled"
-) -> list[WorldStream]:
-    """Return stretches of a simulated phone's IMU along generated walks."""
-    rng = np.random.default_rng(seed)
-    streams = []
-    for index in range(count):
-        walk, sensor = (int(k) for k in rng.integers(2**31, size=2))
-        trajectory = generate_walk(walk, seconds)
-        name = f"walk-{index}"
-        simulated = simulate_imu(trajectory, 200.0, PHONE_IMU, sensor, name=name)
-        streams += world_streams(simulated, attitude=attitude)
-    return streams

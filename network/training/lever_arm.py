@@ -25,40 +25,29 @@ _FREQUENCIES = (0.1, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Sines:
-    """Sums of K sines, one for each of B windows.
+class Swing:
+    """One swing for each of B windows; its angle is a sum of K sines.
 
     Attributes:
+        axis: (B, 3) unit vectors in W.
+        lever: (B, 3) from the pivot to the device at angle zero [m].
         amplitude: (B, K) [rad].
         frequency: (B, K) [rad/s].
         phase: (B, K) [rad].
     """
 
+    axis: Tensor
+    lever: Tensor
     amplitude: Tensor
     frequency: Tensor
     phase: Tensor
 
-    def at(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return value, first and second derivative (B, T) at times (T,) [s]."""
+    def angle(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the angle about the axis and two derivatives (B, T) [rad] at times (T,) [s]."""
         argument = self.frequency[..., None] * time + self.phase[..., None]
         a, w = self.amplitude[..., None], self.frequency[..., None]
         sine = a * argument.sin()
         return sine.sum(-2), (a * w * argument.cos()).sum(-2), -(w**2 * sine).sum(-2)
-
-
-@dataclass(frozen=True, eq=False)
-class Swing:
-    """One swing for each of B windows.
-
-    Attributes:
-        axis: (B, 3) unit vectors in W.
-        lever: (B, 3) from the pivot to the device at angle zero [m].
-        angle: angle about the axis [rad].
-    """
-
-    axis: Tensor
-    lever: Tensor
-    angle: Sines
 
 
 def sample_swing(
@@ -84,15 +73,16 @@ def sample_swing(
     low, high = (2.0 * math.pi * f for f in _FREQUENCIES)
     frequency = low + (high - low) * uniform(size, _SINES)
     amplitude = swings[:, None] * rate / _SINES * uniform(size, _SINES) / frequency
-    angle = Sines(amplitude, frequency, 2.0 * math.pi * uniform(size, _SINES))
-    return Swing(axis, arm * (swings * lever * uniform(size))[:, None], angle)
+    phase = 2.0 * math.pi * uniform(size, _SINES)
+    lever_W = arm * (swings * lever * uniform(size))[:, None]
+    return Swing(axis, lever_W, amplitude, frequency, phase)
 
 
 def apply_swing(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
     """Add a swing to the IMU (B, 200 K, 6) in W and to displacements (B, K, 3) [m]."""
     length = imu.shape[1]
     time = torch.arange(length + 1) / WINDOW_RATE
-    angle, rate, growth = (values[..., None] for values in swing.angle.at(time))
+    angle, rate, growth = (values[..., None] for values in swing.angle(time))
 
     axis = swing.axis[:, None, :].expand(-1, length + 1, -1)
     lever = _turned(swing.lever[:, None, :].expand_as(axis), axis, angle)

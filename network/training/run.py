@@ -26,11 +26,10 @@ from stario.network.model import DisplacementModel, save_model
 from stario.network.training.augment import WindowSampler
 from stario.network.training.calibrate import calibrate
 from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
-from stario.network.training.config import TrainingConfig, learning_rate
-from stario.network.training.loss import step_loss
+from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegSampler
+from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
 
@@ -85,17 +84,18 @@ class TrainingRun:
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint = folder / "checkpoint.safetensors"
         if config.dropout is not None:
-            _set_dropout(self.network, config.dropout)
+            for module in self.network.modules():
+                if isinstance(module, nn.Dropout):
+                    module.p = config.dropout
         self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self.averaged.load_state_dict(self.network.state_dict())
-        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+        self._keep_averaged()
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.rate, weight_decay=config.weight_decay
         )
         idle = architecture(config.architecture).heads > 1
         shared = workers.wrapped(self.network, idle=idle)
         self._shared: Any = torch.compile(shared) if config.compiled else shared
-        self._mixed = config.precision == "bfloat16"
         if not workers.is_leader:
             torch.manual_seed(config.seed + workers.rank)  # independent dropout
         self.step = 0
@@ -116,6 +116,9 @@ class TrainingRun:
         state = model.training_form.state_dict()
         self.network.load_state_dict(state)
         self.averaged.load_state_dict(state)
+        self._keep_averaged()
+
+    def _keep_averaged(self) -> None:
         self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
 
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
@@ -136,8 +139,7 @@ class TrainingRun:
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
         legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
-        with_sigma = self.step >= self.config.likelihood_from * self.config.steps
-        loss, error = step_loss(self._predict, windows, target, legs, with_sigma)
+        loss, error = self._loss(windows, target, legs)
         self.optimiser.zero_grad()
         torch.autograd.backward(loss)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
@@ -151,6 +153,28 @@ class TrainingRun:
         self._windows += sum(part[..., 0, 0].numel() for part in parts)
         return error
 
+    def _loss(self, windows: Tensor, target: Tensor, legs: list[LegBatch]) -> tuple[Tensor, float]:
+        """Return the loss of windows and legs, and the windows' mean squared error [m^2].
+
+        All pass through the network in one batch, so that its normalisation covers them all.
+
+        Args:
+            windows: (..., 6, 200) with full truth.
+            target: (..., 3) displacements of the windows [m].
+            legs: stretches of weak truth.
+        """
+        parts = [windows.flatten(0, -3), *(part.windows.flatten(0, 1) for part in legs)]
+        sizes = [len(part) for part in parts]
+        mean, log_sigma = self._predict(torch.cat(parts))
+        means, log_sigmas = torch.split(mean, sizes), torch.split(log_sigma, sizes)
+        squared = (means[0] - target.flatten(0, -2)) ** 2
+        with_sigma = self.step >= self.config.likelihood_from * self.config.steps
+        loss = loss_with_sigma(squared, log_sigmas[0]) if with_sigma else squared.sum(1).mean()
+        for part, predicted, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
+            shape = (len(part.known), -1, 3)
+            loss = loss + leg_loss(predicted.view(shape), sigma.view(shape), part)[0]
+        return loss, float(squared.detach().sum(1).mean())
+
     def _predict(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Return displacements and log sigmas (B, 3) of windows (B, 6, 200).
 
@@ -159,7 +183,8 @@ class TrainingRun:
         successive = self.config.successive
         if self.network.is_recurrent:
             windows = windows.view(-1, successive, *windows.shape[1:])
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed):
+        mixed = self.config.precision == "bfloat16"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
             mean, log_sigma = self._shared(windows)
         return mean.view(-1, 3), log_sigma.view(-1, 3)
 
@@ -194,11 +219,10 @@ class TrainingRun:
         Sigma is meaningless until the likelihood is part of the loss: from then on, only epochs
         trained with it count.
         """
-        first = self._first_with_sigma
-        errors = [_or_infinite(r.validation_error) for r in self.history]
-        if len(errors) >= first:
-            errors = errors[first - 1 :]
-        return len(errors) - 1 - int(np.argmin(errors)) if errors else 0
+        counted = self.history[self._first_with_sigma - 1 :] or self.history
+        # `np.argmin` treats NaN as the smallest.
+        errors = [e if math.isfinite(e := r.validation_error) else math.inf for r in counted]
+        return len(errors) - 1 - int(np.argmin(errors))
 
     def should_stop(self) -> bool:
         """Return whether validation has stopped improving; False until sigma is learned."""
@@ -211,10 +235,13 @@ class TrainingRun:
         first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
         return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
 
-    def report(self, training_error: float, held_out: ValidationSet) -> EpochReport:
-        """Validate an epoch in the leading process and share the error with the others."""
+    def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
+        """Validate an epoch in the leading process, which shares the error with the others.
+
+        The weights are kept if they are the best so far; checkpoint and log are written.
+        """
         errors = held_out.errors(self.averaged) if self.workers.is_leader else {}
-        return EpochReport(
+        report = EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
             training_error=training_error,
             validation_error=self.workers.broadcast(held_out.selection_error(errors)),
@@ -222,28 +249,31 @@ class TrainingRun:
             windows_per_second=self._windows / (self._drawing_s + self._learning_s),
             drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
         )
-
-    def record(self, report: EpochReport) -> None:
-        """Keep the weights if they are the best so far; write checkpoint and log."""
         self.history.append(report)
         if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
-            self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
-        if not self.workers.is_leader:
-            return
-        self._write_checkpoint()
-        with atomic_write(self.folder / "log.json") as file:
-            file.write(json.dumps([asdict(r) for r in self.history], indent=1))
+            self._keep_averaged()
+        if self.workers.is_leader:
+            history = [asdict(r) for r in self.history]
+            path, config = self._checkpoint, self.config
+            write_checkpoint(path, config, self._material, self.step, history, self._tensors())
+            with atomic_write(self.folder / "log.json") as file:
+                file.write(json.dumps(history, indent=1))
+        return report
 
-    def _write_checkpoint(self) -> None:
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
-        tensors |= {f"best.{k}": v for k, v in self.best.items()}
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return the tensors of a checkpoint, from which `_restore` continues."""
+        parts = {
+            "network": self.network.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "best": self.best,
+            "random": {
+                "sampler": self.sampler.generator.get_state(),
+                "torch": torch.get_rng_state(),
+            },
+        }
         for index, state in self.optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{index}.{k}": v for k, v in state.items()}
-        tensors["random.sampler"] = self.sampler.generator.get_state()
-        tensors["random.torch"] = torch.get_rng_state()
-        history = [asdict(r) for r in self.history]
-        write_checkpoint(self._checkpoint, self.config, self._material, self.step, history, tensors)
+            parts[f"optimiser.{index}"] = state
+        return {f"{name}.{k}": v for name, part in parts.items() for k, v in part.items()}
 
     def resume(self) -> None:
         """Continue from the folder's checkpoint, if there is one.
@@ -307,14 +337,3 @@ class TrainingRun:
         )
         save_model(path, self.averaged, card)
         return path
-
-
-def _or_infinite(error: float) -> float:
-    """Replace a non-finite error by inf: `np.argmin` treats NaN as the smallest."""
-    return error if math.isfinite(error) else math.inf
-
-
-def _set_dropout(network: nn.Module, share: float) -> None:
-    for module in network.modules():
-        if isinstance(module, nn.Dropout):
-            module.p = share

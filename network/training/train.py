@@ -19,7 +19,7 @@ from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_samplers
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
-from stario.sequences.windows import WINDOW_RATE, WorldStream
+from stario.sequences.windows import WorldStream
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,9 @@ def train(
         fix = "positions and waypoints can only be learned alongside them" if legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
     with workers(config.device, config.batch // config.successive) as processes:
-        sampler = _sampler(config, streams, weights)
+        sampler = WindowSampler(
+            streams, weights, config.augmentation, config.seed, config.successive
+        )
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = TrainingRun(
             config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
@@ -82,37 +84,15 @@ def train(
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
+        recurrent = run.network.is_recurrent
         held_out = ValidationSet(
-            validation,
-            run.device,
-            validation_legs,
-            config,
-            chosen_by_legs,
-            run.network.is_recurrent,
+            validation, run.device, config, validation_legs, chosen_by_legs, recurrent
         )
         while run.step < config.steps and not run.should_stop():
-            report = run.report(run.epoch(on_step), held_out)
-            run.record(report)
+            report = run.validate(run.epoch(on_step), held_out)
             if processes.is_leader:
                 on_epoch(report)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
-
-
-def _sampler(
-    config: TrainingConfig, streams: Sequence[WorldStream], weights: Sequence[float]
-) -> WindowSampler:
-    """Return a sampler of the streams that are long enough for the recipe's windows."""
-    pairs = [(s, w) for s, w in zip(streams, weights, strict=True) if len(s) >= config.reach]
-    if not pairs:
-        found = f"none with {config.reach} samples at 200 Hz"
-        raise InputError("streams", found, "one long enough for the windows at the fastest replay")
-    if len(pairs) < len(streams):
-        log.warning(
-            "skipping %d of %d stretches, shorter than the %.1f s that windows span",
-            len(streams) - len(pairs), len(streams), config.reach / WINDOW_RATE,
-        )  # fmt: skip
-    kept, weights = [s for s, _ in pairs], [w for _, w in pairs]
-    return WindowSampler(kept, weights, config.augmentation, config.seed, config.successive)
 
 
 def _material(

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.known_motion import KnownMotion
@@ -30,7 +29,7 @@ from stario.sequences.windows import (
 
 log = logging.getLogger(__name__)
 
-VALIDATION_STRIDE = 20
+_STRIDE = 20
 """Samples between the starts of successive windows."""
 
 _STRIDES = (20, 40, 50, 100, 200)
@@ -52,8 +51,8 @@ class ValidationSet:
     Args:
         streams: held-out streams with full truth.
         device: device of the evaluated networks.
+        config: recipe that determines how stretches of weak truth are drawn.
         legs: held-out streams with weak truth.
-        config: recipe that determines how their stretches are drawn.
         chosen_by_legs: whether legs alone select the weights, if there are any.
         is_recurrent: whether the evaluated networks are recurrent.
 
@@ -65,16 +64,16 @@ class ValidationSet:
         self,
         streams: Sequence[WorldStream],
         device: torch.device,
+        config: TrainingConfig,
         legs: Sequence[LegStream] = (),
-        config: TrainingConfig | None = None,
         chosen_by_legs: bool = False,
         is_recurrent: bool = False,
     ) -> None:
         self.device, self._chosen_by_legs = device, chosen_by_legs
-        self.legs = _drawn_once(legs, config or TrainingConfig())
+        self.legs = _drawn_once(legs, config)
         # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
         length = sum(len(stream) for stream in streams)
-        self.stride = max(VALIDATION_STRIDE, VALIDATION_STRIDE * (length // _DENSE_SAMPLES))
+        self.stride = max(_STRIDE, _STRIDE * (length // _DENSE_SAMPLES))
         if is_recurrent:
             thinned = max(s for s in _STRIDES if s <= self.stride)
             every, self.stride = self.stride // thinned, thinned
@@ -90,10 +89,17 @@ class ValidationSet:
         """Return errors (M, 3) [m] and log sigmas (M, 3); leave the network in evaluation mode."""
         network.eval()
         errors, log_sigmas = [], []
+        # Windows that begin within the same second belong to separate series, as at inference.
+        batch = WINDOW_SAMPLES // self.stride if network.is_recurrent else _BATCH
         for stream in self.streams:
-            predict = _StreamPredictor(network, self.stride)
-            for windows, target in self._cut(stream, predict.batch):
-                mean, log_sigma = predict(torch.from_numpy(windows).to(self.device))
+            state = network.first_state(batch) if network.is_recurrent else None
+            for cut, target in self._cut(stream, batch):
+                windows = torch.from_numpy(cut).to(self.device)
+                if state is None:
+                    mean, log_sigma = network(windows)
+                else:
+                    before = state[:, : len(windows)].contiguous()
+                    mean, log_sigma, state = network.step(windows, before)
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
@@ -178,21 +184,3 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
             continue
         found[kind] = sampler.batch(_STRETCHES)
     return found
-
-
-class _StreamPredictor:
-    """Predictions of a network for the windows of one stream, in order of time."""
-
-    def __init__(self, network: DisplacementNetwork, stride: int) -> None:
-        self._network = network
-        # Windows that begin within the same second belong to separate series, as at inference.
-        self.batch = max(1, WINDOW_SAMPLES // stride) if network.is_recurrent else _BATCH
-        self._state = network.first_state(self.batch) if network.is_recurrent else None
-
-    def __call__(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        if self._state is None:
-            mean, log_sigma = self._network(windows)
-        else:
-            state = self._state[:, : len(windows)].contiguous()
-            mean, log_sigma, self._state = self._network.step(windows, state)
-        return mean, log_sigma

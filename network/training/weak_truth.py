@@ -43,8 +43,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
 
 from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
 from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
@@ -57,6 +57,7 @@ from stario.sequences.windows import (
     VELOCITY_WEIGHTS,
     WINDOW_RATE,
     WINDOW_SAMPLES,
+    runs,
 )
 
 log = logging.getLogger(__name__)
@@ -144,12 +145,12 @@ class LegSampler:
         if not all(found):
             log.warning(
                 "%s: skipping %d of %d stretches, which hold no two legs within %d s",
-                streams[0].kind, sum(not runs for runs in found), len(found), seconds,
+                streams[0].kind, found.count([]), len(found), seconds,
             )  # fmt: skip
         self._runs = [
             (stream, first, count)
-            for stream, runs in zip(streams, found, strict=True)
-            for first, count in runs
+            for stream, beginnings in zip(streams, found, strict=True)
+            for first, count in beginnings
         ]
         counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
         self._cumulative = (counts / counts.sum()).cumsum(0)
@@ -165,9 +166,8 @@ class LegSampler:
         heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
-        varied = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
-        R_NH = varied.R_HW.mT * varied.mirror[:, None, 3:]
-        windows = varied.imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
+        imu, R_NH = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
+        windows = imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
         leg_tensors = [*_padded(drawn, self._seconds), change]
         return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *leg_tensors)
 
@@ -181,11 +181,10 @@ class LegSampler:
 def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
     """Return the runs of samples, first and count, where a stretch with two legs may begin."""
     begin = np.arange(len(stream) - seconds * WINDOW_SAMPLES) / WINDOW_RATE
-    # Counted as in `_inside`: legs are in order of time.
+    # Counted as in `_padded`: legs are in order of time.
     over = np.searchsorted(stream.stop, begin + seconds, side="right")
     enough = over - np.searchsorted(stream.start, begin) >= 2
-    edges = np.flatnonzero(np.diff(enough, prepend=False, append=False)).reshape(-1, 2)
-    return [(int(first), int(stop - first)) for first, stop in edges]
+    return [(first, stop - first) for first, stop in runs(enough)]
 
 
 def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
@@ -200,15 +199,14 @@ def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     )
 
 
-def _inside(stream: LegStream, offset: int, seconds: int) -> NDArray[np.int64]:
-    """Return the legs that lie within a stretch of the stream."""
-    begin = offset / WINDOW_RATE
-    return np.flatnonzero((stream.start >= begin) & (stream.stop <= begin + seconds))
-
-
 def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:
     """Return the tensors of a `LegBatch` that describe the legs."""
-    rows = [_inside(stream, offset, seconds) for stream, offset in drawn]
+    # The legs that lie within each stretch.
+    rows = [
+        np.flatnonzero((stream.start >= begin) & (stream.stop <= begin + seconds))
+        for stream, offset in drawn
+        for begin in (offset / WINDOW_RATE,)
+    ]
     size, width = len(drawn), max(1, *(len(row) for row in rows))
     share = np.zeros((size, width, seconds))
     displacement, whitening = np.zeros((size, width, 3)), np.zeros((size, width, width))
@@ -329,7 +327,8 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
     residual = leg_residuals(displacement_N, legs)
     count = legs.known.sum().clamp(min=1)
     white = torch.einsum("smn,snc->smc", legs.whitening, residual).norm(dim=-1)
-    loss = VARIANCE_RATE * (_robust(white) * legs.known).sum() / count
+    robust = 2.0 * F.huber_loss(white, torch.zeros_like(white), reduction="none", delta=_HUBER)
+    loss = VARIANCE_RATE * (robust * legs.known).sum() / count
     variance = torch.exp(2.0 * log_sigma_H[..., :2]).mean(-1)
     total = torch.einsum("smk,sk->sm", legs.share, variance) + legs.variance
     squared = (residual.detach()[..., :2] ** 2).sum(-1)
@@ -349,8 +348,3 @@ def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     excess = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
     loss: Tensor = VARIANCE_RATE * excess.mean() / VELOCITY_SIGMA**2
     return loss
-
-
-def _robust(white: Tensor) -> Tensor:
-    """Return squared whitened residuals, linear beyond three standard deviations."""
-    return torch.where(white < _HUBER, white**2, _HUBER * (2.0 * white - _HUBER))

@@ -6,25 +6,24 @@ from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.baselines.imunet import NoiseLayer
 from stario.network.baselines.rnin import Rnin
 
-NAMES = [name for name, entry in ARCHITECTURES.items() if entry.module.startswith("baselines")]
-
 
 def windows(count: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(count, 6, 200, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ARCHITECTURES)
 def test_output_has_one_row_per_window_independent_of_other_windows(name: str) -> None:
     torch.manual_seed(0)
     network = build_network(name).eval()
     batch = windows(3)
+    batch[:2] *= 1e3
     with torch.inference_mode():
         alone, together = network(batch[2:]), network(batch)
     assert together.shape == (3, 6)
     torch.testing.assert_close(together[2:], alone, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ARCHITECTURES)
 def test_every_gradient_is_nonzero_and_finite_even_with_a_constant_window(name: str) -> None:
     torch.manual_seed(0)
     network = build_network(name)

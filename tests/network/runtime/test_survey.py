@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from stario.network.architectures import build_network
-from stario.network.runtime.memory import peak_bytes
-from stario.network.runtime.survey import measured, survey, survey_table
-from stario.sequences.errors import InputError
+from stario.network.runtime.survey import measured, peak_bytes, survey, survey_table
 
 
 def test_peak_memory_is_the_most_that_is_allocated_at_once() -> None:
@@ -43,8 +41,3 @@ def test_rows_hold_counts_times_and_memory(tmp_path: Path, monkeypatch: pytest.M
     table = survey_table(rows)
     assert "3.659 (3.659)" in table
     assert "threads" in table
-
-
-def test_an_unknown_network_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="ResNet99"):
-        survey(["ResNet99"], tmp_path)

@@ -41,22 +41,6 @@ def test_recorded_and_generated_streams_get_their_shares() -> None:
     assert material.words[0].startswith("recorded")
 
 
-def test_named_sources_get_their_shares_whatever_their_length() -> None:
-    recorded = [
-        RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
-        RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
-        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
-    ]
-    material = mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.3})
-    drawn = {name: 0.0 for name in "xyz"}
-    for one, weight in zip(material.streams, material.weights, strict=True):
-        drawn[one.name] += weight * len(one)
-    assert drawn["y"] / drawn["x"] == pytest.approx(0.6)
-    assert drawn["z"] / drawn["x"] == pytest.approx(0.4)
-    with pytest.raises(ConfigError, match="shares"):
-        mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
-
-
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
     """Share of drawn windows by name of stream."""
     found: dict[str, float] = {}
@@ -64,6 +48,19 @@ def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
         starts = max(0, len(one) - reach + 1)
         found[one.name] = found.get(one.name, 0.0) + weight * starts
     return {name: value / sum(found.values()) for name, value in found.items()}
+
+
+def test_named_sources_get_their_shares_whatever_their_length() -> None:
+    recorded = [
+        RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
+        RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
+        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
+    ]
+    shares = {"long.h5": 0.5, "short.h5": 0.3}
+    expected = pytest.approx({"x": 0.5, "y": 0.3, "z": 0.2})
+    assert drawn_shares(mix_sources(recorded, [], shares)) == expected
+    with pytest.raises(ConfigError, match="shares"):
+        mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
 
 
 def test_the_share_of_an_absent_source_goes_to_the_other_recordings() -> None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stario.network.training.lever_arm import Sines, Swing, apply_swing, sample_swing
+from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
 
 GRAVITY = 9.80665
 
@@ -16,8 +16,7 @@ def at_rest(size: int) -> torch.Tensor:
 
 def draw_swing(size: int, share: float = 1.0) -> Swing:
     swing = sample_swing(size, share, 2.5, 0.35, torch.Generator().manual_seed(3))
-    angle = Sines(*(value.double() for value in vars(swing.angle).values()))
-    return Swing(swing.axis.double(), swing.lever.double(), angle)
+    return Swing(*(value.double() for value in vars(swing).values()))
 
 
 def test_acceleration_integrates_to_the_displacement() -> None:
@@ -25,7 +24,7 @@ def test_acceleration_integrates_to_the_displacement() -> None:
     imu, displacement = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     # The initial velocity of a window is omega x r.
     now = torch.zeros(1, dtype=torch.float64)
-    lever = rotated(swing.lever, swing.axis, swing.angle.at(now)[0][:, 0])
+    lever = rotated(swing.lever, swing.axis, swing.angle(now)[0][:, 0])
     velocity = torch.linalg.cross(imu[:, 0, :3], lever)
     accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
@@ -41,7 +40,7 @@ def test_rate_and_acceleration_belong_to_one_rotation() -> None:
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
     swing = draw_swing(64)
     imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
-    alpha = swing.angle.at(torch.zeros(1, dtype=torch.float64))[0][:, 0]
+    alpha = swing.angle(torch.zeros(1, dtype=torch.float64))[0][:, 0]
     lever = rotated(swing.lever, swing.axis, alpha)
     gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
     velocity = torch.linalg.cross(gyro, lever)
@@ -51,7 +50,7 @@ def test_rate_and_acceleration_belong_to_one_rotation() -> None:
 def test_no_swing_is_faster_than_its_bound() -> None:
     swing = draw_swing(512)
     time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
-    assert 1.5 < swing.angle.at(time)[1].abs().max() <= 2.5
+    assert 1.5 < swing.angle(time)[1].abs().max() <= 2.5
 
 
 def test_windows_without_a_swing_are_unchanged() -> None:
@@ -65,7 +64,7 @@ def test_windows_without_a_swing_are_unchanged() -> None:
 @pytest.mark.parametrize("share", [0.25, 0.75])
 def test_the_share_of_swung_windows_is_as_requested(share: float) -> None:
     swing = draw_swing(4000, share)
-    assert (swing.angle.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
+    assert (swing.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
 
 
 def rotated(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:

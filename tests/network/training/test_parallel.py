@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
-from stario.network.training import train as training
+from stario.network.training import run
 from stario.network.training.train import train
 from stario.sequences.windows import WorldStream
 
@@ -35,7 +35,7 @@ def swaying(name, phase, seconds):
 if sys.argv[2] == "plain":  # no batch norm: what two processes compute is the same number
     torch.manual_seed(0)
     plain = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(1200, 6))
-    training.build_network = lambda name: copy.deepcopy(plain)
+    run.build_network = lambda name: copy.deepcopy(plain)
 config = TrainingConfig(
     architecture="TLIO", epochs=2, epoch_windows=64, batch=16, rate=1e-3, device="cpu",
     likelihood_from=0.5, average=0.5, dropout=0.0,

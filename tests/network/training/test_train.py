@@ -336,12 +336,12 @@ def test_long_validation_data_are_thinned_by_minutes_for_recurrent_networks(
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
     cpu = torch.device("cpu")
-    held_out = ValidationSet(streams, cpu, is_recurrent=True)
+    held_out = ValidationSet(streams, cpu, TINY, is_recurrent=True)
     assert held_out.stride == stride
     seconds = sum(len(stream) for stream in held_out.streams) / 200
     assert seconds == 60 * minutes
     assert list(dict.fromkeys(held_out.names)) == ["a", "b"]
-    others = ValidationSet(streams, cpu)
+    others = ValidationSet(streams, cpu, TINY)
     assert others.streams is streams
     assert others.stride == 20 * max(1, 420 // dense)
 

@@ -25,6 +25,7 @@ from stario.network.training.weak_truth import (
     leg_residuals,
     velocity_change,
 )
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
@@ -49,8 +50,7 @@ def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
     """The walk with positions in place of poses, on a map rotated by a yaw [rad]."""
     time = np.arange(1.0, 58.0, every)
     position = truth_of(WALK).at(time).position_W
-    c, s = np.cos(yaw), np.sin(yaw)
-    rotated = position @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    rotated = about_z(yaw).apply(position)
     columns = 2 if kind == "waypoints" else 3
     track = PositionTrack(time, rotated[:, :columns], kind)  # type: ignore[arg-type]
     return replace(WALK, truth=None, positions=track)
@@ -62,38 +62,32 @@ def batch_of(recording: ImuSequence, augmentation: Augmentation = PLAIN) -> LegB
     return LegSampler([stream], SECONDS, augmentation, generator).batch(16)
 
 
-class Truth:
-    """True displacements of stretches, found by their windows, as a network would predict them."""
+def true_displacements(recording: ImuSequence, batch: LegBatch) -> torch.Tensor:
+    """Return the true (S, K, 3) in the levelled frame N of stretches, found by their windows."""
+    [stream] = leg_streams(recording)
+    [world] = world_streams(WALK, attitude="true")
+    found = []
+    for windows in batch.windows:
+        begin = begin_of(windows[0, 5].numpy(), stream)
+        position = truth_of(WALK).at(begin / 200.0 + np.arange(SECONDS + 1.0)).position_W
+        # The rotation from the world to the levelled frame, from the horizontal force.
+        part = slice(begin, begin + 2000)
+        a, b = (x[part, 3] + 1j * x[part, 4] for x in (world.imu_W, stream.imu_N))
+        found.append(np.diff(position, axis=0) @ about_z(np.angle(np.vdot(a, b))).as_matrix().T)
+    return torch.tensor(np.stack(found), dtype=torch.float32)
 
-    def __init__(self, recording: ImuSequence) -> None:
-        [self.stream] = leg_streams(recording)
-        [self.world] = world_streams(WALK, attitude="true")
 
-    def __call__(self, batch: LegBatch) -> torch.Tensor:
-        """Return (S, K, 3) displacements, each in the frame of its window."""
-        found = []
-        for windows, R_NH in zip(batch.windows, batch.R_NH, strict=True):
-            begin = self._begin(windows[0].numpy())
-            position = truth_of(WALK).at(begin + np.arange(SECONDS + 1.0)).position_W
-            moved = np.diff(position, axis=0) @ self._R_NW(begin).T
-            R_HN = R_NH.transpose(1, 2).double().numpy()
-            found.append((R_HN @ moved[:, :, None])[:, :, 0])
-        return torch.tensor(np.stack(found), dtype=torch.float32)
+def begin_of(vertical: FloatArray, stream: LegStream) -> int:
+    """Return the sample where a window begins, from its vertical force, which no yaw changes."""
+    found = np.flatnonzero(np.abs(stream.imu_N[:-200, 5] - vertical[0]) < 1e-4)
+    off = [np.abs(stream.imu_N[k : k + 200, 5] - vertical).max() for k in found]
+    return int(found[np.argmin(off)])
 
-    def _begin(self, window: FloatArray) -> float:
-        """Return where a window begins [s], from the vertical force, which no yaw changes."""
-        found = np.flatnonzero(np.abs(self.stream.imu_N[:-200, 5] - window[5, 0]) < 1e-4)
-        off = [np.abs(self.stream.imu_N[k : k + 200, 5] - window[5]).max() for k in found]
-        return float(found[np.argmin(off)]) / 200.0
 
-    def _R_NW(self, begin: float) -> FloatArray:
-        """Return the rotation from the world to the levelled frame, from the horizontal force."""
-        k = round(begin * 200)
-        part = slice(k, k + 2000)
-        a, b = (x[part, 3] + 1j * x[part, 4] for x in (self.world.imu_W, self.stream.imu_N))
-        turn = np.angle(np.vdot(a, b))
-        c, s = np.cos(turn), np.sin(turn)
-        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def rotated(predicted_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    c, s = angle.cos(), angle.sin()
+    x, y, z = predicted_N.unbind(-1)
+    return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
 
 
 @pytest.mark.parametrize(("kind", "every"), [("positions", 0.1), ("waypoints", 4.0)])
@@ -102,7 +96,7 @@ def test_true_displacements_leave_no_residual_on_a_rotated_map(kind: str, every:
     for augmentation in (PLAIN, replace(PLAIN, yaw=0.5, any_yaw=0.3)):
         batch = batch_of(recording, augmentation)
         assert int(batch.known.sum(1).min()) >= 2
-        predicted_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+        predicted_N = true_displacements(recording, batch)
         residual = leg_residuals(predicted_N, batch)
         # Ends within a window are interpolated at constant speed, which a start does not have.
         size = residual[..., :2].norm(dim=-1)[batch.known]
@@ -115,33 +109,26 @@ def test_true_displacements_leave_no_residual_on_a_rotated_map(kind: str, every:
 def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation() -> None:
     recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
-    predicted_H = Truth(recording)(batch)
-    predicted_N = (batch.R_NH @ predicted_H[..., None])[..., 0]
+    predicted_N = true_displacements(recording, batch)
     whole = leg_residuals(predicted_N, batch)[..., :2].norm(dim=-1).mean()
     short = leg_residuals(0.67 * predicted_N, batch)[..., :2].norm(dim=-1).mean()
-    c, s = np.cos(1.0), np.sin(1.0)
-    R = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    rotated = leg_residuals(predicted_N @ R.T, batch)[..., :2].norm(dim=-1).mean()
+    turned = rotated(predicted_N, torch.tensor(1.0))
+    common = leg_residuals(turned, batch)[..., :2].norm(dim=-1).mean()
     assert float(short) > 5.0 * float(whole)
-    assert float(rotated) == pytest.approx(float(whole), rel=1e-3)
+    assert float(common) == pytest.approx(float(whole), rel=1e-3)
 
 
 def test_the_gradient_lengthens_displacements_that_are_too_short() -> None:
     recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
     factor = torch.tensor(0.67, requires_grad=True)
-    predicted = factor * Truth(recording)(batch)
+    true_H = (batch.R_NH.mT @ true_displacements(recording, batch)[..., None])[..., 0]
+    predicted = factor * true_H
     loss, plain = leg_loss(predicted, torch.zeros_like(predicted), batch)
     loss.backward()
     assert float(plain) > 0.0
     assert factor.grad is not None
     assert float(factor.grad) < 0.0
-
-
-def rotated(predicted_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    c, s = angle.cos(), angle.sin()
-    x, y, z = predicted_N.unbind(-1)
-    return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
 
 
 def test_the_velocity_change_is_determined_from_the_accelerometer() -> None:
@@ -158,7 +145,7 @@ def test_the_velocity_change_is_determined_from_the_accelerometer() -> None:
 def test_the_direction_loss_rotates_displacements_back_to_the_true_direction() -> None:
     recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
-    predicted_N = (batch.R_NH @ Truth(recording)(batch)[..., None])[..., 0]
+    predicted_N = true_displacements(recording, batch)
     right = float(direction_loss(predicted_N, batch))
     losses = []
     for degrees in (-90.0, 90.0, -130.0, 130.0, -170.0, 170.0):
@@ -287,12 +274,12 @@ def test_legs_of_short_walks_can_select_the_weights_alone() -> None:
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), [part], TrainingConfig(), chosen_by_legs=True
+        world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part], chosen_by_legs=True
     )
     assert list(held_out.legs) == ["positions"]  # of eight seconds, though training uses twelve
     errors = {"walk": 5.0, "positions": 0.25}
     assert held_out.selection_error(errors) == 0.25
-    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), [part], TrainingConfig())
+    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part])
     assert combined.selection_error(errors) == 2.625
 
 
@@ -325,8 +312,8 @@ def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> 
 def test_validation_skips_legs_without_information(caplog: pytest.LogCaptureFixture) -> None:
     """Their error would be 0, the best possible."""
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), leg_streams(with_positions("waypoints", 25.0)),
-        TrainingConfig(), chosen_by_legs=True,
+        world_streams(WALK), torch.device("cpu"), TrainingConfig(),
+        leg_streams(with_positions("waypoints", 25.0)), chosen_by_legs=True,
     )  # fmt: skip
     assert held_out.legs == {}
     assert held_out.selection_error({"walk": 5.0}) == 5.0
