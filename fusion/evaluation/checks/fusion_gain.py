@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
@@ -25,7 +25,7 @@ from stario.sequences.accuracy.metrics import evaluate_track, pose_errors
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
@@ -35,12 +35,10 @@ GOOD_YAW = math.radians(10.0)
 
 
 @dataclass(frozen=True)
-class FusionGain:
+class FusionGain(GroupedResult):
     """Errors of one recording with and without fusion.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         network_m: error of the network alone [m].
         fused_m: error by back end [m].
         nis: mean NIS of the first back end; 3 is expected.
@@ -50,8 +48,6 @@ class FusionGain:
         yaw_sigma: reported standard deviation of the yaw at the end [rad]; NaN likewise.
     """
 
-    recording: str
-    group: str
     network_m: float
     fused_m: dict[str, float]
     nis: float
@@ -85,16 +81,21 @@ def fusion_gain(
             f"fewer than {MIN_POSITIONS} within the track",
             f"{MIN_POSITIONS} or more",
         )
-    error, sigma = _yaw(first, sequence.truth)
+    nees = yaw_error = yaw_sigma = math.nan
+    if sequence.truth is not None:
+        assert first.covariance is not None  # both back ends give it
+        nees = position_nees(first.trajectory, sequence.truth).median
+        yaw = np.unwrap(pose_errors(first.trajectory, sequence.truth).yaw)
+        yaw_error, yaw_sigma = float(yaw[-1] - yaw[0]), math.sqrt(first.covariance[-1, 2, 2])
     return FusionGain(
         sequence.name,
         group,
         network_m,
         {name: _error(track, reference) for name, track in tracks.items()},
         math.nan if first.nis is None else first.nis,
-        _nees(first, sequence.truth),
-        error,
-        sigma,
+        nees,
+        yaw_error,
+        yaw_sigma,
     )
 
 
@@ -137,14 +138,3 @@ def _error(track: Track, reference: Trajectory | PositionTrack) -> float:
     if isinstance(reference, Trajectory):
         return evaluate_track(track.trajectory, reference, alignment="yaw").ate_m
     return position_error(track, reference)[0]
-
-
-def _nees(track: Track, truth: Trajectory | None) -> float:
-    return math.nan if truth is None else position_nees(track.trajectory, truth).median
-
-
-def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:
-    if truth is None or track.covariance is None:
-        return math.nan, math.nan
-    yaw: FloatArray = np.unwrap(pose_errors(track.trajectory, truth).yaw)
-    return float(yaw[-1] - yaw[0]), math.sqrt(float(track.covariance[-1, 2, 2]))

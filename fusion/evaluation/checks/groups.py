@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 
-class Grouped(Protocol):
-    """A result that belongs to a group."""
+@dataclass(frozen=True)
+class GroupedResult:
+    """Result of one recording.
 
-    @property
-    def group(self) -> str:
-        """Name of the group."""
+    Attributes:
+        recording: name of the recording.
+        group: group that it is counted in.
+    """
+
+    recording: str
+    group: str
 
 
-Result = TypeVar("Result", bound=Grouped)
+Result = TypeVar("Result", bound=GroupedResult)
 
 
 def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:
@@ -22,3 +28,5 @@ def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:
     groups = sorted({result.group for result in found})
     parts = [(group, [result for result in found if result.group == group]) for group in groups]
     return [*parts, ("all", list(found))] if len(groups) > 1 else parts
+
+

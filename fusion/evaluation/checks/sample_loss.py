@@ -15,7 +15,7 @@ import numpy as np
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import drops, gap
-from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
@@ -38,19 +38,15 @@ _MIN_PATH = 1.0
 
 
 @dataclass(frozen=True)
-class EndShift:
+class EndShift(GroupedResult):
     """Shift of a track's end caused by missing samples.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         fault: what was missing.
         metres: horizontal distance between the ends, divided by the length of the track.
         degrees: absolute difference of their yaws [deg].
     """
 
-    recording: str
-    group: str
     fault: str
     metres: float
     degrees: float

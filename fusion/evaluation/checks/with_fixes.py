@@ -14,7 +14,7 @@ import numpy as np
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
-from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -29,12 +29,10 @@ _MIN_FIXES = 4
 
 
 @dataclass(frozen=True)
-class FixConsistency:
+class FixConsistency(GroupedResult):
     """Errors of one recording with fixes.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         applied: share of the fixes that were applied.
         position_rms: horizontal position error, root mean square [m].
         position_nees: median NEES of position; 2.4 is expected for three axes.
@@ -43,8 +41,6 @@ class FixConsistency:
         yaw_covered: share of the poses whose yaw error is within three standard deviations.
     """
 
-    recording: str
-    group: str
     applied: float
     position_rms: float
     position_nees: float
