@@ -22,7 +22,7 @@ from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.judging.network_alone import UPDATES, Predictions
-from stario.fusion.evaluation.judging.prepared import Prepared
+from stario.fusion.evaluation.judging.prepared import Complex, Prepared
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -49,8 +49,6 @@ _AXIS_SECONDS = 5.0
 
 _SIGMA = 0.3
 """Standard deviation of a one-second displacement [m]: the method's error where it works."""
-
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 
 
 @dataclass(frozen=True, eq=False)

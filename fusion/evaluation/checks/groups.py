@@ -28,5 +28,3 @@ def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:
     groups = sorted({result.group for result in found})
     parts = [(group, [result for result in found if result.group == group]) for group in groups]
     return [*parts, ("all", list(found))] if len(groups) > 1 else parts
-
-

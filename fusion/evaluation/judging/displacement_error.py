@@ -13,14 +13,14 @@ A displacement is compared only if the truth has neither gap nor jump between it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
 from stario.fusion.evaluation.judging.network_alone import Predictions
-from stario.fusion.evaluation.judging.prepared import Kind, Prepared, PreparedPiece
+from stario.fusion.evaluation.judging.prepared import Complex, Kind, Prepared, PreparedPiece
 from stario.sequences.levelled_stream import TICK_SECONDS
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -37,8 +37,6 @@ _MIN_DISPLACEMENTS = 20
 """Minimum number of displacements for a piece to count in the error over a horizon."""
 
 _LEG = round(2.0 / TICK_SECONDS)
-
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 
 FIGURES = {
     "ate_fit_m": "root mean square of the horizontal position error after a fit in yaw and position"
@@ -143,42 +141,47 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
 
 def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, predictions)
-    turn = np.exp(1j * piece.yaw_WN[: len(track)])
     finite = np.isfinite(truth)
     if finite.sum() < 2:
         return
     fitted = fit_yaw_and_position(track[finite], truth[finite])
     sums.add("fit", np.abs(fitted - truth[finite]))
+    turn = np.exp(1j * piece.yaw_WN[: len(track)])
     first = np.flatnonzero(finite)[0]
     on_first = truth[first] + turn[first] * (track - track[first])
     sums.add("first", np.abs(on_first - truth)[finite])
-    _lengths(track, truth, breaks, sums)
-    for horizon in HORIZONS:
-        estimated, true, start = _displacements(track, truth, breaks, horizon)
-        if horizon == 1:  # the windows themselves
-            estimated = _windows_xy(predictions)[start]
-        errors = np.full(len(track), np.nan)
-        errors[start] = np.abs(turn[start] * estimated - true)
-        sums.add_blocks(str(horizon), errors)
-    _stretches(track, truth, breaks, sums)
-    _, true, start = _displacements(track, truth, breaks, 1)
-    _nis(predictions, start, np.conj(turn[start]) * true, sums)
+    _along_the_path(track, truth, breaks, predictions, dict.fromkeys(HORIZONS, turn), sums)
 
 
 def _positions(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, predictions)
+    turns = {
+        horizon: _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
+        for horizon in HORIZONS
+    }
+    _along_the_path(track, truth, breaks, predictions, turns, sums)
+
+
+def _along_the_path(
+    track: Complex,
+    truth: Complex,
+    breaks: np.ndarray,
+    predictions: Predictions,
+    turns: Mapping[int, Complex],
+    sums: _Sums,
+) -> None:
+    """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
     _lengths(track, truth, breaks, sums)
     for horizon in HORIZONS:
-        errors = np.full(len(track), np.nan)
-        turn = _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
         estimated, true, start = _displacements(track, truth, breaks, horizon)
-        if horizon == 1:
+        turn = turns[horizon][start]
+        if horizon == 1:  # the windows themselves
             estimated = _windows_xy(predictions)[start]
-        errors[start] = np.abs(turn[start] * estimated - true)
+            known = np.isfinite(turn)
+            _nis(predictions, start[known], np.conj(turn[known]) * true[known], sums)
+        errors = np.full(len(track), np.nan)
+        errors[start] = np.abs(turn * estimated - true)
         sums.add_blocks(str(horizon), errors)
-        if horizon == 1:
-            fitted = np.isfinite(turn[start])
-            _nis(predictions, start[fitted], np.conj(turn[start])[fitted] * true[fitted], sums)
     _stretches(track, truth, breaks, sums)
 
 

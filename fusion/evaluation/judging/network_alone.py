@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.prepared import Prepared
+from stario.fusion.evaluation.judging.prepared import Complex, Prepared
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
@@ -35,7 +35,7 @@ class Predictions:
     displacement_N: FloatArray
     covariance_N: FloatArray
 
-    def track(self) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+    def track(self) -> Complex:
         """Return the horizontal position x + iy (M + 2,) [m] at the ticks, 0 at the first."""
         steps = (self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1]) / UPDATES
         cells = len(steps) + UPDATES - 1
