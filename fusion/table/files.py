@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.tables import METRICS, Entry, NetworkTable, Sample
+from stario.fusion.evaluation.tables import METRICS, TRUE_ATTITUDE, Entry, NetworkTable, Sample
 from stario.fusion.table.cells import Cell, read_tracks
-from stario.fusion.table.errors import CONVENTION, TRUE_ATTITUDE
+from stario.fusion.table.errors import CONVENTION
 from stario.fusion.table.summary import (
     COLUMNS,
     Filled,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.tables import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.table.cells import Cell, read_cell
-from stario.fusion.table.errors import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.table.ranks import Rank, Recordings, ranks
 from stario.fusion.table.sets import DataSet
 from stario.network.architectures import ARCHITECTURES
@@ -25,47 +25,42 @@ Content = Mapping[str, Any]
 Recording = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """A quantity of each recording, averaged over recordings.
 
     Attributes:
         title: title of the column.
-        value: function that returns a recording's value; NaN if it has none.
+        source: track that it is an error of, or kind of ground truth whose figure it is.
+        name: name of the error or figure.
+        scale: factor of the error.
     """
 
     title: str
-    value: Callable[[Recording], float]
+    source: str
+    name: str
+    scale: float = 1.0
 
-
-def _track(track: str, metric: str, scale: float = 1.0) -> Callable[[Recording], float]:
-    def value(recording: Recording) -> float:
-        found = recording["tracks"].get(track, {}).get(metric)
-        return float("nan") if found is None else scale * float(found)
-
-    return value
-
-
-def _figure(kind: str, figure: str) -> Callable[[Recording], float]:
-    def value(recording: Recording) -> float:
-        found = recording["figures"].get(figure) if recording["kind"] == kind else None
-        return float("nan") if found is None else float(found)
-
-    return value
+    def value(self, recording: Recording) -> float:
+        """Return a recording's value; NaN if it has none."""
+        if recording["kind"] == self.source:
+            found = recording["figures"].get(self.name)
+        else:
+            found = recording["tracks"].get(self.source, {}).get(self.name)
+        return float("nan") if found is None else self.scale * float(found)
 
 
 COLUMNS = {
-    "ate": Column("ATE [m]", _track(TRUE_ATTITUDE, "ate_m")),
-    "rte": Column("RTE [m]", _track(TRUE_ATTITUDE, "rte_m")),
-    "pde": Column("PDE [%]", _track(TRUE_ATTITUDE, "pde", 100.0)),
-    "own_ate": Column("own attitude: ATE [m]", _track(OWN_ATTITUDE, "ate_m")),
-    "own_rte": Column("own attitude: RTE [m]", _track(OWN_ATTITUDE, "rte_m")),
-    "ekf_ate": Column("EKF: ATE [m]", _track(EKF, "ate_m")),
-    "ekf_rte": Column("EKF: RTE [m]", _track(EKF, "rte_m")),
-    "waypoints_m": Column("waypoints [m]", _figure("waypoints", "ate_fit_m")),
-    "waypoints_percent": Column("waypoints [%]", _figure("waypoints", "ate_fit_percent")),
-    "waypoints_length": Column("length ratio", _figure("waypoints", "length_ratio")),
-    "positions_percent": Column("positions, 20 s [%]", _figure("positions", "stretch_percent")),
+    "ate": Column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": Column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": Column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
+    "own_ate": Column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": Column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "ekf_ate": Column("EKF: ATE [m]", EKF, "ate_m"),
+    "ekf_rte": Column("EKF: RTE [m]", EKF, "rte_m"),
+    "waypoints_m": Column("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": Column("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": Column("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": Column("positions, 20 s [%]", "positions", "stretch_percent"),
 }
 """Columns of the table, in order; a column without any value on a set is omitted there."""
 

@@ -197,10 +197,14 @@ def _waypoints(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> N
     sums.add("fit", errors)
     sums.path += float(np.abs(np.diff(truth)).sum())
     sums.length += float(np.abs(np.diff(estimated)).sum())
-    block = np.floor((time - ticks[0]) / BLOCK_SECONDS).astype(int)
-    counted = [np.bincount(block, weights) for weights in (errors**2, np.ones(len(errors)))]
-    rows: FloatArray = np.stack(counted, axis=1).astype(np.float64)
-    sums.blocks.setdefault("10", []).append(rows[rows[:, 1] > 0])
+    sums.blocks.setdefault("10", []).append(block_sums(time - ticks[0], errors**2))
+
+
+def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
+    """Return (B, 2): sum of squares (n,) and their number, for every block of 30 s with any."""
+    block = np.floor(seconds / BLOCK_SECONDS).astype(int)
+    rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
+    return np.asarray(rows[rows[:, 1] > 0])
 
 
 def _at_ticks(

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.fusion.evaluation.judging.judge import Row
-from stario.sequences.drawing.figures import apply_style
+from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_BEFORE, _AFTER, _INK = "#8C8C8C", "#0072B2", "#333333"
+_BEFORE, _AFTER = "#8C8C8C", BLUE
 
 _PANELS = (
     (
@@ -27,18 +27,14 @@ _PANELS = (
 
 def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
     """Draw a line for each group: medians of both weights, paired ratio with its interval."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     groups = [row for row in rows if not row.pooled]
-    fig = Figure(figsize=(12.0 if theirs else 9.0, 1.8 + 0.55 * len(rows)), layout="constrained")
-    FigureCanvasAgg(fig)
+    fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(rows), "")
     panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
     for axes, (title, keys) in zip(panels, _PANELS, strict=False):
         _medians(axes, groups, keys, ours, theirs)
         axes.set_title(title, loc="left", fontsize=10)
     panels[0].set_xlim(left=0.0)
-    panels[1].axvline(1.0, color=_INK, lw=1.0)
+    panels[1].axvline(1.0, color=INK, lw=1.0)
     shown = groups
     if theirs:
         shown = [*groups, *(row for row in rows if row.pooled)]
@@ -72,7 +68,7 @@ def _ratios(axes: Axes, rows: Sequence[Row]) -> None:
         if found is not None:
             axes.plot([found.low, found.high], [k, k], color=_AFTER, lw=2.0)
             axes.plot(found.ratio, k, "o", color=_AFTER, ms=8)
-    axes.axvline(1.0, color=_INK, lw=1.0)
+    axes.axvline(1.0, color=INK, lw=1.0)
     axes.set_xscale("log")
     limits = [x for row in rows if (r := row.ratios.get("rms_10s_m")) for x in (r.low, r.high)]
     ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
