@@ -30,15 +30,12 @@ _MARKERS = "osD^vP"
 _BASELINE = "R-ResNet"
 
 
-def write_table(folder: Path, table: NetworkTable) -> list[Path]:
+def write_table(folder: Path, table: NetworkTable) -> None:
     """Write `networks.csv`, `networks.json` and the figures into an existing folder."""
     write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
-    written = [folder / "networks.csv", folder / "networks.json"]
     for name, figure in figures(table).items():
         save_figure(figure, folder / name)
-        written.append(folder / name)
-    return written
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:

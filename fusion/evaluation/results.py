@@ -51,10 +51,7 @@ def write_run(
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    filter_innovations = track.innovations
-    return written + _figures(
-        folder, name, {backend: aligned}, truth, filter_innovations, config, known
-    )
+    return written + _figures(folder, name, {backend: aligned}, truth, track.innovations, known)
 
 
 def write_comparison(
@@ -103,10 +100,8 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
         written.append(inner / "truth.tum")
     filter_track = comparison.tracks["ekf"]
     known = shown_positions(comparison.sequence, filter_track)
-    filter_innovations = filter_track.innovations
-    return written + _figures(
-        inner, name, comparison.aligned(), truth, filter_innovations, config, known
-    )
+    tracks = comparison.aligned()
+    return written + _figures(inner, name, tracks, truth, filter_track.innovations, known)
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
@@ -148,25 +143,16 @@ def _figures(
     name: str,
     tracks: dict[str, Trajectory],
     truth: Trajectory | None,
-    filter_innovations: Innovations | None,
-    config: NavigatorConfig,
+    found: Innovations | None,
     known: PositionTrack | None,
 ) -> list[Path]:
     figures = {"plan.png": plan_view(tracks, truth, name, known)}
     if truth is not None:
         shown = {k: v for k, v in tracks.items() if k != "inertial"}
         figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")
-    if filter_innovations is not None and len(filter_innovations.time):
-        figures["innovations.png"] = innovations(
-            filter_innovations.time,
-            filter_innovations.residual_W,
-            filter_innovations.sigma,
-            filter_innovations.nis,
-            3,
-            filter_innovations.gated,
-            title=f"{name}: innovations",
-            unit="m",
-        )
+    if found is not None and len(found.time):
+        values = found.time, found.residual_W, found.sigma, found.nis, 3, found.gated
+        figures["innovations.png"] = innovations(*values, title=f"{name}: innovations", unit="m")
     for file, figure in figures.items():
         save_figure(figure, folder / file)
     return [folder / file for file in figures]

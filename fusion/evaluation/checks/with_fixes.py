@@ -74,7 +74,6 @@ def track_with_fixes(
     every: float = 5.0,
     sigma: float = 0.3,
     backend: BackendName = "ekf",
-    seed: int = 0,
 ) -> FixConsistency:
     """Run a recording with fixes and evaluate its track.
 
@@ -83,7 +82,7 @@ def track_with_fixes(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses")
-    known = true_fixes(sequence.truth, every, sigma, seed)
+    known = true_fixes(sequence.truth, every, sigma, seed=0)
     fixes = [fix for fix in known if fix.time >= sequence.time[0]]  # truth may begin earlier
     if len(fixes) < _MIN_FIXES:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")

@@ -34,17 +34,16 @@ class Interval:
     high: float
 
 
-def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None:
+def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     """Return the mean ratio of errors over equally weighted strata of equally weighted groups.
 
     Args:
         strata: groups by stratum name (a data set, for example); strata are not resampled.
-        seed: seed of the resampling.
 
     Returns:
         The ratio and its interval; None if there is no recording.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     results = [
         result for groups in strata.values() if (result := _stratum(groups, rng)) is not None
     ]

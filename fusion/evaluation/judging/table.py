@@ -116,7 +116,7 @@ def judgement_dict(found: JudgingResult) -> dict[str, object]:
     }
 
 
-def write_judgement(folder: Path, found: JudgingResult) -> list[Path]:
+def write_judgement(folder: Path, found: JudgingResult) -> None:
     """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
     rows = [
         {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
@@ -131,12 +131,10 @@ def write_judgement(folder: Path, found: JudgingResult) -> list[Path]:
         for result in found.judged
         for name, errors in result.errors.items()
     ]
-    written = [folder / name for name in ("groups.csv", "recordings.csv", "groups.json")]
-    for path, content in zip(written, (rows, single), strict=False):
-        write_rows(path, content)
-    write_json(written[2], judgement_dict(found))
+    write_rows(folder / "groups.csv", rows)
+    write_rows(folder / "recordings.csv", single)
+    write_json(folder / "groups.json", judgement_dict(found))
     save_figure(groups_figure(found.rows, found.ours, found.theirs), folder / "groups.png")
-    return [*written, folder / "groups.png"]
 
 
 def _recording(result: RecordingResult) -> dict[str, object]:
