@@ -144,28 +144,23 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
         filled: contents of its filled cells.
         learned: recordings that packaged weights were trained on, by the weights' name.
     """
-    poses = all(
-        recording["kind"] == "poses" for c in _contents(filled) for recording in c["recordings"]
-    )
+    contents = [content for seeds in filled.values() for content in seeds.values()]
+    poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])
     measure = "ate" if poses else "10"
     blocks = {name: _blocks(seeds, measure) for name, seeds in filled.items()}
-    network_ranks = ranks(
-        {name: runs for name, runs in blocks.items() if all(runs)}, REFERENCE_NETWORK
-    )
+    known = {name: runs for name, runs in blocks.items() if all(runs)}
+    network_ranks = ranks(known, REFERENCE_NETWORK)
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
     test = {entry.path for entry in dataset.test}
     rows = [
-        _row(
-            name, filled[name], network_ranks.get(name), len(test & learned.get(name, frozenset()))
-        )
+        _row(name, filled[name], network_ranks.get(name), len(test & learned.get(name, set())))
         for name in order
     ]
-    first = next(iter(_contents(filled)), None)
-    recordings = first["recordings"] if first else []
+    recordings = contents[0]["recordings"]
     skipped = [
         f"{failure['item']}: {failure['reason']}"
-        for c in _contents(filled)
+        for c in contents
         for failure in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
     ]
     return SetTable(
@@ -183,44 +178,34 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
 
 def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float, float]]:
     """Return seconds of training and of evaluation, and training windows per second, by network."""
-    sums: dict[str, list[float]] = {}
+    contents: dict[str, list[Content]] = {}
     for filled in tables:
         for name, seeds in filled.items():
-            total = sums.setdefault(name, [0.0, 0.0, 0.0, 0.0])
-            for content in seeds.values():
-                trained = content.get("trained", {})
-                total[0] += trained.get("seconds", 0.0)
-                total[1] += content["seconds"]
-                step = trained.get("step_seconds")
-                if step:
-                    total[2] += trained["windows"] / step
-                    total[3] += 1
-    return {
-        name: (training, testing, speeds / count if count else float("nan"))
-        for name, (training, testing, speeds, count) in sums.items()
-    }
-
-
-def _contents(filled: Filled) -> Iterable[Content]:
-    return (content for seeds in filled.values() for content in seeds.values())
+            contents.setdefault(name, []).extend(seeds.values())
+    work = {}
+    for name, found in contents.items():
+        trained = [content["trained"] for content in found if "trained" in content]
+        speeds = [t["windows"] / t["step_seconds"] for t in trained if t["step_seconds"]]
+        training = sum((t["seconds"] for t in trained), 0.0)
+        testing = sum(content["seconds"] for content in found)
+        work[name] = training, testing, sum(speeds) / len(speeds) if speeds else float("nan")
+    return work
 
 
 def _row(name: str, seeds: Mapping[int, Content], rank: Rank | None, learned: int) -> Row:
     figures = {}
     for key, column in COLUMNS.items():
-        means = [
-            _mean([column.value(recording) for recording in c["recordings"]])
-            for c in seeds.values()
-        ]
-        found = _over_seeds(means)
+        found = _over_seeds(
+            [_mean([column.value(one) for one in c["recordings"]]) for c in seeds.values()]
+        )
         if found is not None:
             figures[key] = found
     trained = [c["trained"] for c in seeds.values() if "trained" in c]
-    errors = [
-        _over_seeds([recording[key] for recording in trained])
+    training, validation = (
+        _over_seeds([one[key] for one in trained])
         for key in ("training_error_m2", "validation_error_m2")
-    ]
-    return Row(name, sorted(seeds), figures, errors[0], errors[1], rank, learned)
+    )
+    return Row(name, sorted(seeds), figures, training, validation, rank, learned)
 
 
 def _mean(values: Sequence[float]) -> float:
