@@ -228,9 +228,6 @@ def _displacements(
 ) -> tuple[Complex, Complex, np.ndarray]:
     """Return displacements of track and truth over a span, and the ticks (n,) they start at."""
     span = round(seconds / TICK_SECONDS)
-    if span >= len(track):
-        none = np.empty(0, dtype=complex)
-        return none, none, np.empty(0, dtype=np.int64)
     start = np.flatnonzero(_unbroken(truth, breaks, span))
     return track[start + span] - track[start], truth[start + span] - truth[start], start
 
@@ -252,8 +249,6 @@ def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, secon
     """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
     span = round(seconds / TICK_SECONDS)
     turn = np.full(len(track), complex(np.nan, np.nan))
-    if span >= len(track):
-        return turn
     unbroken = np.flatnonzero(_unbroken(truth, breaks, span))
     product = np.conj(track[_LEG:] - track[:-_LEG]) * np.nan_to_num(truth[_LEG:] - truth[:-_LEG])
     total = np.concatenate([[0.0], np.cumsum(product)])
@@ -264,12 +259,8 @@ def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, secon
 def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
     """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
-    if span >= len(track):
-        return
     unbroken = _unbroken(truth, breaks, span)
-    for start in range(0, len(unbroken), span // 2):
-        if not unbroken[start]:
-            continue
+    for start in span // 2 * np.flatnonzero(unbroken[:: span // 2]):
         part = slice(start, start + span + 1)
         path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
         if path < 5.0:  # stationary: there is no path to relate errors to

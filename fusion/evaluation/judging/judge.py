@@ -158,11 +158,9 @@ def _row(name: str, part: Sequence[RecordingResult], ours: str, theirs: str | No
         for weights_name in weights
     }
     ratios = {}
-    for horizon in HORIZONS if theirs is not None else ():
-        assert theirs is not None
-        found = paired_ratio(_strata(part, str(horizon), ours, theirs))
-        if found is not None:
-            ratios[f"rms_{horizon}s_m"] = found
+    if theirs is not None:
+        found = {h: paired_ratio(_strata(part, str(h), ours, theirs)) for h in HORIZONS}
+        ratios = {f"rms_{h}s_m": ratio for h, ratio in found.items() if ratio is not None}
     paths = [result.errors[ours].path_m for result in part]
     return Row(name, sum(path > 0.0 for path in paths), sum(paths) / 1e3, medians, ratios)
 

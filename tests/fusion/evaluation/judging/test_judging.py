@@ -13,12 +13,12 @@ from recorded import DATA
 
 from stario.fusion.evaluation.judging.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
-from stario.fusion.evaluation.judging.figure import groups_figure
 from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, Row, judge, rows_of
 from stario.fusion.evaluation.judging.network_alone import predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
 from stario.fusion.evaluation.judging.table import (
     JudgingResult,
+    groups_figure,
     judgement_text,
     verdict,
     write_judgement,
