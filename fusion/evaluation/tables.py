@@ -132,19 +132,10 @@ def compare_networks(
     jobs: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[NetworkTable, list[Skipped]]:
-    """Compute the tracks of every network on every recording.
+    """Compute the tracks of networks, given with distinct names, on recordings with true poses.
 
-    Args:
-        paths: recordings with true poses.
-        models: models under distinct names.
-        config: configuration of the filter.
-        read: function that reads a path; must be picklable.
-        convention: how position errors are averaged.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
-        progress: called with the share of the work done.
-
-    Returns:
-        The table, and the recordings that could not be used.
+    Recordings that cannot be used are returned, too. `read` must be picklable; `jobs` is as for
+    `stario.sequences.datasets.batch.each`.
     """
     parameters = {model.name: table_cost(model.name).parameters for _, model in models}
     table, skipped = NetworkTable(convention, parameters), []

@@ -52,12 +52,7 @@ def write_results(
 ) -> str:
     """Write `table.md`, `table.json`, `table.csv` and the figures of each set; return the text.
 
-    Args:
-        cells: cells of the table, filled or not.
-        out: folder of all results.
-        costs: costs of the networks.
-        learned: recordings that packaged weights were trained on, by the weights' name.
-        drawn: whether to draw the figures.
+    Cells need not be filled; `learned` is as for `set_table`; figures are slow (`drawn`).
     """
     filled = filled_cells(cells, out)
     datasets = {cell.dataset.name: cell.dataset for cell in cells}

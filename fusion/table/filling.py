@@ -64,11 +64,8 @@ def fill(
 ) -> Iterator[Cell | Skipped]:
     """Fill what is missing; yield each cell once it is filled, or the reason why it is not.
 
-    Args:
-        cells: cells in the order in which they are started.
-        out: folder of all results, writable by every participating process.
-        reading: how recordings are read.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+    Cells are started in their order; `out` must be writable by every process that takes part.
+    `jobs` is as for `stario.sequences.datasets.batch.each`.
     """
     yield from each(partial(fill_cell, out=out, reading=reading), cells, jobs)
 

@@ -139,10 +139,7 @@ def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
 def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[Path]]) -> SetTable:
     """Return the table of a set.
 
-    Args:
-        dataset: the set.
-        filled: contents of its filled cells.
-        learned: recordings that packaged weights were trained on, by the weights' name.
+    `learned` has the recordings that packaged weights were trained on, by the weights' name.
     """
     contents = [content for seeds in filled.values() for content in seeds.values()]
     poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])

@@ -22,11 +22,7 @@ def table_text(
 ) -> str:
     """Return the tables of all sets, the costs and the conventions as Markdown.
 
-    Args:
-        tables: tables of the sets.
-        costs: costs of the networks.
-        work: computing time by network.
-        recipe: training recipe, common to all except for network and seed.
+    The recipe is common to all networks except for its network and seed.
     """
     parts = [_recipe_words(recipe)]
     parts += [_set_text(table) for table in tables]

@@ -173,14 +173,8 @@ def with_true_displacements(
     """Replace a preprocessed recording's displacements by the true ones with white noise.
 
     Like a network's, they are given in each window's levelled frame, in which the window itself is
-    given. After the filter's scaling, their covariance is the true one.
-
-    Args:
-        preprocessed: the preprocessed recording.
-        truth: its true poses.
-        config: configuration of the navigator.
-        seed: seed of the noise; a window's noise does not depend on earlier windows.
-        noise: standard deviation per axis [m].
+    given. After the filter's scaling, their covariance is the true one: `noise` [m] per axis. A
+    window's noise depends on the seed and its time, not on earlier windows.
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
     measurements = list(preprocessed.measurements)

@@ -37,11 +37,7 @@ class Interval:
 def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     """Return the mean ratio of errors over equally weighted strata of equally weighted groups.
 
-    Args:
-        strata: groups by stratum name (a data set, for example); strata are not resampled.
-
-    Returns:
-        The ratio and its interval; None if there is no recording.
+    Strata, such as data sets, are not resampled. None if there is no recording.
     """
     rng = np.random.default_rng(0)
     results = [

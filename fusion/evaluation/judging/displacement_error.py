@@ -111,12 +111,7 @@ class _Sums:
 
 
 def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> RecordingErrors:
-    """Compute the errors of a network's predictions on a recording.
-
-    Args:
-        prepared: the recording.
-        found: predictions on each of its pieces.
-    """
+    """Compute the errors of a network's predictions on each piece of a recording."""
     sums = _Sums()
     add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
     total_direction = Direction()

@@ -134,11 +134,7 @@ def _errors(
 def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | None) -> list[Row]:
     """Return a row for each group, sorted by name, and one over all if there are several.
 
-    Args:
-        judged: the recordings.
-        by: label to group them by.
-        ours: name of the weights under evaluation.
-        theirs: name of the weights to compare them with, if any.
+    `ours` and `theirs` name the weights under evaluation and those to compare them with, if any.
     """
     names = sorted({result.labels[by] for result in judged})
     parts = [(name, [result for result in judged if result.labels[by] == name]) for name in names]
@@ -179,15 +175,10 @@ def _strata(
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
-    """Return the labels that a recording can be grouped by.
+    """Return the labels that a recording can be grouped by, given its group in a list, if any.
 
     Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
     folders by the form of their data: `syn` counts as `oxiod`.
-
-    Args:
-        path: path of the recording.
-        attributes: attributes of the recording.
-        group: group from a list; empty if none is given.
     """
     file, member = split_name(path)
     folder = "oxiod" if file.parent.name == "syn" else file.parent.name
