@@ -45,11 +45,7 @@ MODELS = [
 def read(make_walk):
     def read(path: Path):
         walk = make_walk(seed=int(path.stem), seconds=12.0)
-        if path.suffix == ".blind":
-            from dataclasses import replace
-
-            return replace(walk, truth=None)
-        return walk
+        return walk.without_truth() if path.suffix == ".blind" else walk
 
     return read
 
