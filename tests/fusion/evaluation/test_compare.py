@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.config import FilterConfig, NavigatorConfig, read_config
 from stario.fusion.evaluation import compare as compare_module
 from stario.fusion.evaluation.compare import (
-    METRIC_WORDS,
     TRACKS,
     Comparison,
     compare,
@@ -22,7 +21,7 @@ from stario.fusion.evaluation.compare import (
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
-from stario.sequences.accuracy.metrics import align, evaluate_track
+from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
@@ -186,11 +185,8 @@ def test_the_written_configuration_can_be_read_back(folder: Path) -> None:
 
 def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
     track = compared.tracks["ekf"]
-    aligned = align(track.trajectory, walk.truth, "first")
-    files = write_run(
-        tmp_path / "run", walk.name, track, walk.truth, aligned, compared.metrics["ekf"],
-        METRIC_WORDS, CONFIG,
-    )  # fmt: skip
+    alone = Comparison(walk, {"ekf": track}, {"ekf": compared.metrics["ekf"]})
+    files = write_run(tmp_path / "run", alone, CONFIG)
     assert {p.name for p in files} == {
         "ekf.tum", "ekf.npz", "metrics.json", "config.json", "health.json",
         "plan.png", "error.png", "innovations.png",
