@@ -87,19 +87,16 @@ def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
 
 def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
     """Return the networks' errors on recordings with poses, for the figures."""
-    names = [name for name in ARCHITECTURES if name in filled]
-    table = NetworkTable(
-        CONVENTION, {name: table_cost(name).parameters for name in names}, samples=samples
-    )
-    for name in names:
-        for seed, content in filled[name].items():
-            for recording in content["recordings"]:
-                for protocol, errors in recording["tracks"].items():
-                    values = (_number(errors[metric]) for metric in METRICS)
-                    table.entries.append(
-                        Entry(recording["recording"], name, f"seed {seed}", protocol, *values)
-                    )
-    return table
+    parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in filled}
+    entries = [
+        Entry(one["recording"], name, f"seed {seed}", protocol, *map(_number, values))
+        for name in parameters
+        for seed, content in filled[name].items()
+        for one in content["recordings"]
+        for protocol, errors in one["tracks"].items()
+        for values in ([errors[metric] for metric in METRICS],)
+    ]
+    return NetworkTable(CONVENTION, parameters, entries, samples)
 
 
 def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:

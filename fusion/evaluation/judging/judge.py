@@ -126,8 +126,8 @@ def _errors(
     found = recording_errors(prepared, predictions(model, prepared))
     if read is None or isinstance(model, RecordingPredictor):
         return found
-    health = Navigator(model).run(read(prepared.path)).health
-    nis = float("nan") if health is None else health.mean_nis
+    nis = Navigator(model).run(read(prepared.path)).nis
+    assert nis is not None  # the EKF reports its health
     return replace(found, figures=found.figures | {"nis_ekf": nis})
 
 

@@ -103,9 +103,13 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         kind: Kind = "poses"
         pieces = [_with_poses(stream, sequence.truth) for stream in streams]
     elif sequence.positions is not None:
-        kind = sequence.positions.kind
-        build = _with_waypoints if kind == "waypoints" else _with_positions
-        pieces = [build(stream, sequence.positions) for stream in streams]
+        track = sequence.positions
+        kind = track.kind
+        if kind == "waypoints":
+            pieces = [_with_waypoints(stream, track) for stream in streams]
+        else:
+            known = track.time[track.valid], track.position_W[track.valid]
+            pieces = [_with_known(stream, *known, gaps_and_jumps(*known)) for stream in streams]
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
@@ -151,11 +155,6 @@ def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
     yaw_WN = yaw_of(attitude * Rotation.from_matrix(stream.R_NB).inv())
     yaw_WN[np.isnan(piece.position_W)] = np.nan
     return replace(piece, yaw_WN=yaw_WN)
-
-
-def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
-    time, position_W = track.time[track.valid], track.position_W[track.valid]
-    return _with_known(stream, time, position_W, gaps_and_jumps(time, position_W))
 
 
 def _with_known(
