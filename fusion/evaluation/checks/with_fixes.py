@@ -51,18 +51,12 @@ class FixConsistency(GroupedResult):
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
     """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
-    truth_at_fixes = truth.at(np.arange(truth.time[0], truth.time[-1], every))
-    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(truth_at_fixes.time), 3))
+    at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
+    positions = at.position_W + np.random.default_rng(seed).normal(0.0, sigma, (len(at), 3))
     covariance = sigma**2 * np.eye(3)
     return [
         position_fix(float(time), position, covariance)
-        for time, position, valid in zip(
-            truth_at_fixes.time,
-            truth_at_fixes.position_W + noise,
-            truth_at_fixes.valid,
-            strict=True,
-        )
-        if valid
+        for time, position in zip(at.time[at.valid], positions[at.valid], strict=True)
     ]
 
 
