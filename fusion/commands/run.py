@@ -79,8 +79,8 @@ def _run(
     """Write one recording's track, summarise it on stdout and return its record."""
     import numpy as np
 
-    from stario.fusion.evaluation.compare import alignment_with, measure, metric_words
-    from stario.fusion.evaluation.known_positions import position_error_words, shown_positions
+    from stario.fusion.evaluation.compare import Comparison, alignment_with, measure, metric_words
+    from stario.fusion.evaluation.known_positions import position_error_words
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import health_lines
@@ -94,10 +94,8 @@ def _run(
     metrics = measure(track, sequence, alignment)
     aligned = track.trajectory if truth is None else align(track.trajectory, truth, alignment)
     words = metric_words(alignment)
-    written = write_run(
-        folder, sequence.name, track, truth, aligned, metrics, words, navigator.config, backend,
-        shown_positions(sequence, track),
-    )  # fmt: skip
+    found = Comparison(sequence, {backend: track}, {backend: metrics}, alignment)
+    written = write_run(folder, found, navigator.config)
     if shown.report:
         from stario.fusion.report.page import write_report
 

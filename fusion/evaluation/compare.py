@@ -160,13 +160,7 @@ def compare(
 
 
 def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:
-    """Compute the figures of one track; None where ground truth or covariance is missing.
-
-    Args:
-        track: track to measure.
-        sequence: its recording.
-        alignment: alignment for position errors and NEES, as in `align`.
-    """
+    """Compute the figures of a track, aligned as in `align`; None without truth or covariance."""
     figures: Metrics = dict.fromkeys(METRICS)
     truth = sequence.truth
     if truth is not None:

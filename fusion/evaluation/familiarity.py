@@ -106,13 +106,10 @@ def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:
         InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
     """
     streams = levelled_streams(sequence)
-    if not streams or not any(stream.window_count for stream in streams):
+    if not streams:
         return Familiarity(None, {}, {}, Direction())
     windows = np.concatenate([stream.windows()[::2] for stream in streams])
-    predicted = [
-        predict_stream(model, s).displacement_N if s.window_count else np.empty((0, 3))
-        for s in streams
-    ]
+    predicted = [predict_stream(model, stream).displacement_N for stream in streams]
     observed = sum(map(direction, streams, predicted), Direction())
     speeds = np.linalg.norm(np.concatenate(predicted)[:, :2], axis=1) / WINDOW_SECONDS
     medians = dict(zip(FEATURES, np.median(features(windows), axis=0).tolist(), strict=True))

@@ -15,7 +15,6 @@ import numpy as np
 from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
 from stario.sequences.drawing.figures import INK, apply_style, new_figure, save_figure
 from stario.sequences.files import write_json, write_rows
-from stario.sequences.sequence import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,15 +29,12 @@ _MARKERS = "osD^vP"
 _BASELINE = "R-ResNet"
 
 
-def write_table(folder: Path, table: NetworkTable) -> list[Path]:
+def write_table(folder: Path, table: NetworkTable) -> None:
     """Write `networks.csv`, `networks.json` and the figures into an existing folder."""
     write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
-    written = [folder / "networks.csv", folder / "networks.json"]
     for name, figure in figures(table).items():
         save_figure(figure, folder / name)
-        written.append(folder / name)
-    return written
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:
@@ -83,10 +79,11 @@ def _distributions(table: NetworkTable) -> Figure:
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, network in enumerate(table.parameters):
             values = table.values(network, "network_true_attitude", metric)
-            error, share = _steps(values[np.isfinite(values)])
+            error = np.sort(values[np.isfinite(values)])
+            share = np.arange(len(error) + 1) / max(len(error), 1)
             axes.plot(
-                error, share, _STYLES[k % 3], drawstyle="steps-post", color=_colour(k), lw=1.6,
-                label=network,
+                np.append(0.0, error), share, _STYLES[k % 3], drawstyle="steps-post",
+                color=_colour(k), lw=1.6, label=network,
             )  # fmt: skip
         axes.set(xlabel=title, ylim=(0.0, 1.02))
         axes.set_xlim(left=0.0)
@@ -152,13 +149,6 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     apply_style(axes)
-
-
-def _steps(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of the empirical distribution of values (N,)."""
-    ordered = np.sort(values)
-    share = np.arange(1, len(ordered) + 1) / max(len(ordered), 1)
-    return np.concatenate([[0.0], ordered]), np.concatenate([[0.0], share])
 
 
 def _colour(index: int) -> str:

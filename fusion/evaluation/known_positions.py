@@ -14,14 +14,10 @@ MIN_POSITIONS = 2
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
-    """Return the horizontal error at the known positions, after a fit of yaw and position.
+    """Return the horizontal error [m] at known positions after a fit of yaw and position.
 
-    Args:
-        track: track of the same recording.
-        known: positions or waypoints.
-
-    Returns:
-        Root mean square [m], NaN for fewer than `MIN_POSITIONS` within the track; their number.
+    It is the root mean square over those within the track, NaN for fewer than `MIN_POSITIONS`;
+    their number is returned, too.
     """
     fitted = placed(track, known)
     if fitted is None or len(fitted) < MIN_POSITIONS:
@@ -31,17 +27,10 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
 
 
 def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
-    """Return the horizontal known positions that lie within a track and in none of its gaps.
+    """Return the known positions (n, 2) [m] that lie within a track and in none of its gaps.
 
-    They are rotated about the vertical and shifted to fit the track best, in its frame.
-
-    Args:
-        track: track of the same recording.
-        known: positions or waypoints.
-
-    Returns:
-        The positions (n, 2) [m], a single one exactly on the track; None if there is none within
-        its time.
+    They are rotated about the vertical and shifted to fit the track best, in its frame; a single
+    one lies exactly on it. None if there is none within its time.
     """
     inside = known.valid & track.trajectory.covers(known.time)
     time, truth = known.time[inside], known.position_W[inside]

@@ -13,7 +13,7 @@ from stario.fusion.evaluation.compare import Comparison, compare
 from stario.fusion.fixes import Fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import Progress
-from stario.network.model import DisplacementModel, load_model
+from stario.network.model import load_model
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
@@ -97,9 +97,7 @@ def _compare(
     return compare(network, sequence, config, progress, fixes)
 
 
-@cache
-def _loaded(name: str) -> DisplacementModel:
-    return load_model(name)
+_loaded = cache(load_model)
 
 
 def _ignore_progress(share: float) -> None:

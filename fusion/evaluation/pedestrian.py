@@ -13,7 +13,6 @@ A classical baseline that shows whether a network is worth using on a recording:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -22,7 +21,7 @@ from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.judging.network_alone import UPDATES, Predictions
-from stario.fusion.evaluation.judging.prepared import Prepared
+from stario.fusion.evaluation.judging.prepared import Complex, Prepared
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -50,28 +49,7 @@ _AXIS_SECONDS = 5.0
 _SIGMA = 0.3
 """Standard deviation of a one-second displacement [m]: the method's error where it works."""
 
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """Steps of a stretch.
-
-    Attributes:
-        begin: (S,) sample at which each begins: where the previous one ended, except after a pause.
-        end: (S,) sample at which each ends.
-        spread: (S,) difference of the largest and smallest vertical acceleration [m/s^2].
-        direction_N: (S,) unit direction x + iy in N.
-    """
-
-    begin: np.ndarray[tuple[int], np.dtype[np.int64]]
-    end: np.ndarray[tuple[int], np.dtype[np.int64]]
-    spread: FloatArray
-    direction_N: Complex
-
-    def lengths(self, constant: float = WEINBERG_CONSTANT) -> FloatArray:
-        """Return step lengths (S,) [m] by Weinberg's rule."""
-        return np.asarray(constant * self.spread**0.25)
+Indices = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
 class PedestrianDeadReckoning:
@@ -110,8 +88,11 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
     return Track(trajectory, seconds_filter=perf_counter() - began)
 
 
-def steps_of(stream: LevelledStream) -> Steps:
-    """Detect steps and their directions."""
+def steps_of(stream: LevelledStream) -> tuple[Indices, Indices, Complex]:
+    """Detect steps: samples (S,) at which each begins and ends, and its displacement x + iy [m].
+
+    A step begins where the previous one ended, except after a pause.
+    """
     band = butter(2, _STEP_BAND, "bandpass", fs=WINDOW_RATE, output="sos")
     accel_N = sosfiltfilt(band, stream.imu_N[:, 3:].astype(np.float64), axis=0)
     vertical = accel_N[:, 2]
@@ -123,16 +104,14 @@ def steps_of(stream: LevelledStream) -> Steps:
     spread = np.array([np.ptp(vertical[a:b]) for a, b in zip(begin, end, strict=True)])
     heading = _unit(stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1])
     forward_H = _forward(accel_N[:, 0] + 1j * accel_N[:, 1], vertical, heading)
-    middle = (begin + end) // 2
-    return Steps(begin, end, spread, (heading * forward_H)[middle])
+    direction_N = (heading * forward_H)[(begin + end) // 2]
+    return begin, end, WEINBERG_CONSTANT * spread**0.25 * direction_N
 
 
-def pedestrian_path(stream: LevelledStream, constant: float = WEINBERG_CONSTANT) -> Complex:
+def pedestrian_path(stream: LevelledStream) -> Complex:
     """Return the horizontal position x + iy (N,) [m] in N at each sample, 0 at the first."""
-    steps = steps_of(stream)
     speed = np.zeros(len(stream), dtype=complex)
-    displacements = steps.lengths(constant) * steps.direction_N
-    for begin, end, step in zip(steps.begin, steps.end, displacements, strict=True):
+    for begin, end, step in zip(*steps_of(stream), strict=True):
         speed[begin:end] = step / (end - begin)
     return np.concatenate([[0.0], np.cumsum(speed)[:-1]])
 
@@ -142,8 +121,8 @@ def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> C
     horizontal_H = horizontal_N * np.conj(heading)
     samples = round(_AXIS_SECONDS * WINDOW_RATE)
     # The square doubles angles, so that both ends of an axis add up.
-    axis = np.sqrt(_unit(_mean(horizontal_H**2, samples)))
-    lagging = _mean(-horizontal_H * np.imag(hilbert(vertical)), samples)
+    axis = np.sqrt(_unit(uniform_filter1d(horizontal_H**2, samples, mode="nearest")))
+    lagging = uniform_filter1d(-horizontal_H * np.imag(hilbert(vertical)), samples, mode="nearest")
     return np.asarray(np.where((np.conj(axis) * lagging).real < 0.0, -axis, axis))
 
 
@@ -155,12 +134,6 @@ def _predictions(stream: LevelledStream) -> Predictions:
     displacement_xy = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
     displacement = np.stack([displacement_xy.real, displacement_xy.imag, np.zeros(count)], axis=1)
     return Predictions(displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
-
-
-def _mean(values: Complex, samples: int) -> Complex:
-    parts = (uniform_filter1d(part, samples, mode="nearest") for part in (values.real, values.imag))
-    real, imaginary = parts
-    return np.asarray(real + 1j * imaginary)
 
 
 def _unit(values: Complex) -> Complex:

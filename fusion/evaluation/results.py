@@ -6,33 +6,20 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, Metrics
+from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, metric_words
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
-from stario.fusion.state import Innovations, Track
+from stario.fusion.state import Track
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
-from stario.sequences.sequence import PositionTrack, Trajectory
 
 
-def write_run(
-    folder: Path,
-    name: str,
-    track: Track,
-    truth: Trajectory | None,
-    aligned: Trajectory,
-    metrics: Metrics,
-    words: dict[str, str],
-    config: NavigatorConfig,
-    backend: BackendName = "ekf",
-    known: PositionTrack | None = None,
-) -> list[Path]:
-    """Write one fused track and return the files written.
+def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Path]:
+    """Write the fused track of a run, its only one, and return the files written.
 
     These are `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
     `config.json`, `health.json` and the figures; the graph's track is called `graph`. Without
@@ -42,19 +29,17 @@ def write_run(
         InputError: the folder cannot be created.
     """
     make_folder(folder)
-    written = _track_files(folder, backend, track)
-    record = {"recording": name, backend: metrics, "conventions": words}
+    [track] = run.tracks.values()
+    written = _track_files(folder, run)
+    words = metric_words(run.alignment)
     for file, content in (
-        ("metrics.json", record),
+        ("metrics.json", {"recording": run.sequence.name, **run.metrics, "conventions": words}),
         ("config.json", asdict(config)),
         ("health.json", asdict(track.health) if track.health else None),
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    filter_innovations = track.innovations
-    return written + _figures(
-        folder, name, {backend: aligned}, truth, filter_innovations, config, known
-    )
+    return written + _figures(folder, run, track)
 
 
 def write_comparison(
@@ -91,22 +76,14 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
     Raises:
         InputError: a folder cannot be created.
     """
-    name = comparison.sequence.name
-    inner = folder / name
+    inner = folder / comparison.sequence.name
     make_folder(inner)
-    written: list[Path] = []
-    for track_name, track in comparison.tracks.items():
-        written += _track_files(inner, track_name, track)
+    written = _track_files(inner, comparison)
     truth = comparison.sequence.truth
     if truth is not None:
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
-    filter_track = comparison.tracks["ekf"]
-    known = shown_positions(comparison.sequence, filter_track)
-    filter_innovations = filter_track.innovations
-    return written + _figures(
-        inner, name, comparison.aligned(), truth, filter_innovations, config, known
-    )
+    return written + _figures(inner, comparison, comparison.tracks["ekf"])
 
 
 def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
@@ -136,35 +113,26 @@ def make_folder(folder: Path) -> None:
         ) from error
 
 
-def _track_files(folder: Path, name: str, track: Track) -> list[Path]:
-    tum, npz = folder / f"{name}.tum", folder / f"{name}.npz"
-    write_tum(tum, track.trajectory)
-    write_npz(npz, **track.arrays())
-    return [tum, npz]
+def _track_files(folder: Path, found: Comparison) -> list[Path]:
+    written = []
+    for name, track in found.tracks.items():
+        written += [folder / f"{name}.tum", folder / f"{name}.npz"]
+        write_tum(written[-2], track.trajectory)
+        write_npz(written[-1], **track.arrays())
+    return written
 
 
-def _figures(
-    folder: Path,
-    name: str,
-    tracks: dict[str, Trajectory],
-    truth: Trajectory | None,
-    filter_innovations: Innovations | None,
-    config: NavigatorConfig,
-    known: PositionTrack | None,
-) -> list[Path]:
-    figures = {"plan.png": plan_view(tracks, truth, name, known)}
+def _figures(folder: Path, found: Comparison, track: Track) -> list[Path]:
+    """Write plan and errors of all tracks, and the innovations of one."""
+    name, truth, tracks = found.sequence.name, found.sequence.truth, found.aligned()
+    figures = {"plan.png": plan_view(tracks, truth, name, shown_positions(found.sequence, track))}
     if truth is not None:
         shown = {k: v for k, v in tracks.items() if k != "inertial"}
         figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")
-    if filter_innovations is not None and len(filter_innovations.time):
-        figures["innovations.png"] = innovations(
-            filter_innovations.time,
-            filter_innovations.residual_W,
-            filter_innovations.sigma,
-            filter_innovations.nis,
-            filter_innovations.gated,
-            f"{name}: innovations",
-        )
+    drawn = track.innovations
+    if drawn is not None and len(drawn.time):
+        values = drawn.time, drawn.residual_W, drawn.sigma, drawn.nis, drawn.gated
+        figures["innovations.png"] = innovations(*values, f"{name}: innovations")
     for file, figure in figures.items():
         save_figure(figure, folder / file)
     return [folder / file for file in figures]

@@ -7,9 +7,10 @@ weights of one network, for example from different training seeds, are averaged,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
+from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
@@ -24,17 +26,21 @@ from stario.sequences.accuracy.metrics import CONVENTIONS, Convention, align, ev
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
-from stario.sequences.readers import read_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
+TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
+
 PROTOCOLS = {
-    "network_true_attitude": "network, true attitude",
-    "network": "network, own attitude",
-    "ekf": "EKF",
+    TRUE_ATTITUDE: "network, true attitude",
+    OWN_ATTITUDE: "network, own attitude",
+    EKF: "EKF",
 }
 """Tracks of the table and their titles."""
 
 METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}
+
+MAX_DRAWN = 4
+"""Number of recordings whose tracks are kept for a figure."""
 
 
 @dataclass(frozen=True)
@@ -93,32 +99,24 @@ class NetworkTable:
     entries: list[Entry] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
 
-    def values(self, network: str, protocol: str, metric: str, weights: str = "") -> FloatArray:
-        """Return a metric (N,) of a network's tracks, for one weights file or for all."""
-        return np.array(
-            [
-                getattr(entry, metric)
-                for entry in self.entries
-                if (entry.network, entry.protocol) == (network, protocol)
-                and weights in ("", entry.weights)
-            ]
-        )
+    def values(self, network: str, protocol: str, metric: str) -> FloatArray:
+        """Return a metric (N,) of a network's tracks, of all weights and recordings."""
+        return np.array([getattr(entry, metric) for entry in self._entries(network, protocol)])
 
     def mean_and_spread(
         self, network: str, protocol: str, metric: str, recording: str = ""
     ) -> tuple[float, float | None]:
         """Return the mean over recordings, or of one, and its standard deviation over weights."""
-        chosen = [
-            e
-            for e in self.entries
-            if (e.network, e.protocol) == (network, protocol) and recording in ("", e.recording)
-        ]
+        chosen = [e for e in self._entries(network, protocol) if recording in ("", e.recording)]
         by_weights = [
             np.nanmean([getattr(e, metric) for e in chosen if e.weights == weights])
             for weights in dict.fromkeys(e.weights for e in chosen)
         ]
         spread = float(np.std(by_weights, ddof=1)) if len(by_weights) > 1 else None
         return float(np.mean(by_weights)), spread
+
+    def _entries(self, network: str, protocol: str) -> list[Entry]:
+        return [e for e in self.entries if (e.network, e.protocol) == (network, protocol)]
 
 
 Models = Sequence[tuple[str, DisplacementModel]]
@@ -129,26 +127,15 @@ def compare_networks(
     paths: Sequence[Path],
     models: Models,
     config: NavigatorConfig,
-    read: Callable[[Path], ImuSequence] = read_recording,
+    read: Callable[[Path], ImuSequence],
     convention: Convention = "rms",
     jobs: int | None = None,
-    samples: int = 4,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[NetworkTable, list[Skipped]]:
-    """Compute the tracks of every network on every recording.
+    """Compute the tracks of networks, given with distinct names, on recordings with true poses.
 
-    Args:
-        paths: recordings with true poses.
-        models: models under distinct names.
-        config: configuration of the filter.
-        read: function that reads a path; must be picklable.
-        convention: how position errors are averaged.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
-        samples: number of recordings whose tracks are kept for a figure.
-        progress: called with the share of the work done.
-
-    Returns:
-        The table, and the recordings that could not be used.
+    Recordings that cannot be used are returned, too. `read` must be picklable; `jobs` is as for
+    `stario.sequences.datasets.batch.each`.
     """
     parameters = {model.name: table_cost(model.name).parameters for _, model in models}
     table, skipped = NetworkTable(convention, parameters), []
@@ -161,7 +148,7 @@ def compare_networks(
             entries, sample = outcome
             name = distinct_name(sample.recording, names)
             table.entries.extend(replace(entry, recording=name) for entry in entries)
-            if len(table.samples) < samples:
+            if len(table.samples) < MAX_DRAWN:
                 table.samples.append(replace(sample, recording=name))
         progress(done / len(paths))
     return table, skipped
@@ -185,22 +172,11 @@ def table_text(table: NetworkTable) -> str:
 
 def table_dict(table: NetworkTable) -> dict[str, object]:
     """Return the table as plain values."""
-    means = {
-        network: {
-            protocol: {
-                metric: dict(
-                    zip(
-                        ("mean", "spread"),
-                        table.mean_and_spread(network, protocol, metric),
-                        strict=True,
-                    )
-                )
-                for metric in METRICS
-            }
-            for protocol in PROTOCOLS
-        }
-        for network in table.parameters
-    }
+    means: dict[str, dict[str, dict[str, object]]] = {}
+    for network, protocol, metric in product(table.parameters, PROTOCOLS, METRICS):
+        mean, spread = table.mean_and_spread(network, protocol, metric)
+        metrics = means.setdefault(network, {}).setdefault(protocol, {})
+        metrics[metric] = {"mean": mean, "spread": spread}
     return {
         "networks": table.parameters,
         "over_recordings": means,
@@ -233,24 +209,32 @@ def _tracks(
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     entries: list[Entry] = []
-    shown: dict[str, Trajectory] = {}
-    shown_errors: dict[str, tuple[float, float]] = {}
+    sample = Sample(sequence.name, sequence.truth, {}, {})
     for weights, model in models:
-        for protocol, track in _protocol_tracks(model, sequence, config):
-            result = evaluate_track(track, sequence.truth, convention=convention)
-            errors = result.ate_m, result.rte_m, result.pde
-            entries.append(Entry(sequence.name, model.name, weights, protocol, *errors))
-            if protocol == "network_true_attitude":
-                shown.setdefault(model.name, align(track, sequence.truth, "first"))
-                shown_errors.setdefault(model.name, (result.ate_m, result.rte_m))
-    return entries, Sample(sequence.name, sequence.truth, shown, shown_errors)
+        for protocol, track in protocol_tracks(model, sequence, config).items():
+            errors = metrics_of(track, sequence.truth, convention)
+            entries.append(Entry(sequence.name, model.name, weights, protocol, **errors))
+            if protocol == TRUE_ATTITUDE and model.name not in sample.tracks:
+                sample.tracks[model.name] = align(track, sequence.truth, "first")
+                sample.errors[model.name] = errors["ate_m"], errors["rte_m"]
+    return entries, sample
 
 
-def _protocol_tracks(
-    model: DisplacementModel, sequence: ImuSequence, config: NavigatorConfig
-) -> Iterator[tuple[str, Trajectory]]:
+def metrics_of(track: Trajectory, truth: Trajectory, convention: Convention) -> dict[str, float]:
+    """Return the `METRICS` of a track."""
+    result = evaluate_track(track, truth, convention=convention)
+    return {name: getattr(result, name) for name in METRICS}
+
+
+def protocol_tracks(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig
+) -> dict[str, Trajectory]:
+    """Return the tracks of `PROTOCOLS`; raises the errors of `network_track_true_attitude`."""
     navigator = Navigator(model, config)
     preprocessed = navigator.observe(sequence)
-    yield "network_true_attitude", network_track_true_attitude(model, sequence, config).trajectory
-    yield "network", network_track(preprocessed).trajectory
-    yield "ekf", navigator.track(preprocessed).trajectory
+    true_attitude = network_track_true_attitude(model, sequence, config)
+    return {
+        TRUE_ATTITUDE: true_attitude.trajectory,
+        OWN_ATTITUDE: network_track(preprocessed).trajectory,
+        EKF: navigator.track(preprocessed).trajectory,
+    }

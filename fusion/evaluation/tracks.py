@@ -44,15 +44,8 @@ def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig)
         if interval.gap:
             p = p + v * (interval.stop - interval.start)
         else:
-            segment = preintegrate(
-                interval.time,
-                interval.gyro,
-                interval.accel,
-                zero,
-                zero,
-                config.noise,
-                config.gravity,
-            )
+            samples = interval.time, interval.gyro, interval.accel
+            segment = preintegrate(*samples, zero, zero, config.noise, config.gravity)
             R, v, p = segment.predict(R, v, p, zero, zero)
         rows.append((interval.stop, R, v, p))
     trajectory = Trajectory(

@@ -80,10 +80,11 @@ def fill_cell(cell: Cell, out: Path, reading: ReaderConfig) -> Cell:
         InputError: the network cannot be trained.
     """
     folder = cell.folder(out)
-    if not _is_done(cell, folder / "errors.json"):
+    if _read_if_done(cell, folder / "errors.json") is None:
         folder.mkdir(parents=True, exist_ok=True)
-        if cell.recipe is not None and not _is_done(cell, folder / "trained.json"):
-            _train(cell, cell.recipe, folder, reading)
+        recipe = cell.recipe
+        if recipe is not None and _read_if_done(cell, folder / "trained.json") is None:
+            _train(cell, recipe, folder, reading)
         _evaluate(cell, folder, reading)
     return cell
 
@@ -95,10 +96,10 @@ def read_cell(cell: Cell, out: Path) -> dict[str, object] | None:
         ConfigError: it was filled with another recipe or other recordings.
     """
     folder = cell.folder(out)
-    if not _is_done(cell, folder / "errors.json"):
-        return None
-    content: dict[str, object] = _read(folder / "errors.json")
-    return content | ({} if cell.recipe is None else {"trained": _read(folder / "trained.json")})
+    content = _read_if_done(cell, folder / "errors.json")
+    if content is None or cell.recipe is None:
+        return content
+    return content | {"trained": _read(folder / "trained.json")}
 
 
 def read_tracks(cell: Cell, out: Path) -> dict[str, Shown]:
@@ -147,17 +148,16 @@ def _model(cell: Cell, folder: Path) -> Model:
     return load_model(cell.network)
 
 
-def _is_done(cell: Cell, path: Path) -> bool:
-    if not path.exists():
-        return False
-    if _read(path).get("cell") != cell.digest:
+def _read_if_done(cell: Cell, path: Path) -> dict[str, object] | None:
+    content = _read(path) if path.exists() else None
+    if content is not None and content.get("cell") != cell.digest:
         raise ConfigError(
             str(path),
             "made with another recipe or other recordings",
             "those of this table",
             "use the settings it was made with, or another folder (--out)",
         )
-    return True
+    return content
 
 
 def _read(path: Path) -> dict[str, object]:

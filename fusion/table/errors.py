@@ -9,31 +9,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.judging.displacement_error import BLOCK_SECONDS, recording_errors
+from stario.fusion.evaluation.judging.displacement_error import block_sums, recording_errors
 from stario.fusion.evaluation.judging.network_alone import predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepared_recordings
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
-from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
-from stario.fusion.navigator import Navigator
+from stario.fusion.evaluation.tables import (
+    MAX_DRAWN,
+    OWN_ATTITUDE,
+    TRUE_ATTITUDE,
+    metrics_of,
+    protocol_tracks,
+)
 from stario.fusion.table.training import ReaderConfig
 from stario.network.model import DisplacementModel
-from stario.sequences.accuracy.metrics import Convention, align, evaluate_track, pose_errors
+from stario.sequences.accuracy.metrics import Convention, align, pose_errors
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import StarioError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
-TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
-"""Names of the tracks of a recording with poses, as in the rest of the package."""
-
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
-
-_MAX_DRAWN = 4
-"""Number of recordings per cell whose tracks are kept for figures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +71,7 @@ def test_errors(
             skipped.append(Skipped(str(entry.path), str(error)))
             continue
         found.append({"path": str(entry.path), "group": entry.group, **row})
-        if track is not None and len(shown) < _MAX_DRAWN:
+        if track is not None and len(shown) < MAX_DRAWN:
             shown[outcome.name] = track
     return found, shown, skipped
 
@@ -95,47 +92,20 @@ def _recording(
     if prepared.kind != "poses":
         return row, None
     sequence = reading.read(prepared.path)
-    assert sequence.truth is not None  # guaranteed by its kind
+    truth = sequence.truth
+    assert truth is not None  # guaranteed by its kind
     tracks = _tracks(model, sequence)
-    row["tracks"] = {name: _errors(track, sequence.truth) for name, track in tracks.items()}
-    true_attitude = tracks.get(TRUE_ATTITUDE)
-    if true_attitude is None:
+    row["tracks"] = {name: metrics_of(track, truth, CONVENTION) for name, track in tracks.items()}
+    if TRUE_ATTITUDE not in tracks:
         return row, None
-    blocks["ate"] = _blocks(true_attitude, sequence.truth)
-    return row, _shown(true_attitude, sequence.truth)
+    errors = pose_errors(align(tracks[TRUE_ATTITUDE], truth, "first"), truth)
+    time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
+    blocks["ate"] = block_sums(time - time[0], squares).tolist()
+    positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
+    return row, Shown(time, *positions)
 
 
 def _tracks(model: Model, sequence: ImuSequence) -> dict[str, Trajectory]:
     if isinstance(model, PedestrianDeadReckoning):
         return {OWN_ATTITUDE: pedestrian_track(sequence).trajectory}
-    settings = NavigatorConfig()
-    navigator = Navigator(model, settings)
-    preprocessed = navigator.observe(sequence)
-    true = network_track_true_attitude(model, sequence, settings)
-    return {
-        TRUE_ATTITUDE: true.trajectory,
-        OWN_ATTITUDE: network_track(preprocessed).trajectory,
-        EKF: navigator.track(preprocessed).trajectory,
-    }
-
-
-def _errors(track: Trajectory, truth: Trajectory) -> dict[str, float]:
-    found = evaluate_track(track, truth, convention=CONVENTION)
-    return {"ate_m": found.ate_m, "rte_m": found.rte_m, "pde": found.pde}
-
-
-def _blocks(track: Trajectory, truth: Trajectory) -> list[list[float]]:
-    """Return [sum, count] of squared horizontal position errors per block, first pose aligned."""
-    errors = pose_errors(align(track, truth, "first"), truth)
-    squares = (errors.position_W[:, :2] ** 2).sum(axis=1)
-    time = errors.estimate.time
-    block = np.floor((time - time[0]) / BLOCK_SECONDS).astype(int)
-    rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
-    blocks: list[list[float]] = rows[rows[:, 1] > 0].tolist()
-    return blocks
-
-
-def _shown(track: Trajectory, truth: Trajectory) -> Shown:
-    errors = pose_errors(align(track, truth, "first"), truth)
-    positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
-    return Shown(errors.estimate.time, *positions)
+    return protocol_tracks(model, sequence, NavigatorConfig())

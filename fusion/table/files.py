@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.tables import METRICS, Entry, NetworkTable, Sample
+from stario.fusion.evaluation.tables import METRICS, TRUE_ATTITUDE, Entry, NetworkTable, Sample
 from stario.fusion.table.cells import Cell, read_tracks
-from stario.fusion.table.errors import CONVENTION, TRUE_ATTITUDE
+from stario.fusion.table.errors import CONVENTION
 from stario.fusion.table.summary import (
     COLUMNS,
     Filled,
@@ -52,12 +52,7 @@ def write_results(
 ) -> str:
     """Write `table.md`, `table.json`, `table.csv` and the figures of each set; return the text.
 
-    Args:
-        cells: cells of the table, filled or not.
-        out: folder of all results.
-        costs: costs of the networks.
-        learned: recordings that packaged weights were trained on, by the weights' name.
-        drawn: whether to draw the figures.
+    Cells need not be filled; `learned` is as for `set_table`; figures are slow (`drawn`).
     """
     filled = filled_cells(cells, out)
     datasets = {cell.dataset.name: cell.dataset for cell in cells}
@@ -92,19 +87,16 @@ def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
 
 def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
     """Return the networks' errors on recordings with poses, for the figures."""
-    names = [name for name in ARCHITECTURES if name in filled]
-    table = NetworkTable(
-        CONVENTION, {name: table_cost(name).parameters for name in names}, samples=samples
-    )
-    for name in names:
-        for seed, content in filled[name].items():
-            for recording in content["recordings"]:
-                for protocol, errors in recording["tracks"].items():
-                    values = (_number(errors[metric]) for metric in METRICS)
-                    table.entries.append(
-                        Entry(recording["recording"], name, f"seed {seed}", protocol, *values)
-                    )
-    return table
+    parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in filled}
+    entries = [
+        Entry(one["recording"], name, f"seed {seed}", protocol, *map(_number, values))
+        for name in parameters
+        for seed, content in filled[name].items()
+        for one in content["recordings"]
+        for protocol, errors in one["tracks"].items()
+        for values in ([errors[metric] for metric in METRICS],)
+    ]
+    return NetworkTable(CONVENTION, parameters, entries, samples)
 
 
 def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:

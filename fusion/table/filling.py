@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
@@ -42,20 +43,16 @@ def table_cells(
     for name in names:
         architecture(name)
 
-    def filled(dataset: DataSet, members: Sequence[str], seed: int) -> list[Cell]:
-        return [Cell(dataset, n, seed, cell_recipe(recipe, n, seed, steps)) for n in members]
-
     first = [dataset for dataset in sets if dataset.name in FIRST]
     others = [dataset for dataset in sets if dataset.name not in FIRST]
     leading = [name for name in names if name in LEADING]
     cells = []
     for part in (first, others):
-        for dataset in part:
-            cells += [Cell(dataset, name, 0, None) for name in reference_rows(dataset)]
-            cells += filled(dataset, names, 0)
-        for seed in range(1, seeds):
-            for dataset in part:
-                cells += filled(dataset, leading, seed)
+        for seed, dataset in product(range(seeds), part):
+            if seed == 0:
+                cells += [Cell(dataset, name, 0, None) for name in reference_rows(dataset)]
+            for name in leading if seed else names:
+                cells.append(Cell(dataset, name, seed, cell_recipe(recipe, name, seed, steps)))
     return cells
 
 
@@ -64,11 +61,8 @@ def fill(
 ) -> Iterator[Cell | Skipped]:
     """Fill what is missing; yield each cell once it is filled, or the reason why it is not.
 
-    Args:
-        cells: cells in the order in which they are started.
-        out: folder of all results, writable by every participating process.
-        reading: how recordings are read.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+    Cells are started in their order; `out` must be writable by every process that takes part.
+    `jobs` is as for `stario.sequences.datasets.batch.each`.
     """
     yield from each(partial(fill_cell, out=out, reading=reading), cells, jobs)
 

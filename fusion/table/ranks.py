@@ -35,15 +35,12 @@ class Rank:
     ratio: Interval | None
 
 
-def ranks(
-    networks: Mapping[str, Sequence[Recordings]], against: str, seed: int = 0
-) -> dict[str, Rank]:
+def ranks(networks: Mapping[str, Sequence[Recordings]], against: str) -> dict[str, Rank]:
     """Rank networks by the geometric mean of their errors over the recordings common to all.
 
     Args:
         networks: errors on every recording for each training seed, by network name.
         against: reference network of the ratios; if it is missing, there are no ratios.
-        seed: seed of the bootstrap.
 
     Returns:
         Ranks by network name; empty if no recording is common to all.
@@ -54,7 +51,7 @@ def ranks(
     names = list(networks)
     scores = np.array([np.mean([_score(run, common) for run in networks[n]]) for n in names])
     replicates = np.stack(
-        [np.mean([_replicates(run, common, seed) for run in networks[n]], axis=0) for n in names]
+        [np.mean([_replicates(run, common) for run in networks[n]], axis=0) for n in names]
     )
     tail = 50.0 * (1.0 - CONFIDENCE)
     places = replicates.argsort(axis=0).argsort(axis=0) + 1
@@ -92,18 +89,18 @@ def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
     return float(np.mean(means))
 
 
-def _replicates(run: Recordings, common: Mapping[str, Sequence[str]], seed: int) -> FloatArray:
-    """Return the score of every replicate (R,); draws depend only on seed and recordings."""
+def _replicates(run: Recordings, common: Mapping[str, Sequence[str]]) -> FloatArray:
+    """Return the score of every replicate (R,); draws depend only on the recordings."""
     blocks = {(stratum, name): value for stratum, name, value in run}
     strata = []
     for s, (stratum, names) in enumerate(common.items()):
         errors = []
         for k, name in enumerate(names):
             value = blocks[stratum, name]
-            rng = np.random.default_rng([seed, s, k])
+            rng = np.random.default_rng([0, s, k])
             rows = rng.integers(len(value), size=(REPLICATES, len(value)))
             errors.append(_log_error(value[rows].sum(axis=1)))
-        rng = np.random.default_rng([seed, s])
+        rng = np.random.default_rng([0, s])
         rows = rng.integers(len(names), size=(len(names), REPLICATES))
         strata.append(np.take_along_axis(np.stack(errors), rows, axis=0).mean(axis=0))
     return np.asarray(np.mean(strata, axis=0))

@@ -15,29 +15,21 @@ from stario.sequences.datasets.splits import ListEntry, random_split
 from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings
 
-_MEMBERS = {
-    "oxiod": ("oxiod",),
-    "ridi": ("ridi",),
-    "tyrex": ("tyrex",),
-    "kipd": ("kipd", "rfbr"),
-    "ilc": ("ilc",),
-}
-"""Sets among the development recordings, with the first words of their recordings' groups."""
-
 ALL = "all"
 """All development recordings together, with the groups of the list `holdout` held out."""
 
 FIRST = ("oxiod", "ridi", ALL)
 """The sets that are filled first."""
 
-TITLES = {
-    "oxiod": "OxIOD",
-    "ridi": "RIDI",
-    "tyrex": "tyrex",
-    "kipd": "KIPD and rfbr",
-    "ilc": "Indoor Location",
-    ALL: "All together, held out by group",
+_SETS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "oxiod": ("OxIOD", ("oxiod",)),
+    "ridi": ("RIDI", ("ridi",)),
+    ALL: ("All together, held out by group", ()),
+    "tyrex": ("tyrex", ("tyrex",)),
+    "kipd": ("KIPD and rfbr", ("kipd", "rfbr")),
+    "ilc": ("Indoor Location", ("ilc",)),
 }
+"""Title of each set, and the first words of its recordings' groups; the most important first."""
 
 Key = TypeVar("Key")
 
@@ -67,7 +59,7 @@ class DataSet:
     @property
     def title(self) -> str:
         """Title for readers."""
-        return TITLES.get(self.name, self.name)
+        return _SETS[self.name][0] if self.name in _SETS else self.name
 
 
 def development_sets(
@@ -84,14 +76,15 @@ def development_sets(
     Raises:
         InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
-    available = [*FIRST, *(name for name in _MEMBERS if name not in FIRST)]
     for name in chosen or ():
-        if name not in available:
-            raise InputError("--sets", repr(name), f"one of {', '.join(available)}")
+        if name not in _SETS:
+            raise InputError("--sets", repr(name), f"one of {', '.join(_SETS)}")
     recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
-        _combined(data, seed, per_group) if name == ALL else _single(name, recordings, seed)
-        for name in available
+        _combined(data, seed, per_group)
+        if name == ALL
+        else _split(name, [entry for entry in recordings if _set_of(entry) in words], seed)
+        for name, (_, words) in _SETS.items()
         if chosen is None or name in chosen
     ]
 
@@ -104,10 +97,6 @@ def folder_set(name: str, folder: Path, seed: int) -> DataSet:
         ReadError: it cannot be read.
     """
     return _split(name, [ListEntry(path, name) for path in find_recordings(folder)], seed)
-
-
-def _single(name: str, recordings: Iterable[ListEntry], seed: int) -> DataSet:
-    return _split(name, [entry for entry in recordings if _set_of(entry) in _MEMBERS[name]], seed)
 
 
 def _split(name: str, recordings: Sequence[ListEntry], seed: int) -> DataSet:
@@ -138,12 +127,12 @@ def _combined(data: Path, seed: int, per_group: int) -> DataSet:
     held_paths = {entry.path for entry in held_out}
     outside = [entry for entry in read_packaged_list("all", data) if entry.path not in held_paths]
     rng = np.random.default_rng(seed)
-    validation = {
-        entry.path
-        for members in _by(outside, _set_of).values()
-        for walk in _validation_walks(list(_by(members, _walk).values()), rng)
-        for entry in walk
-    }
+    validation = set()
+    for members in _by(outside, _set_of).values():
+        walks = list(_by(members, _walk).values())
+        count = max(1, round(_VALIDATION_SHARE * len(walks)))
+        chosen = rng.permutation(len(walks))[:count]
+        validation |= {entry.path for k in chosen for entry in walks[k]}
     test = [
         ListEntry(entry.path, name)
         for name, members in _by(held_out, lambda entry: entry.group).items()
@@ -164,14 +153,6 @@ def _set_of(entry: ListEntry) -> str:
     return entry.group.split(" ")[0]
 
 
-def _validation_walks(
-    walks: list[list[ListEntry]], rng: np.random.Generator
-) -> list[list[ListEntry]]:
-    """Return those used for validation."""
-    count = max(1, round(_VALIDATION_SHARE * len(walks)))
-    return [walks[k] for k in rng.permutation(len(walks))[:count]]
-
-
 def _by(
     recordings: Iterable[ListEntry], key: Callable[[ListEntry], Key]
 ) -> dict[Key, list[ListEntry]]:
@@ -182,7 +163,7 @@ def _by(
 
 
 def _spread(members: Sequence[ListEntry], maximum: int) -> list[ListEntry]:
-    """Return up to `most` of them, evenly spaced from the first to the last."""
+    """Return up to `maximum` of them, evenly spaced from the first to the last."""
     count = min(maximum, len(members))
     indices = np.linspace(0, len(members) - 1, count).round().astype(int)
     return [members[k] for k in indices]

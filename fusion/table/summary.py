@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.tables import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.table.cells import Cell, read_cell
-from stario.fusion.table.errors import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.table.ranks import Rank, Recordings, ranks
 from stario.fusion.table.sets import DataSet
 from stario.network.architectures import ARCHITECTURES
@@ -25,47 +25,42 @@ Content = Mapping[str, Any]
 Recording = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """A quantity of each recording, averaged over recordings.
 
     Attributes:
         title: title of the column.
-        value: function that returns a recording's value; NaN if it has none.
+        source: track that it is an error of, or kind of ground truth whose figure it is.
+        name: name of the error or figure.
+        scale: factor of the error.
     """
 
     title: str
-    value: Callable[[Recording], float]
+    source: str
+    name: str
+    scale: float = 1.0
 
-
-def _track(track: str, metric: str, scale: float = 1.0) -> Callable[[Recording], float]:
-    def value(recording: Recording) -> float:
-        found = recording["tracks"].get(track, {}).get(metric)
-        return float("nan") if found is None else scale * float(found)
-
-    return value
-
-
-def _figure(kind: str, figure: str) -> Callable[[Recording], float]:
-    def value(recording: Recording) -> float:
-        found = recording["figures"].get(figure) if recording["kind"] == kind else None
-        return float("nan") if found is None else float(found)
-
-    return value
+    def value(self, recording: Recording) -> float:
+        """Return a recording's value; NaN if it has none."""
+        if recording["kind"] == self.source:
+            found = recording["figures"].get(self.name)
+        else:
+            found = recording["tracks"].get(self.source, {}).get(self.name)
+        return float("nan") if found is None else self.scale * float(found)
 
 
 COLUMNS = {
-    "ate": Column("ATE [m]", _track(TRUE_ATTITUDE, "ate_m")),
-    "rte": Column("RTE [m]", _track(TRUE_ATTITUDE, "rte_m")),
-    "pde": Column("PDE [%]", _track(TRUE_ATTITUDE, "pde", 100.0)),
-    "own_ate": Column("own attitude: ATE [m]", _track(OWN_ATTITUDE, "ate_m")),
-    "own_rte": Column("own attitude: RTE [m]", _track(OWN_ATTITUDE, "rte_m")),
-    "ekf_ate": Column("EKF: ATE [m]", _track(EKF, "ate_m")),
-    "ekf_rte": Column("EKF: RTE [m]", _track(EKF, "rte_m")),
-    "waypoints_m": Column("waypoints [m]", _figure("waypoints", "ate_fit_m")),
-    "waypoints_percent": Column("waypoints [%]", _figure("waypoints", "ate_fit_percent")),
-    "waypoints_length": Column("length ratio", _figure("waypoints", "length_ratio")),
-    "positions_percent": Column("positions, 20 s [%]", _figure("positions", "stretch_percent")),
+    "ate": Column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": Column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": Column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
+    "own_ate": Column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": Column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "ekf_ate": Column("EKF: ATE [m]", EKF, "ate_m"),
+    "ekf_rte": Column("EKF: RTE [m]", EKF, "rte_m"),
+    "waypoints_m": Column("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": Column("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": Column("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": Column("positions, 20 s [%]", "positions", "stretch_percent"),
 }
 """Columns of the table, in order; a column without any value on a set is omitted there."""
 
@@ -144,33 +139,25 @@ def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
 def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[Path]]) -> SetTable:
     """Return the table of a set.
 
-    Args:
-        dataset: the set.
-        filled: contents of its filled cells.
-        learned: recordings that packaged weights were trained on, by the weights' name.
+    `learned` has the recordings that packaged weights were trained on, by the weights' name.
     """
-    poses = all(
-        recording["kind"] == "poses" for c in _contents(filled) for recording in c["recordings"]
-    )
+    contents = [content for seeds in filled.values() for content in seeds.values()]
+    poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])
     measure = "ate" if poses else "10"
     blocks = {name: _blocks(seeds, measure) for name, seeds in filled.items()}
-    network_ranks = ranks(
-        {name: runs for name, runs in blocks.items() if all(runs)}, REFERENCE_NETWORK
-    )
+    known = {name: runs for name, runs in blocks.items() if all(runs)}
+    network_ranks = ranks(known, REFERENCE_NETWORK)
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
     test = {entry.path for entry in dataset.test}
     rows = [
-        _row(
-            name, filled[name], network_ranks.get(name), len(test & learned.get(name, frozenset()))
-        )
+        _row(name, filled[name], network_ranks.get(name), len(test & learned.get(name, set())))
         for name in order
     ]
-    first = next(iter(_contents(filled)), None)
-    recordings = first["recordings"] if first else []
+    recordings = contents[0]["recordings"]
     skipped = [
         f"{failure['item']}: {failure['reason']}"
-        for c in _contents(filled)
+        for c in contents
         for failure in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
     ]
     return SetTable(
@@ -188,44 +175,34 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
 
 def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float, float]]:
     """Return seconds of training and of evaluation, and training windows per second, by network."""
-    sums: dict[str, list[float]] = {}
+    contents: dict[str, list[Content]] = {}
     for filled in tables:
         for name, seeds in filled.items():
-            total = sums.setdefault(name, [0.0, 0.0, 0.0, 0.0])
-            for content in seeds.values():
-                trained = content.get("trained", {})
-                total[0] += trained.get("seconds", 0.0)
-                total[1] += content["seconds"]
-                step = trained.get("step_seconds")
-                if step:
-                    total[2] += trained["windows"] / step
-                    total[3] += 1
-    return {
-        name: (training, testing, speeds / count if count else float("nan"))
-        for name, (training, testing, speeds, count) in sums.items()
-    }
-
-
-def _contents(filled: Filled) -> Iterable[Content]:
-    return (content for seeds in filled.values() for content in seeds.values())
+            contents.setdefault(name, []).extend(seeds.values())
+    work = {}
+    for name, found in contents.items():
+        trained = [content["trained"] for content in found if "trained" in content]
+        speeds = [t["windows"] / t["step_seconds"] for t in trained if t["step_seconds"]]
+        training = sum((t["seconds"] for t in trained), 0.0)
+        testing = sum(content["seconds"] for content in found)
+        work[name] = training, testing, sum(speeds) / len(speeds) if speeds else float("nan")
+    return work
 
 
 def _row(name: str, seeds: Mapping[int, Content], rank: Rank | None, learned: int) -> Row:
     figures = {}
     for key, column in COLUMNS.items():
-        means = [
-            _mean([column.value(recording) for recording in c["recordings"]])
-            for c in seeds.values()
-        ]
-        found = _over_seeds(means)
+        found = _over_seeds(
+            [_mean([column.value(one) for one in c["recordings"]]) for c in seeds.values()]
+        )
         if found is not None:
             figures[key] = found
     trained = [c["trained"] for c in seeds.values() if "trained" in c]
-    errors = [
-        _over_seeds([recording[key] for recording in trained])
+    training, validation = (
+        _over_seeds([one[key] for one in trained])
         for key in ("training_error_m2", "validation_error_m2")
-    ]
-    return Row(name, sorted(seeds), figures, errors[0], errors[1], rank, learned)
+    )
+    return Row(name, sorted(seeds), figures, training, validation, rank, learned)
 
 
 def _mean(values: Sequence[float]) -> float:

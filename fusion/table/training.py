@@ -6,21 +6,20 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import RecordingStreams, cached_walks, mix_sources
-from stario.network.training.run import EpochReport
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SAMPLES, WorldStream
+from stario.sequences.windows import WINDOW_SAMPLES, Attitude, WorldStream
 
 _EPOCH_STEPS = 250
 """Maximum steps between two checkpoints: what an interrupted run loses."""
@@ -38,7 +37,7 @@ every cell, so that only the networks differ."""
 
 @dataclass(frozen=True)
 class ReaderConfig:
-    """How recordings are read, on any machine that fills a cell.
+    """How recordings are read, on any machine that fills a cell; told apart by the cache alone.
 
     Attributes:
         read: function that reads the recording at a path; must be picklable.
@@ -46,8 +45,8 @@ class ReaderConfig:
         cache: folder that caches windows for later cells.
     """
 
-    read: Callable[[Path], ImuSequence]
-    options: dict[str, object]
+    read: Callable[[Path], ImuSequence] = field(compare=False)
+    options: dict[str, object] = field(compare=False)
     cache: Path
 
 
@@ -85,18 +84,13 @@ def train_cell(
     Raises:
         InputError, ConfigError: as for `stario.network.training.train.train`.
     """
-    streams, skipped = _streams(dataset.training, recipe, reading)
-    held_out, missing = _streams(dataset.validation, recipe, reading)
+    streams, skipped = _streams(dataset.training, recipe.attitude, reading)
+    held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
     material = mix_sources(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
     validation_data = mix_sources(held_out, [])
     clock = _Clock(folder / TEMPORARY_FILES[1])
-
-    def finished(report: EpochReport) -> None:
-        clock.keep()
-        clock.pause()
-
     train(
         recipe,
         material.streams,
@@ -105,7 +99,7 @@ def train_cell(
         or simulated(_VALIDATION_WALKS, 1),
         folder,
         on_step=lambda step, error: clock.step(),
-        on_epoch=finished,
+        on_epoch=lambda report: clock.keep(),
         trained_on=material.words,
         legs=material.legs,
         validation_legs=validation_data.legs,
@@ -134,30 +128,19 @@ def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
+@lru_cache(maxsize=2)  # training and validation part of the set that cells are filled for
 def _streams(
-    files: Sequence[Path], recipe: TrainingConfig, reading: ReaderConfig
+    files: tuple[Path, ...], attitude: Attitude, reading: ReaderConfig
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of each recording; later cells of the same set reuse them."""
-    key = (tuple(files), recipe.attitude, reading.cache)
-    if key not in _open_streams:
-        outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, recipe.attitude)
-        found = list(zip(files, outcomes, strict=True))
-        streams = [
-            RecordingStreams(path, outcome)
-            for path, outcome in found
-            if not isinstance(outcome, Skipped)
-        ]
-        skipped = [outcome for _, outcome in found if isinstance(outcome, Skipped)]
-        while len(_open_streams) >= _MAX_OPEN:
-            _open_streams.pop(next(iter(_open_streams)))
-        _open_streams[key] = streams, skipped
-    return _open_streams[key]
-
-
-_MAX_OPEN = 2
-"""Maximum parts of sets whose streams a process keeps open: the two of one cell."""
-
-_open_streams: dict[object, tuple[list[RecordingStreams], list[Skipped]]] = {}
+    outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
+    streams, skipped = [], []
+    for path, outcome in zip(files, outcomes, strict=True):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            streams.append(RecordingStreams(path, outcome))
+    return streams, skipped
 
 
 def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
@@ -193,10 +176,7 @@ class _Clock:
             self._steps.append(process_time() - self._last)
         self._last = process_time()
 
-    def pause(self) -> None:
-        """Exclude the time until the next call of `step`."""
-        self._last = None
-
     def keep(self) -> None:
-        """Write the time so far."""
+        """Write the time so far; that until the next call of `step` counts for no step."""
         write_json(self._path, self.seconds)
+        self._last = None

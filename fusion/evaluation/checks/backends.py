@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from time import process_time
+from typing import get_args
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.checks.faults import DummyPredictor, with_true_displacements
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.faults import (
+    DummyPredictor,
+    matched_config,
+    with_true_displacements,
+)
 from stario.fusion.filter.innovations import innovations_from_rows
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
@@ -65,14 +71,8 @@ def score_walk(seed: int, seconds: float) -> Score:
         gyro_turn_on=PHONE_IMU.gyro_turn_on,
         accel_turn_on=PHONE_IMU.accel_turn_on,
     )
-    matched = FilterConfig(
-        update_rate=1,
-        covariance_scale=1.0,
-        gyro_bias_sigma=errors.gyro_turn_on,
-        accel_bias_sigma=errors.accel_turn_on,
-        adaptive=False,
-    )
-    config = NavigatorConfig(noise=errors.noise, filter=matched)
+    config = matched_config(errors)
+    config = replace(config, filter=replace(config.filter, update_rate=1))
     walk = generate_walk(seed, seconds)
     sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
     preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
@@ -94,29 +94,30 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
 
 def summary(scores: Sequence[Score]) -> dict[str, object]:
     """Return medians over recordings, and errors relative to the filter's, as plain values."""
-    ate = _table(scores, lambda score: score.ate_m)
-    medians = dict(zip(ESTIMATORS, np.median(ate, axis=0).tolist(), strict=True))
-    ratios, errors = _mean_ratios(ate)
+
+    def by_name(values: FloatArray) -> dict[str, float]:
+        return dict(zip(ESTIMATORS, values.tolist(), strict=True))
+
+    ate, nees, seconds = (_table(scores, field) for field in _FIELDS)
+    medians, (ratios, errors) = np.median(ate, axis=0), _mean_ratios(ate)
     return {
         "recordings": len(scores),
-        "median_ate_m": medians,
-        "median_ate_to_ekf": {name: medians[name] / medians["ekf"] for name in ESTIMATORS},
-        "mean_ratio_to_ekf": dict(zip(ESTIMATORS, ratios.tolist(), strict=True)),
-        "mean_ratio_error": dict(zip(ESTIMATORS, errors.tolist(), strict=True)),
-        "median_nees": _medians(scores, lambda score: score.nees),
-        "s_per_min": _medians(scores, lambda score: score.s_per_min),
+        "median_ate_m": by_name(medians),
+        "median_ate_to_ekf": by_name(medians / medians[0]),
+        "mean_ratio_to_ekf": by_name(ratios),
+        "mean_ratio_error": by_name(errors),
+        "median_nees": by_name(np.median(nees, axis=0)),
+        "s_per_min": by_name(np.median(seconds, axis=0)),
         "slowest_update_ms": max(score.slowest_ms for score in scores),
     }
 
 
 def score_table(scores: Sequence[Score]) -> str:
     """Return the scores as text."""
-    titles = {"ekf": "EKF", "graph": "graph", "fixed_lag": "fixed-lag"}
-    head = [f"{titles[e]} {group}" for group in ("ATE [m]", "NEES", "s/min") for e in ESTIMATORS]
-    tables = [
-        _table(scores, by) for by in (lambda s: s.ate_m, lambda s: s.nees, lambda s: s.s_per_min)
-    ]
-    figures = np.hstack([*tables, [[score.slowest_ms] for score in scores]])
+    titles = ("EKF", "graph", "fixed-lag")
+    head = [f"{title} {group}" for group in ("ATE [m]", "NEES", "s/min") for title in titles]
+    slowest = [[score.slowest_ms] for score in scores]
+    figures = np.hstack([*(_table(scores, field) for field in _FIELDS), slowest])
     rows = [(s.name, row) for s, row in zip(scores, figures, strict=True)]
     rows.append(("median", np.median(figures, axis=0)))
     cells = [[name, *(f"{v:.3f}" for v in row[:-1]), f"{row[-1]:.1f}"] for name, row in rows]
@@ -133,6 +134,13 @@ def score_table(scores: Sequence[Score]) -> str:
     )
 
 
+_FIELDS = ("ate_m", "nees", "s_per_min")
+
+
+def _table(scores: Sequence[Score], field: str) -> FloatArray:
+    return np.array([[getattr(score, field)[name] for name in ESTIMATORS] for score in scores])
+
+
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the geometric mean (3,) of the ratios of errors (N, 3) to the EKF's, and its error.
 
@@ -147,15 +155,13 @@ def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _scored(
     name: str, preprocessed: PreprocessedRecording, truth: Trajectory, config: NavigatorConfig
 ) -> Score:
-    model = DummyPredictor()
     tracks: dict[str, Track] = {}
     seconds: dict[str, float] = {}
-    began = process_time()
-    tracks["ekf"] = Navigator(model, config).track(preprocessed)
-    seconds["ekf"] = process_time() - began
-    began = process_time()
-    tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed)
-    seconds["graph"] = process_time() - began
+    for backend in get_args(BackendName):
+        navigator = Navigator(DummyPredictor(), config, backend=backend)
+        began = process_time()
+        tracks[backend] = navigator.track(preprocessed)
+        seconds[backend] = process_time() - began
     tracks["fixed_lag"], times = _streamed(preprocessed, config)
     seconds["fixed_lag"] = float(times.sum())
     duration = float(tracks["ekf"].time[-1] - tracks["ekf"].time[0])
@@ -186,12 +192,3 @@ def _streamed(
         times.append(process_time() - began)
     health = estimator.health(preprocessed.front_end.counts)
     return track_from_states(states, innovations_from_rows([]), health), np.array(times)
-
-
-def _table(scores: Sequence[Score], by: Callable[[Score], dict[str, float]]) -> FloatArray:
-    return np.array([[by(score)[name] for name in ESTIMATORS] for score in scores])
-
-
-def _medians(scores: Sequence[Score], by: Callable[[Score], dict[str, float]]) -> dict[str, float]:
-    values = np.median(_table(scores, by), axis=0).tolist()
-    return dict(zip(ESTIMATORS, values, strict=True))

@@ -106,14 +106,13 @@ def consistency(
     """
     if runs < 1 or not seconds >= 2.0:
         raise InputError("runs, seconds", f"{runs}, {seconds:g}", "at least 1 run of 2 s")
-    tables, nis = [], []
     # The errors are drawn as configured: there is nothing to adapt to.
     config = replace(config, filter=replace(config.filter, adaptive=False))
+    results = []
     for k in range(runs):
-        table, run_nis = _run(config, yaw_sigma, seconds, seed + k)
-        tables.append(table)
-        nis.append(run_nis)
+        results.append(_run(config, yaw_sigma, seconds, seed + k))
         progress((k + 1) / runs)
+    tables, nis = zip(*results, strict=True)
     table = np.stack(tables)  # runs, seconds, (nees, yaw error^2, yaw variance)
     return Consistency(
         runs=runs,
@@ -212,8 +211,7 @@ def _run(
         estimator.step(interval, _drawn_displacement(walk, interval, config, rng))
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
-            now = estimator.estimate()
-            rows.append(_errors(now, walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
     return np.array(rows), float(estimator.innovations().nis.mean())
 
 
@@ -222,20 +220,20 @@ def _drawn_start(
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
     """Draw the prior on the first pose and the true biases (N, 3)."""
     f = config.filter
-    tilt, yaw, velocity, position = f.tilt_sigma, yaw_sigma, f.velocity_sigma, _POSITION_SIGMA
-    theta = np.array([tilt, tilt, yaw]) * rng.normal(size=3)
-    turn = exp_so3(-theta)
+    sigmas = np.array([f.tilt_sigma, f.tilt_sigma, yaw_sigma])
     prior = PriorPose(
-        R_WB=turn @ walk.R_WB[0],
-        v_W=walk.velocity_W[0] - velocity * rng.normal(size=3),
-        p_W=walk.position_W[0] - position * rng.normal(size=3),
-        tilt_sigma=tilt,
-        yaw_sigma=yaw,
-        velocity_sigma=velocity,
-        position_sigma=position,
+        R_WB=exp_so3(-sigmas * rng.normal(size=3)) @ walk.R_WB[0],
+        v_W=walk.velocity_W[0] - f.velocity_sigma * rng.normal(size=3),
+        p_W=walk.position_W[0] - _POSITION_SIGMA * rng.normal(size=3),
+        tilt_sigma=f.tilt_sigma,
+        yaw_sigma=yaw_sigma,
+        velocity_sigma=f.velocity_sigma,
+        position_sigma=_POSITION_SIGMA,
     )
-    sigmas = f.gyro_bias_sigma, f.accel_bias_sigma
-    b_g, b_a = (np.tile(sigma * rng.normal(size=3), (len(walk.time), 1)) for sigma in sigmas)
+    b_g, b_a = (
+        np.tile(sigma * rng.normal(size=3), (len(walk.time), 1))
+        for sigma in (f.gyro_bias_sigma, f.accel_bias_sigma)
+    )
     return prior, b_g, b_a
 
 

@@ -63,18 +63,22 @@ class FaultResult:
 
 def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
     """Simulate a walk, and return it with a configuration that matches its sensor's errors."""
-    noise = ImuNoise()
-    errors = ImuErrors(noise=noise, gyro_turn_on=5e-4, accel_turn_on=0.02)
+    errors = ImuErrors(noise=ImuNoise(), gyro_turn_on=5e-4, accel_turn_on=0.02)
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(seed, seconds, style=style)
+    sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
+    return sequence, matched_config(errors)
+
+
+def matched_config(errors: ImuErrors) -> NavigatorConfig:
+    """Return the configuration of a sensor whose errors are exactly as stated."""
     matched = FilterConfig(
         covariance_scale=1.0,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         adaptive=False,
     )
-    sequence = simulate_imu(walk, 200.0, errors, seed, name=f"simulated walk {seed}")
-    return sequence, NavigatorConfig(noise=noise, filter=matched)
+    return NavigatorConfig(noise=errors.noise, filter=matched)
 
 
 def run_faults(
@@ -102,10 +106,11 @@ def run_faults(
         raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
     results: list[FaultResult] = []
     for backend in backends:
-        without = _error(_run(Fault(""), sequence, config, model, seed, backend), sequence)
+        unmodified = _run(Fault(""), sequence, config, model, seed, backend)
+        without = evaluate_track(unmodified.trajectory, sequence.truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
             track = _run(fault, sequence, config, model, seed, backend)
-            results.append(_result(fault, backend, track, sequence, without))
+            results.append(_result(fault, backend, track, sequence.truth, without))
     return results
 
 
@@ -168,28 +173,21 @@ def with_true_displacements(
     """Replace a preprocessed recording's displacements by the true ones with white noise.
 
     Like a network's, they are given in each window's levelled frame, in which the window itself is
-    given. After the filter's scaling, their covariance is the true one.
-
-    Args:
-        preprocessed: the preprocessed recording.
-        truth: its true poses.
-        config: configuration of the navigator.
-        seed: seed of the noise; a window's noise does not depend on earlier windows.
-        noise: standard deviation per axis [m].
+    given. After the filter's scaling, their covariance is the true one: `noise` [m] per axis. A
+    window's noise depends on the seed and its time, not on earlier windows.
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
-    with_window = [
-        k for k, interval in enumerate(preprocessed.intervals) if interval.window is not None
-    ]
-    intervals = [preprocessed.intervals[k] for k in with_window]
-    stop = np.array([interval.stop for interval in intervals])
+    measurements = list(preprocessed.measurements)
+    with_window = {
+        k: (interval.stop, interval.R_NB_window)
+        for k, interval in enumerate(preprocessed.intervals)
+        if interval.R_NB_window is not None
+    }
+    stop, attitudes = (np.array(values) for values in zip(*with_window.values(), strict=True))
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
-    attitudes = [interval.R_NB_window for interval in intervals if interval.R_NB_window is not None]
-    R_NB = Rotation.from_matrix(np.stack(attitudes))
-    turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
+    turn = about_z(yaw_of(Rotation.from_matrix(attitudes) * first.attitude_WB.inv()))
     displacement_N = turn.apply(last.position_W - first.position_W)
-    measurements = list(preprocessed.measurements)
     for k, d_N, time in zip(with_window, displacement_N, stop - truth.time[0], strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
         measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
@@ -197,42 +195,33 @@ def with_true_displacements(
 
 
 def _corrupted(
-    preprocessed: PreprocessedRecording,
-    modify: ModifyPredictions,
-    rng: np.random.Generator,
+    preprocessed: PreprocessedRecording, modify: ModifyPredictions, rng: np.random.Generator
 ) -> PreprocessedRecording:
     """Apply a fault to all measurements at once."""
-    measured = [
-        k for k, measurement in enumerate(preprocessed.measurements) if measurement is not None
-    ]
-    pairs = [measurement for measurement in preprocessed.measurements if measurement is not None]
-    mean, covariance = (np.stack(values) for values in zip(*pairs, strict=True))
-    modify((np.arange(len(mean)) + 1.0) / len(mean), mean, covariance, rng)
     measurements = list(preprocessed.measurements)
+    measured = {k: pair for k, pair in enumerate(measurements) if pair is not None}
+    mean, covariance = (np.stack(values) for values in zip(*measured.values(), strict=True))
+    modify(mean, covariance, rng)
     for k, d_N, cov_N in zip(measured, mean, covariance, strict=True):
         measurements[k] = (d_N, cov_N)
     return replace(preprocessed, measurements=measurements)
 
 
 def _result(
-    fault: Fault, backend: str, track: Track, sequence: ImuSequence, without: float
+    fault: Fault, backend: str, track: Track, truth: Trajectory, without: float
 ) -> FaultResult:
-    assert sequence.truth is not None and track.covariance is not None  # noqa: PT018
-    aligned = align(track.trajectory, sequence.truth, "first")
-    last = sequence.truth.at(np.clip(track.time[-1:], *sequence.truth.time[[0, -1]]))
+    assert track.covariance is not None  # both back ends give it
+    assert track.health is not None
+    end = align(track.trajectory, truth, "first").position_W[-1]
+    last = truth.at(np.clip(track.time[-1:], *truth.time[[0, -1]])).position_W[0]
     arrays = [values for values in track.arrays().values() if values.dtype.kind == "f"]
     return FaultResult(
         fault=fault.name,
         backend=backend,
         error_without=without,
-        error_with=_error(track, sequence),
-        end_error=float(np.linalg.norm(aligned.position_W[-1] - last.position_W[0])),
+        error_with=evaluate_track(track.trajectory, truth).ate_m,
+        end_error=float(np.linalg.norm(end - last)),
         end_sigma=float(np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9]))),
         finite=all(bool(np.isfinite(values).all()) for values in arrays),
-        reported="" if track.health is None else reported(track.health),
+        reported=reported(track.health),
     )
-
-
-def _error(track: Track, sequence: ImuSequence) -> float:
-    assert sequence.truth is not None  # checked by run_faults()
-    return evaluate_track(track.trajectory, sequence.truth).ate_m

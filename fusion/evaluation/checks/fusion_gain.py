@@ -15,17 +15,16 @@ import numpy as np
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.groups import by_group
-from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
+from stario.fusion.evaluation.compare import Metrics, measure
+from stario.fusion.evaluation.known_positions import MIN_POSITIONS
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.state import Track
-from stario.sequences.accuracy.metrics import evaluate_track, pose_errors
-from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import ImuSequence
 
 SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
@@ -35,12 +34,10 @@ GOOD_YAW = math.radians(10.0)
 
 
 @dataclass(frozen=True)
-class FusionGain:
+class FusionGain(GroupedResult):
     """Errors of one recording with and without fusion.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         network_m: error of the network alone [m].
         fused_m: error by back end [m].
         nis: mean NIS of the first back end; 3 is expected.
@@ -50,8 +47,6 @@ class FusionGain:
         yaw_sigma: reported standard deviation of the yaw at the end [rad]; NaN likewise.
     """
 
-    recording: str
-    group: str
     network_m: float
     fused_m: dict[str, float]
     nis: float
@@ -72,29 +67,35 @@ def fusion_gain(
     Raises:
         InputError: it has no ground truth or too few known positions, or cannot be run.
     """
-    reference: Trajectory | PositionTrack | None = sequence.truth or sequence.positions
-    if reference is None:
+    truth = sequence.truth
+    if truth is None and sequence.positions is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     preprocessed = Navigator(model, config).observe(sequence)
     tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
-    first = tracks[backends[0]]
-    network_m = _error(network_track(preprocessed), reference)
+    figures = {name: measure(track, sequence) for name, track in tracks.items()}
+    network_m = _error(measure(network_track(preprocessed), sequence))
     if math.isnan(network_m):
         raise InputError(
             f"{sequence.name}: positions",
             f"fewer than {MIN_POSITIONS} within the track",
             f"{MIN_POSITIONS} or more",
         )
-    error, sigma = _yaw(first, sequence.truth)
+    first = backends[0]
+    yaw_error = yaw_sigma = math.nan
+    if truth is not None:
+        covariance = tracks[first].covariance
+        assert covariance is not None  # both back ends give it
+        yaw = np.unwrap(pose_errors(tracks[first].trajectory, truth).yaw)
+        yaw_error, yaw_sigma = float(yaw[-1] - yaw[0]), math.sqrt(covariance[-1, 2, 2])
     return FusionGain(
         sequence.name,
         group,
         network_m,
-        {name: _error(track, reference) for name, track in tracks.items()},
-        math.nan if first.nis is None else first.nis,
-        _nees(first, sequence.truth),
-        error,
-        sigma,
+        {name: _error(found) for name, found in figures.items()},
+        _number(figures[first]["nis"]),
+        _number(figures[first]["nees"]),
+        yaw_error,
+        yaw_sigma,
     )
 
 
@@ -132,19 +133,11 @@ def _row(group: str, part: Sequence[FusionGain], names: Sequence[str]) -> list[s
     return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]
 
 
-def _error(track: Track, reference: Trajectory | PositionTrack) -> float:
-    """Return the horizontal error after a fit of yaw and position [m]."""
-    if isinstance(reference, Trajectory):
-        return evaluate_track(track.trajectory, reference, alignment="yaw").ate_m
-    return position_error(track, reference)[0]
+def _error(figures: Metrics) -> float:
+    """Return the horizontal error after a fit of yaw and position [m]; NaN if unknown."""
+    fitted = figures["ate_fit_m"]
+    return _number(figures["known_positions_m"] if fitted is None else fitted)
 
 
-def _nees(track: Track, truth: Trajectory | None) -> float:
-    return math.nan if truth is None else position_nees(track.trajectory, truth).median
-
-
-def _yaw(track: Track, truth: Trajectory | None) -> tuple[float, float]:
-    if truth is None or track.covariance is None:
-        return math.nan, math.nan
-    yaw: FloatArray = np.unwrap(pose_errors(track.trajectory, truth).yaw)
-    return float(yaw[-1] - yaw[0]), math.sqrt(float(track.covariance[-1, 2, 2]))
+def _number(figure: float | None) -> float:
+    return math.nan if figure is None else figure

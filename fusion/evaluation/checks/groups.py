@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 
-class Grouped(Protocol):
-    """A result that belongs to a group."""
+@dataclass(frozen=True)
+class GroupedResult:
+    """Result of one recording.
 
-    @property
-    def group(self) -> str:
-        """Name of the group."""
+    Attributes:
+        recording: name of the recording.
+        group: group that it is counted in.
+    """
+
+    recording: str
+    group: str
 
 
-Result = TypeVar("Result", bound=Grouped)
+Result = TypeVar("Result", bound=GroupedResult)
 
 
 def by_group(found: Sequence[Result]) -> list[tuple[str, list[Result]]]:

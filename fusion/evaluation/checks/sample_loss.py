@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import drops, gap
-from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
@@ -38,19 +37,15 @@ _MIN_PATH = 1.0
 
 
 @dataclass(frozen=True)
-class EndShift:
+class EndShift(GroupedResult):
     """Shift of a track's end caused by missing samples.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         fault: what was missing.
         metres: horizontal distance between the ends, divided by the length of the track.
         degrees: absolute difference of their yaws [deg].
     """
 
-    recording: str
-    group: str
     fault: str
     metres: float
     degrees: float
@@ -61,19 +56,14 @@ def end_shifts(
     sequence: ImuSequence,
     config: NavigatorConfig,
     group: str,
-    backend: BackendName = "ekf",
-    seed: int = 0,
 ) -> list[EndShift]:
     """Run a recording with each of the faults and return the shifts of its end.
 
     Raises:
         InputError: the recording cannot be run, or its track is shorter than a metre.
     """
-
-    def run(faulty: ImuSequence) -> Track:
-        return Navigator(model, config, backend=backend).run(faulty)
-
-    unmodified = run(sequence)
+    navigator = Navigator(model, config)
+    unmodified = navigator.run(sequence)
     steps = np.diff(unmodified.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())
     if path < _MIN_PATH:
@@ -81,11 +71,11 @@ def end_shifts(
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
     faults = [(f"gap at {instant:.0f} s", gap(float(instant), GAP_SECONDS)) for instant in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
-    return [
-        EndShift(sequence.name, group, name, *_end_shift(unmodified, run(faulty), path))
-        for name, modify_samples in faults
-        for faulty in (modify_samples(sequence, np.random.default_rng(seed)),)
-    ]
+    found = []
+    for name, modify_samples in faults:
+        faulty = navigator.run(modify_samples(sequence, np.random.default_rng(0)))
+        found.append(EndShift(sequence.name, group, name, *_end_shift(unmodified, faulty, path)))
+    return found
 
 
 def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, float]:

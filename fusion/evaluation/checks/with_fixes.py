@@ -14,7 +14,7 @@ import numpy as np
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
-from stario.fusion.evaluation.checks.groups import by_group
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -29,12 +29,10 @@ _MIN_FIXES = 4
 
 
 @dataclass(frozen=True)
-class FixConsistency:
+class FixConsistency(GroupedResult):
     """Errors of one recording with fixes.
 
     Attributes:
-        recording: name of the recording.
-        group: group that it is counted in.
         applied: share of the fixes that were applied.
         position_rms: horizontal position error, root mean square [m].
         position_nees: median NEES of position; 2.4 is expected for three axes.
@@ -43,8 +41,6 @@ class FixConsistency:
         yaw_covered: share of the poses whose yaw error is within three standard deviations.
     """
 
-    recording: str
-    group: str
     applied: float
     position_rms: float
     position_nees: float
@@ -55,18 +51,12 @@ class FixConsistency:
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
     """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
-    truth_at_fixes = truth.at(np.arange(truth.time[0], truth.time[-1], every))
-    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(truth_at_fixes.time), 3))
+    at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
+    positions = at.position_W + np.random.default_rng(seed).normal(0.0, sigma, (len(at), 3))
     covariance = sigma**2 * np.eye(3)
     return [
         position_fix(float(time), position, covariance)
-        for time, position, valid in zip(
-            truth_at_fixes.time,
-            truth_at_fixes.position_W + noise,
-            truth_at_fixes.valid,
-            strict=True,
-        )
-        if valid
+        for time, position in zip(at.time[at.valid], positions[at.valid], strict=True)
     ]
 
 
@@ -78,7 +68,6 @@ def track_with_fixes(
     every: float = 5.0,
     sigma: float = 0.3,
     backend: BackendName = "ekf",
-    seed: int = 0,
 ) -> FixConsistency:
     """Run a recording with fixes and evaluate its track.
 
@@ -87,7 +76,7 @@ def track_with_fixes(
     """
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses")
-    known = true_fixes(sequence.truth, every, sigma, seed)
+    known = true_fixes(sequence.truth, every, sigma, seed=0)
     fixes = [fix for fix in known if fix.time >= sequence.time[0]]  # truth may begin earlier
     if len(fixes) < _MIN_FIXES:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")

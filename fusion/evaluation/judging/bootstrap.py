@@ -34,46 +34,31 @@ class Interval:
     high: float
 
 
-def paired_ratio(strata: Mapping[str, Groups], seed: int = 0) -> Interval | None:
+def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     """Return the mean ratio of errors over equally weighted strata of equally weighted groups.
 
-    Args:
-        strata: groups by stratum name (a data set, for example); strata are not resampled.
-        seed: seed of the resampling.
-
-    Returns:
-        The ratio and its interval; None if there is no recording.
+    Strata, such as data sets, are not resampled. None if there is no recording.
     """
-    rng = np.random.default_rng(seed)
-    results = [
-        result for groups in strata.values() if (result := _stratum(groups, rng)) is not None
-    ]
-    if not results:
+    if not strata:
         return None
-    estimate = float(np.mean([mean for mean, _ in results]))
-    replicates = np.mean([result for _, result in results], axis=0)
+    rng = np.random.default_rng(0)
+    results = [_stratum(groups, rng) for groups in strata.values()]
+    means, replicates = zip(*results, strict=True)
     tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(replicates, [tail, 100.0 - tail])
-    return Interval(*(float(np.exp(value)) for value in (estimate, low, high)))
+    bounds = np.percentile(np.mean(replicates, axis=0), [tail, 100.0 - tail])
+    return Interval(*(float(np.exp(value)) for value in (np.mean(means), *bounds)))
 
 
-def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray] | None:
+def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray]:
     """Return the mean log ratio over groups, and its replicates (R,)."""
-    results = [_group(recordings, rng) for recordings in groups.values() if recordings]
-    if not results:
-        return None
-    group_replicates = np.stack([replicates for _, replicates in results])
-    return float(np.mean([mean for mean, _ in results])), _means_of_draws(group_replicates, rng)
+    means, replicates = zip(*(_group(part, rng) for part in groups.values()), strict=True)
+    return float(np.mean(means)), _means_of_draws(np.stack(replicates), rng)
 
 
 def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[float, FloatArray]:
-    mean = float(
-        np.mean(
-            [0.5 * np.log(evaluated.sum() / baseline.sum()) for evaluated, baseline in recordings]
-        )
-    )
+    ratios = [0.5 * np.log(evaluated.sum() / baseline.sum()) for evaluated, baseline in recordings]
     replicates = np.stack([_recording(*blocks, rng) for blocks in recordings])
-    return mean, _means_of_draws(replicates, rng)
+    return float(np.mean(ratios)), _means_of_draws(replicates, rng)
 
 
 def _recording(evaluated: FloatArray, baseline: FloatArray, rng: np.random.Generator) -> FloatArray:

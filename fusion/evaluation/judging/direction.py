@@ -18,14 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from stario.fusion.evaluation.judging.prepared import Complex
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import VELOCITY_WEIGHTS, WINDOW_SECONDS
 
 _STRETCH = round(20.0 / TICK_SECONDS)
 _SECOND = round(WINDOW_SECONDS / TICK_SECONDS)
-
-Complex = np.ndarray[Any, np.dtype[np.complex128]]
 
 
 @dataclass(frozen=True)

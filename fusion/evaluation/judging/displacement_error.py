@@ -13,14 +13,14 @@ A displacement is compared only if the truth has neither gap nor jump between it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
 from stario.fusion.evaluation.judging.network_alone import Predictions
-from stario.fusion.evaluation.judging.prepared import Kind, Prepared, PreparedPiece
+from stario.fusion.evaluation.judging.prepared import Complex, Kind, Prepared, PreparedPiece
 from stario.sequences.levelled_stream import TICK_SECONDS
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -37,8 +37,6 @@ _MIN_DISPLACEMENTS = 20
 """Minimum number of displacements for a piece to count in the error over a horizon."""
 
 _LEG = round(2.0 / TICK_SECONDS)
-
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 
 FIGURES = {
     "ate_fit_m": "root mean square of the horizontal position error after a fit in yaw and position"
@@ -113,12 +111,7 @@ class _Sums:
 
 
 def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> RecordingErrors:
-    """Compute the errors of a network's predictions on a recording.
-
-    Args:
-        prepared: the recording.
-        found: predictions on each of its pieces.
-    """
+    """Compute the errors of a network's predictions on each piece of a recording."""
     sums = _Sums()
     add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
     total_direction = Direction()
@@ -143,42 +136,47 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
 
 def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, predictions)
-    turn = np.exp(1j * piece.yaw_WN[: len(track)])
     finite = np.isfinite(truth)
     if finite.sum() < 2:
         return
     fitted = fit_yaw_and_position(track[finite], truth[finite])
     sums.add("fit", np.abs(fitted - truth[finite]))
+    turn = np.exp(1j * piece.yaw_WN[: len(track)])
     first = np.flatnonzero(finite)[0]
     on_first = truth[first] + turn[first] * (track - track[first])
     sums.add("first", np.abs(on_first - truth)[finite])
-    _lengths(track, truth, breaks, sums)
-    for horizon in HORIZONS:
-        estimated, true, start = _displacements(track, truth, breaks, horizon)
-        if horizon == 1:  # the windows themselves
-            estimated = _windows_xy(predictions)[start]
-        errors = np.full(len(track), np.nan)
-        errors[start] = np.abs(turn[start] * estimated - true)
-        sums.add_blocks(str(horizon), errors)
-    _stretches(track, truth, breaks, sums)
-    _, true, start = _displacements(track, truth, breaks, 1)
-    _nis(predictions, start, np.conj(turn[start]) * true, sums)
+    _along_the_path(track, truth, breaks, predictions, dict.fromkeys(HORIZONS, turn), sums)
 
 
 def _positions(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     track, truth, breaks = _at_ticks(piece, predictions)
+    turns = {
+        horizon: _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
+        for horizon in HORIZONS
+    }
+    _along_the_path(track, truth, breaks, predictions, turns, sums)
+
+
+def _along_the_path(
+    track: Complex,
+    truth: Complex,
+    breaks: np.ndarray,
+    predictions: Predictions,
+    turns: Mapping[int, Complex],
+    sums: _Sums,
+) -> None:
+    """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
     _lengths(track, truth, breaks, sums)
     for horizon in HORIZONS:
-        errors = np.full(len(track), np.nan)
-        turn = _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
         estimated, true, start = _displacements(track, truth, breaks, horizon)
-        if horizon == 1:
+        turn = turns[horizon][start]
+        if horizon == 1:  # the windows themselves
             estimated = _windows_xy(predictions)[start]
-        errors[start] = np.abs(turn[start] * estimated - true)
+            known = np.isfinite(turn)
+            _nis(predictions, start[known], np.conj(turn[known]) * true[known], sums)
+        errors = np.full(len(track), np.nan)
+        errors[start] = np.abs(turn * estimated - true)
         sums.add_blocks(str(horizon), errors)
-        if horizon == 1:
-            fitted = np.isfinite(turn[start])
-            _nis(predictions, start[fitted], np.conj(turn[start])[fitted] * true[fitted], sums)
     _stretches(track, truth, breaks, sums)
 
 
@@ -194,10 +192,14 @@ def _waypoints(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> N
     sums.add("fit", errors)
     sums.path += float(np.abs(np.diff(truth)).sum())
     sums.length += float(np.abs(np.diff(estimated)).sum())
-    block = np.floor((time - ticks[0]) / BLOCK_SECONDS).astype(int)
-    counted = [np.bincount(block, weights) for weights in (errors**2, np.ones(len(errors)))]
-    rows: FloatArray = np.stack(counted, axis=1).astype(np.float64)
-    sums.blocks.setdefault("10", []).append(rows[rows[:, 1] > 0])
+    sums.blocks.setdefault("10", []).append(block_sums(time - ticks[0], errors**2))
+
+
+def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
+    """Return (B, 2): sum of squares (n,) and their number, for every block of 30 s with any."""
+    block = np.floor(seconds / BLOCK_SECONDS).astype(int)
+    rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
+    return np.asarray(rows[rows[:, 1] > 0])
 
 
 def _at_ticks(
@@ -221,9 +223,6 @@ def _displacements(
 ) -> tuple[Complex, Complex, np.ndarray]:
     """Return displacements of track and truth over a span, and the ticks (n,) they start at."""
     span = round(seconds / TICK_SECONDS)
-    if span >= len(track):
-        none = np.empty(0, dtype=complex)
-        return none, none, np.empty(0, dtype=np.int64)
     start = np.flatnonzero(_unbroken(truth, breaks, span))
     return track[start + span] - track[start], truth[start + span] - truth[start], start
 
@@ -245,8 +244,6 @@ def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, secon
     """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
     span = round(seconds / TICK_SECONDS)
     turn = np.full(len(track), complex(np.nan, np.nan))
-    if span >= len(track):
-        return turn
     unbroken = np.flatnonzero(_unbroken(truth, breaks, span))
     product = np.conj(track[_LEG:] - track[:-_LEG]) * np.nan_to_num(truth[_LEG:] - truth[:-_LEG])
     total = np.concatenate([[0.0], np.cumsum(product)])
@@ -257,12 +254,8 @@ def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, secon
 def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
     """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
-    if span >= len(track):
-        return
     unbroken = _unbroken(truth, breaks, span)
-    for start in range(0, len(unbroken), span // 2):
-        if not unbroken[start]:
-            continue
+    for start in span // 2 * np.flatnonzero(unbroken[:: span // 2]):
         part = slice(start, start + span + 1)
         path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
         if path < 5.0:  # stationary: there is no path to relate errors to

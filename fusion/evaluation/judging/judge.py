@@ -126,19 +126,15 @@ def _errors(
     found = recording_errors(prepared, predictions(model, prepared))
     if read is None or isinstance(model, RecordingPredictor):
         return found
-    health = Navigator(model).run(read(prepared.path)).health
-    nis = float("nan") if health is None else health.mean_nis
+    nis = Navigator(model).run(read(prepared.path)).nis
+    assert nis is not None  # the EKF reports its health
     return replace(found, figures=found.figures | {"nis_ekf": nis})
 
 
 def rows_of(judged: Sequence[RecordingResult], by: By, ours: str, theirs: str | None) -> list[Row]:
     """Return a row for each group, sorted by name, and one over all if there are several.
 
-    Args:
-        judged: the recordings.
-        by: label to group them by.
-        ours: name of the weights under evaluation.
-        theirs: name of the weights to compare them with, if any.
+    `ours` and `theirs` name the weights under evaluation and those to compare them with, if any.
     """
     names = sorted({result.labels[by] for result in judged})
     parts = [(name, [result for result in judged if result.labels[by] == name]) for name in names]
@@ -158,11 +154,9 @@ def _row(name: str, part: Sequence[RecordingResult], ours: str, theirs: str | No
         for weights_name in weights
     }
     ratios = {}
-    for horizon in HORIZONS if theirs is not None else ():
-        assert theirs is not None
-        found = paired_ratio(_strata(part, str(horizon), ours, theirs))
-        if found is not None:
-            ratios[f"rms_{horizon}s_m"] = found
+    if theirs is not None:
+        found = {h: paired_ratio(_strata(part, str(h), ours, theirs)) for h in HORIZONS}
+        ratios = {f"rms_{h}s_m": ratio for h, ratio in found.items() if ratio is not None}
     paths = [result.errors[ours].path_m for result in part]
     return Row(name, sum(path > 0.0 for path in paths), sum(paths) / 1e3, medians, ratios)
 
@@ -181,15 +175,10 @@ def _strata(
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
-    """Return the labels that a recording can be grouped by.
+    """Return the labels that a recording can be grouped by, given its group in a list, if any.
 
     Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
     folders by the form of their data: `syn` counts as `oxiod`.
-
-    Args:
-        path: path of the recording.
-        attributes: attributes of the recording.
-        group: group from a list; empty if none is given.
     """
     file, member = split_name(path)
     folder = "oxiod" if file.parent.name == "syn" else file.parent.name

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.prepared import Prepared
+from stario.fusion.evaluation.judging.prepared import Complex, Prepared
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
@@ -35,14 +35,11 @@ class Predictions:
     displacement_N: FloatArray
     covariance_N: FloatArray
 
-    def track(self) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+    def track(self) -> Complex:
         """Return the horizontal position x + iy (M + 2,) [m] at the ticks, 0 at the first."""
         steps = (self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1]) / UPDATES
-        cells = len(steps) + UPDATES - 1
-        total, count = np.zeros(cells, dtype=complex), np.zeros(cells)
-        for shift in range(UPDATES):
-            total[shift : shift + len(steps)] += steps
-            count[shift : shift + len(steps)] += 1.0
+        cover = np.ones(UPDATES)
+        total, count = np.convolve(steps, cover), np.convolve(np.ones(len(steps)), cover)
         return np.concatenate([[0.0], np.cumsum(total / count)])
 
 
@@ -51,7 +48,7 @@ class RecordingPredictor(Protocol):
     """Predictor of a whole recording that needs no network."""
 
     def predictions(self, prepared: Prepared) -> list[Predictions]:
-        """Return predictions for every piece, in frame N."""
+        """Return a predictor's predictions for every piece, in N; a network begins each anew."""
         ...
 
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal
@@ -41,17 +41,11 @@ log = logging.getLogger(__name__)
 
 Kind = Literal["poses", "positions", "waypoints"]
 
-_ARRAYS = (
-    "imu_N",
-    "facing_N",
-    "R_NB",
-    "position_W",
-    "breaks",
-    "yaw_WN",
-    "waypoint_time",
-    "waypoint_W",
-    "start",
-)
+Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
+"""Horizontal positions or vectors x + iy."""
+
+_STREAM = ("imu_N", "facing_N", "R_NB")
+_TRUTH = ("position_W", "breaks", "yaw_WN", "waypoint_time", "waypoint_W")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +63,11 @@ class PreparedPiece:
     """
 
     stream: LevelledStream
-    position_W: np.ndarray[tuple[int], np.dtype[np.complex128]]
+    position_W: Complex
     breaks: np.ndarray[tuple[int], np.dtype[np.int64]]
     yaw_WN: FloatArray
     waypoint_time: FloatArray
-    waypoint_W: np.ndarray[tuple[int], np.dtype[np.complex128]]
+    waypoint_W: Complex
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,16 +103,17 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         kind: Kind = "poses"
         pieces = [_with_poses(stream, sequence.truth) for stream in streams]
     elif sequence.positions is not None:
-        kind = sequence.positions.kind
-        build = _with_waypoints if kind == "waypoints" else _with_positions
-        pieces = [build(stream, sequence.positions) for stream in streams]
+        track = sequence.positions
+        kind = track.kind
+        if kind == "waypoints":
+            pieces = [_with_waypoints(stream, track) for stream in streams]
+        else:
+            known = track.time[track.valid], track.position_W[track.valid]
+            pieces = [_with_known(stream, *known, gaps_and_jumps(*known)) for stream in streams]
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    attributes = {k: str(v) for k, v in sequence.attributes.items() if k in _ATTRIBUTES}
+    attributes = {name: str(value) for name, value in sequence.attributes.items()}
     return Prepared(path, sequence.name, kind, attributes, pieces)
-
-
-_ATTRIBUTES = ("person", "device", "place", "carry", "grade", "magnets_near")
 
 
 def prepared_recordings(
@@ -155,18 +150,11 @@ def _cached(
 
 def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
     time, position_W = truth.time[truth.valid], truth.position_W[truth.valid]
-    base = _with_known(stream, time, position_W, is_gap(np.diff(time)))
-    at_tick = truth.at(stream.ticks)
-    yaw_WN = yaw_of(at_tick.attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
-    yaw_WN[np.isnan(base.position_W)] = np.nan
-    return PreparedPiece(
-        stream, base.position_W, base.breaks, yaw_WN, base.waypoint_time, base.waypoint_W
-    )
-
-
-def _with_positions(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
-    time, position_W = track.time[track.valid], track.position_W[track.valid]
-    return _with_known(stream, time, position_W, gaps_and_jumps(time, position_W))
+    piece = _with_known(stream, time, position_W, is_gap(np.diff(time)))
+    attitude = truth.at(stream.ticks).attitude_WB
+    yaw_WN = yaw_of(attitude * Rotation.from_matrix(stream.R_NB).inv())
+    yaw_WN[np.isnan(piece.position_W)] = np.nan
+    return replace(piece, yaw_WN=yaw_WN)
 
 
 def _with_known(
@@ -207,8 +195,11 @@ def _code() -> str:
 def _store(file: Path, prepared: Prepared) -> None:
     arrays = {}
     for k, piece in enumerate(prepared.pieces):
-        for name, value in _arrays(piece).items():
-            arrays[f"{k}.{name}"] = value
+        values = {name: getattr(piece.stream, name) for name in _STREAM}
+        values |= {name: getattr(piece, name) for name in _TRUTH}
+        values["start"] = np.array([piece.stream.start])
+        for name, value in values.items():  # the format knows no complex numbers
+            arrays[f"{k}.{name}"] = value.view(np.float64) if np.iscomplexobj(value) else value
     description = {
         "name": prepared.name,
         "kind": prepared.kind,
@@ -230,44 +221,17 @@ def _load(file: Path, path: Path) -> Prepared | None:
     try:
         with safetensors.safe_open(file, "numpy") as source:
             description = json.loads(source.metadata()["recording"])
-            pieces = [
-                _piece({name: source.get_tensor(f"{k}.{name}") for name in _ARRAYS})
-                for k in range(description["pieces"])
-            ]
+            pieces = []
+            for k in range(description["pieces"]):
+                names = ("start", *_STREAM, *_TRUTH)
+                found = {name: source.get_tensor(f"{k}.{name}") for name in names}
+                for name in ("position_W", "waypoint_W"):
+                    found[name] = found[name].view(np.complex128)
+                start = float(found["start"][0])
+                stream = LevelledStream(start, *(found[name] for name in _STREAM))
+                pieces.append(PreparedPiece(stream, *(found[name] for name in _TRUTH)))
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
         log.warning("%s: unreadable, prepared again: %s", file, error)
         return None
-    return Prepared(
-        path, description["name"], description["kind"], description["attributes"], pieces
-    )
-
-
-def _arrays(piece: PreparedPiece) -> dict[str, np.ndarray]:
-    return {
-        "imu_N": piece.stream.imu_N,
-        "facing_N": piece.stream.facing_N,
-        "R_NB": piece.stream.R_NB,
-        "position_W": _split(piece.position_W),
-        "breaks": piece.breaks.astype(np.int64),
-        "yaw_WN": piece.yaw_WN,
-        "waypoint_time": piece.waypoint_time,
-        "waypoint_W": _split(piece.waypoint_W),
-        "start": np.array([piece.stream.start]),
-    }
-
-
-def _piece(arrays: dict[str, np.ndarray]) -> PreparedPiece:
-    imu_N, facing_N, R_NB = (arrays[name] for name in ("imu_N", "facing_N", "R_NB"))
-    stream = LevelledStream(float(arrays["start"][0]), imu_N, facing_N, R_NB)
-    position_W, waypoint_W = (_joined(arrays[name]) for name in ("position_W", "waypoint_W"))
-    return PreparedPiece(
-        stream, position_W, arrays["breaks"], arrays["yaw_WN"], arrays["waypoint_time"], waypoint_W
-    )
-
-
-def _split(values: np.ndarray) -> np.ndarray:
-    return np.stack([values.real, values.imag], axis=1)
-
-
-def _joined(values: np.ndarray) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
-    return np.asarray(values[:, 0] + 1j * values[:, 1])
+    name, kind, attributes = (description[key] for key in ("name", "kind", "attributes"))
+    return Prepared(path, name, kind, attributes, pieces)

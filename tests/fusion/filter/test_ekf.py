@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from se23 import exp_se23
 
-from stario.fusion.evaluation.checks.benchmark import DenseEkf
+from stario.fusion.evaluation.checks.speed import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian

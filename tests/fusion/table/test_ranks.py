@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stario.fusion.table.published import published
 from stario.fusion.table.ranks import ranks
+from stario.fusion.table.text import published
 
 
 def errors(scale: float, noise: float = 0.0, seed: int = 0) -> list[tuple[str, str, np.ndarray]]:
