@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, map_recordings, print_json
+from stario.fusion.commands.common import exit_if_skipped, map_recordings, print_result
 from stario.fusion.commands.options import (
     BackendOption,
     ByOption,
@@ -114,8 +114,6 @@ def _judge_each(
 
     results, skipped = map_recordings(title, reading, paths, judged)
     found = [result for group in results for result in group]
-    if as_json:
-        print_json([asdict(result) for result in found])
-    elif found:
-        typer.echo(table(found))
+    if as_json or found:
+        print_result(as_json, [asdict(result) for result in found], table(found) if found else "")
     exit_if_skipped(skipped)

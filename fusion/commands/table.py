@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stario.fusion.commands.common import exit_if_skipped
-from stario.fusion.commands.options import ReadingOptions, recipe_values
+from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
 
 def table(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder of the finished cells; a rerun resumes there.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder of the finished cells; a rerun resumes there.")],
     data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
     sets: Annotated[
         str | None,
@@ -48,16 +46,11 @@ def table(
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
     ] = 2,
     config: Annotated[
-        Path | None,
-        typer.Option("--config", help="JSON file with the recipe. Default: the package's."),
+        Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache."),
-    ] = None,
+    cache: CacheOption = None,
     jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", help="Cells to run in parallel; -1 for as many as possible."),
+        int | None, typer.Option(help="Cells to run in parallel; -1 for as many as possible.")
     ] = None,
     backend: Annotated[
         str, typer.Option(help="Where cells run: loky (this machine), dask or ray.")
