@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.readers.checked import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
-_TIME = "time"
+rr: Any = optional_package("rerun", "view")
+
 _AXIS_LENGTH = 0.4
 _SIGMAS = 3.0
 _BLUE, _BLACK = (0, 114, 178), (0, 0, 0)
@@ -38,9 +40,8 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
         The path.
 
     Raises:
-        InputError: rerun is not installed, or the file cannot be written.
+        InputError: the file cannot be written.
     """
-    rr = optional_package("rerun", "view")
     stream = rr.RecordingStream("stario", recording_id=None)
     try:
         stream.save(path)
@@ -48,12 +49,12 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
         raise InputError("view", f"{path}: {error}", "a writable path") from error
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _log_path(rr, stream, "world/track", trajectory, _BLUE)
+    _log_path(stream, "world/track", trajectory, _BLUE)
     if sequence.truth is not None:
-        _log_path(rr, stream, "world/truth", sequence.truth, _BLACK)
-    _log_device(rr, stream, trajectory, start)
-    _log_sensors(rr, stream, sequence, start)
-    _log_estimates(rr, stream, track, start)
+        _log_path(stream, "world/truth", sequence.truth, _BLACK)
+    _log_device(stream, trajectory, start)
+    _log_sensors(stream, sequence, start)
+    _log_estimates(stream, track, start)
     stream.disconnect()
     return path
 
@@ -74,7 +75,7 @@ def open_view(path: Path) -> None:
 
 
 def _log_path(
-    rr: Any, stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
+    stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
 ) -> None:
     """Log a whole path at once, broken where poses are not valid."""
     valid = trajectory.valid
@@ -84,9 +85,9 @@ def _log_path(
     stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
 
 
-def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
+def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:
     """Log the device's axes at its position, with the 3-sigma ellipsoid of the position."""
-    index = _times(rr, trajectory.time[trajectory.valid] - start)
+    index = _times(trajectory.time[trajectory.valid] - start)
     position = trajectory.position_W[trajectory.valid]
     columns = rr.Transform3D.columns(
         translation=position, quaternion=trajectory.quat_xyzw[trajectory.valid]
@@ -97,8 +98,6 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
     covariance = trajectory.position_covariance_W
     if covariance is None:
         return
-    from scipy.spatial.transform import Rotation
-
     values, vectors = np.linalg.eigh(covariance[trajectory.valid])
     vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, not a reflection
     count = np.ones(len(position), dtype=int)
@@ -110,18 +109,18 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
     stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
 
 
-def _log_sensors(rr: Any, stream: Any, sequence: ImuSequence, start: float) -> None:
+def _log_sensors(stream: Any, sequence: ImuSequence, start: float) -> None:
     finite = np.isfinite(sequence.time)
-    index = _times(rr, sequence.time[finite] - start)
+    index = _times(sequence.time[finite] - start)
     for name, values in (
         ("gyroscope [rad/s]", sequence.gyro),
         ("specific force [m/s^2]", sequence.accel),
     ):
-        _log_lines(rr, stream, ("sensors", name), index, values[finite], "xyz")
+        _log_lines(stream, ["sensors", name], index, values[finite], "xyz")
 
 
-def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
-    index = _times(rr, track.time - start)
+def _log_estimates(stream: Any, track: Track, start: float) -> None:
+    index = _times(track.time - start)
     lines: list[tuple[str, FloatArray | None, Sequence[str]]] = [
         ("gyroscope bias [rad/s]", track.b_g, "xyz"),
         ("accelerometer bias [m/s^2]", track.b_a, "xyz"),
@@ -135,26 +134,21 @@ def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
         lines.append(("sigma of yaw [rad]", sigma[:, 2:3], ["yaw"]))
     for name, values, labels in lines:
         if values is not None:
-            _log_lines(rr, stream, ("estimate", name), index, values, labels)
+            _log_lines(stream, ["estimate", name], index, values, labels)
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        update_index, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
-        _log_lines(rr, stream, ("estimate", "NIS [1]"), update_index, nis, ["NIS"])
+        update_index, nis = _times(innovations.time - start), innovations.nis[:, None]
+        _log_lines(stream, ["estimate", "NIS [1]"], update_index, nis, ["NIS"])
 
 
 def _log_lines(
-    rr: Any,
-    stream: Any,
-    path: Sequence[str],
-    index: list[Any],
-    values: FloatArray,
-    labels: Sequence[str],
+    stream: Any, path: list[str], index: list[Any], values: FloatArray, labels: Sequence[str]
 ) -> None:
-    name = rr.new_entity_path(list(path))
+    name = rr.new_entity_path(path)
     stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
     colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
     stream.log(name, rr.SeriesLines(colors=colours, names=list(labels)), static=True)
 
 
-def _times(rr: Any, seconds: FloatArray) -> list[Any]:
-    return [rr.TimeColumn(_TIME, duration=seconds)]
+def _times(seconds: FloatArray) -> list[Any]:
+    return [rr.TimeColumn("time", duration=seconds)]
