@@ -52,7 +52,8 @@ def compare(
 
     if report:
         optional_package("plotly", "report")
-    settings, network = estimating.settings(), estimating.network_for(jobs)
+    settings, network = estimating.settings(), estimating.network()
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
     files, skipped = reading.recordings(paths or [])
@@ -61,11 +62,11 @@ def compare(
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
         if not paths:
             typer.echo("demonstration: a simulated walk not used in training", err=True)
-            model = estimating.network()
-            comparison = compare_tracks(model, demonstration(), settings, progress, absolute_fixes)
-            comparisons.append(comparison)
+            comparisons.append(
+                compare_tracks(network, demonstration(), settings, progress, absolute_fixes)
+            )
         outcomes = compare_recordings(
-            files, network, settings, reading.read, jobs, absolute_fixes, progress=progress
+            files, model, settings, reading.read, jobs, absolute_fixes, progress=progress
         )
         comparisons += collect_results(outcomes, skipped)
     folder = out or Path("runs") / "compare"

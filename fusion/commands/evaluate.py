@@ -137,12 +137,13 @@ def _tracks(
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 
-    settings, network = estimating.settings(), estimating.network_for(jobs)
+    settings, network = estimating.settings(), estimating.network()
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     skipped: list[Skipped] = []
     recordings = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
-            files, network, settings, reading.read, jobs, truth_needed=True, progress=progress
+            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
         )
         for comparison in collect_results(outcomes, skipped):
             if out is not None:

@@ -168,11 +168,6 @@ class EstimatorOptions:
 
         return load_model(self.model)
 
-    def network_for(self, jobs: int) -> DisplacementModel | str:
-        """Return the loaded network, or for several jobs its name, after checking that it loads."""
-        network = self.network()
-        return network if jobs == 1 else self.model
-
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.

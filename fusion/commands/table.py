@@ -13,7 +13,6 @@ from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_v
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.table.cells import Cell
     from stario.fusion.table.sets import DataSet
 
 
@@ -66,6 +65,7 @@ def table(
     from stario.fusion.table.filling import fill, table_cells
     from stario.fusion.table.sets import learned_from
     from stario.fusion.table.training import ReaderConfig
+    from stario.network.architectures import ARCHITECTURES
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import cache_folder
 
@@ -73,7 +73,8 @@ def table(
     chosen = None if networks is None else [name.strip() for name in networks.split(",")]
     cells = table_cells(datasets, _recipe(config), steps, chosen, seeds)
     make_folder(out)
-    costs = known_costs(_trained(cells), out)
+    requested = {cell.network for cell in cells}
+    costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
     learned = {} if data is None else learned_from(data)
     options = ReadingOptions()
     reading = ReaderConfig(options.read, options.as_read(), cache or cache_folder())
@@ -116,11 +117,3 @@ def _data_sets(
 def _recipe(path: Path | None) -> dict[str, Any]:
     packaged = importlib.resources.files("stario.network.weights").joinpath("recipe-table.json")
     return recipe_values(Path(str(packaged)) if path is None else path)
-
-
-def _trained(cells: list[Cell]) -> list[str]:
-    """Return the networks of the cells, in the order of the paper's table."""
-    from stario.network.architectures import ARCHITECTURES
-
-    requested = {cell.network for cell in cells}
-    return [name for name in ARCHITECTURES if name in requested]

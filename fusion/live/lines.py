@@ -74,7 +74,7 @@ class LineServer:
         sender = f"tcp {writer.get_extra_info('peername')[0]}"
         try:
             await self._read(reader, writer, sender)
-        except (ConnectionError, asyncio.IncompleteReadError) as error:
+        except ConnectionError as error:
             _log.info("%s: %s", sender, error)
         finally:
             self._connections -= 1
@@ -108,18 +108,14 @@ class LineServer:
     async def _process_packets(self) -> None:
         while True:
             data, sender = await self._packets.get()
+            lines = data.split(b"\n")
             try:
-                await self._process_packet(data.split(b"\n"), sender)
+                trusted = not self._token or self._is_token(lines.pop(0))
+                refused = len(await self._take(lines, sender)) if trusted else 1
+                self._hub.refused["udp"] += refused
             except Exception:  # no packet, whatever it holds, may stop the server
                 _log.exception("%s: a packet is skipped", sender)
                 self._hub.refused["udp"] += 1
-
-    async def _process_packet(self, lines: list[bytes], sender: str) -> None:
-        if self._token and not self._is_token(lines.pop(0)):
-            self._hub.refused["udp"] += 1
-            return
-        for _ in await self._take(lines, sender):
-            self._hub.refused["udp"] += 1
 
     async def _take(self, lines: Sequence[bytes], sender: str) -> list[str]:
         """Process lines, batched by device; return the errors of those that fail."""

@@ -38,7 +38,7 @@ _LEFT = 58
 
 
 def map_figure(
-    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None = None
+    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
 ) -> go.Figure:
     """Draw all tracks from above on equal axes, with 3-sigma ellipses where there is covariance.
 

@@ -59,31 +59,6 @@ def write_report(
     Raises:
         InputError: the folder does not exist.
     """
-    content = _html(sequence, tracks, config, metrics, alignment)
-    with atomic_write(path) as file:
-        file.write(content)
-    return path
-
-
-def write_comparison_report(folder: Path, comparison: Comparison, config: NavigatorConfig) -> Path:
-    """Write `report.html` for a comparison; raises the errors of `write_report`."""
-    return write_report(
-        folder / "report.html",
-        comparison.sequence,
-        comparison.tracks,
-        config,
-        comparison.metrics,
-        comparison.alignment,
-    )
-
-
-def _html(
-    sequence: ImuSequence,
-    tracks: Mapping[str, Track],
-    config: NavigatorConfig,
-    metrics: Mapping[str, Metrics],
-    alignment: Alignment,
-) -> str:
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     truth = sequence.truth
     series = {
@@ -110,19 +85,32 @@ def _html(
         "cursors": _cursors(drawn, main),
     }
     health = tracks[main].health
-    return _filled(
-        {
-            "TITLE": html.escape(sequence.name),
-            "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
-            "FACTS": _facts(sequence, tracks[main], series[main]),
-            "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
-            "HEALTH": "" if health is None else _health(findings(health)),
-            "TABLE": "" if truth is None else _table(metrics, alignment),
-            "STYLE": _asset("report.css"),
-            "SCRIPT": _asset("report.js"),
-            "DATA": _script_json(data),
-            "PLOTLY": get_plotlyjs(),
-        }
+    parts = {
+        "TITLE": html.escape(sequence.name),
+        "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
+        "FACTS": _facts(sequence, tracks[main], series[main]),
+        "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
+        "HEALTH": "" if health is None else _health(findings(health)),
+        "TABLE": "" if truth is None else _table(metrics, alignment),
+        "STYLE": _asset("report.css"),
+        "SCRIPT": _asset("report.js"),
+        "DATA": _script_json(data),
+        "PLOTLY": get_plotlyjs(),
+    }
+    with atomic_write(path) as file:
+        file.write(_filled(parts))
+    return path
+
+
+def write_comparison_report(folder: Path, comparison: Comparison, config: NavigatorConfig) -> Path:
+    """Write `report.html` for a comparison; raises the errors of `write_report`."""
+    return write_report(
+        folder / "report.html",
+        comparison.sequence,
+        comparison.tracks,
+        config,
+        comparison.metrics,
+        comparison.alignment,
     )
 
 

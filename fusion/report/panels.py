@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
@@ -27,19 +26,12 @@ Column = Callable[[Series], FloatArray | None]
 """Function from a track to the column that a panel draws."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One row of the figure over time.
-
-    Attributes:
-        title: title with unit.
-        traces: plotly traces.
-        layout: layout of its y axis.
-    """
+class Panel(NamedTuple):
+    """One row of the figure over time: title with unit, plotly traces, layout of its y axis."""
 
     title: str
     traces: list[go.Scatter]
-    layout: dict[str, Any] = field(default_factory=dict)
+    layout: dict[str, Any]
 
 
 def style(name: str) -> tuple[str, str, str]:
@@ -136,7 +128,6 @@ def _curve(
         y=_rounded(value),
         name=label,
         legendgroup=name,
-        showlegend=False,
         mode="lines",
         line={"color": colour, "dash": dash, "width": 1.6},
         customdata=None if sigma is None else _rounded(sigma),
@@ -169,7 +160,6 @@ def _band(
         "line": {"width": 0},
         "hoverinfo": "skip",
         "legendgroup": group,
-        "showlegend": False,
     }
     fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
     return [
@@ -188,7 +178,6 @@ def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> l
             x=_rounded(time[rows]),
             y=_rounded(value[rows]),
             name=name,
-            showlegend=False,
             mode="markers",
             marker=marker,
             hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
@@ -203,7 +192,6 @@ def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
         x=_rounded(ends),
         y=[value, value],
         name=label,
-        showlegend=False,
         mode="lines",
         line={"color": INK, "dash": dash, "width": 1.2},
         hoverinfo="skip",

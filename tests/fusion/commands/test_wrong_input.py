@@ -12,37 +12,27 @@ from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 
 
-@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize(
+    ("field", "factor", "options", "truth"),
+    [
+        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], True),
+        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], False),
+        ("accel", 1.0 / 9.80665, ["--accel-unit", "g"], True),
+        ("accel", -1.0, ["--accel-unit=-m/s^2"], True),
+    ],
+)
 @pytest.mark.usefixtures("no_figures")
-def test_degrees_are_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path, truth: bool
-) -> None:
+def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path, field: str, factor: float, options: list[str],
+    truth: bool,
+) -> None:  # fmt: skip
     sequence = read_generic_csv(recording)
     sequence = sequence if truth else sequence.without_truth()
-    write_csv(tmp_path / "deg.csv", replace(sequence, gyro=np.degrees(sequence.gyro)))
-    done = stario("run", "deg.csv", "--out", "out")
-    done.assert_one_line_error("--gyro-unit deg/s", "deg")
+    write_csv(tmp_path / "odd.csv", replace(sequence, **{field: factor * getattr(sequence, field)}))
+    stario("run", "odd.csv", "--out", "out").assert_one_line_error(" ".join(options))
     assert not (tmp_path / "out").exists()
     if truth:
-        assert stario("run", "deg.csv", "--out", "out", "--gyro-unit", "deg/s").code == 0
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
-    stario("run", "g.csv").assert_one_line_error("--accel-unit g")
-    assert stario("run", "g.csv", "--accel-unit", "g").code == 0
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_wrong_sign_of_gravity_is_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "apple.csv", replace(sequence, accel=-sequence.accel))
-    stario("run", "apple.csv").assert_one_line_error("--accel-unit=-m/s^2")
-    assert stario("run", "apple.csv", "--accel-unit=-m/s^2").code == 0
+        assert stario("run", "odd.csv", "--out", "out", *options).code == 0
 
 
 @pytest.mark.parametrize(
