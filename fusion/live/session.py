@@ -46,6 +46,21 @@ class Session:
         self._file: LiveFile | None = None
         self.start()
 
+    def start(self, recording: str = "") -> None:
+        """Start a new track and a new recording."""
+        self.close()
+        self._recording, self._merger = recording, Merger()
+        self._navigator, self._file = self._new_navigator(), None
+        self._first_ns = self._newest_ns = -1
+        self._health_time = -math.inf
+        self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
+        self.problem = ""
+        self.words: list[dict[str, str]] = []
+        self._unwritten: tuple[list[Sample], list[Field]] = [], []
+        self.samples = self.fixes = 0
+        self.rate = 0.0
+        self.running = True
+
     @property
     def path(self) -> Path | None:
         """Path of the current recording, or of the last; None before the first sample."""
@@ -92,21 +107,6 @@ class Session:
             self._push_field(time_ns, field)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
-
-    def start(self, recording: str = "") -> None:
-        """Start a new track and a new recording."""
-        self.close()
-        self._recording, self._merger = recording, Merger()
-        self._navigator, self._file = self._new_navigator(), None
-        self._first_ns = self._newest_ns = -1
-        self._health_time = -math.inf
-        self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
-        self.problem = ""
-        self.words: list[dict[str, str]] = []
-        self._unwritten: tuple[list[Sample], list[Field]] = [], []
-        self.samples = self.fixes = 0
-        self.rate = 0.0
-        self.running = True
 
     def stop(self) -> None:
         """End the track; ignore data until `start`."""

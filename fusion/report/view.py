@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +53,11 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
     if sequence.truth is not None:
         _log_path(stream, "world/truth", sequence.truth, _BLACK)
     _log_device(stream, trajectory, start)
-    _log_sensors(stream, sequence, start)
-    _log_estimates(stream, track, start)
+    for entity, time, values, labels in _quantities(sequence, track):
+        name, index = rr.new_entity_path(entity), _times(time - start)
+        stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
+        colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
+        stream.log(name, rr.SeriesLines(colors=colours, names=labels), static=True)
     stream.disconnect()
     return path
 
@@ -109,45 +112,30 @@ def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:
     stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
 
 
-def _log_sensors(stream: Any, sequence: ImuSequence, start: float) -> None:
-    finite = np.isfinite(sequence.time)
-    index = _times(sequence.time[finite] - start)
-    for name, values in (
-        ("gyroscope [rad/s]", sequence.gyro),
-        ("specific force [m/s^2]", sequence.accel),
+def _quantities(
+    sequence: ImuSequence, track: Track
+) -> Iterator[tuple[list[str], FloatArray, FloatArray, list[str]]]:
+    """Yield path, times (N,), values (N, k) and labels of each quantity over time."""
+    finite, axes = np.isfinite(sequence.time), list("xyz")
+    time = sequence.time[finite]
+    yield ["sensors", "gyroscope [rad/s]"], time, sequence.gyro[finite], axes
+    yield ["sensors", "specific force [m/s^2]"], time, sequence.accel[finite], axes
+    for name, bias in (
+        ("gyroscope bias [rad/s]", track.b_g),
+        ("accelerometer bias [m/s^2]", track.b_a),
     ):
-        _log_lines(stream, ["sensors", name], index, values[finite], "xyz")
-
-
-def _log_estimates(stream: Any, track: Track, start: float) -> None:
-    index = _times(track.time - start)
-    lines: list[tuple[str, FloatArray | None, Sequence[str]]] = [
-        ("gyroscope bias [rad/s]", track.b_g, "xyz"),
-        ("accelerometer bias [m/s^2]", track.b_a, "xyz"),
-    ]
+        if bias is not None:
+            yield ["estimate", name], track.time, bias, axes
     if track.trajectory.velocity_W is not None:
         speed = np.linalg.norm(track.trajectory.velocity_W, axis=1)[:, None]
-        lines.append(("speed [m/s]", speed, ["speed"]))
+        yield ["estimate", "speed [m/s]"], track.time, speed, ["speed"]
     if track.covariance is not None:
         sigma = np.sqrt(track.covariance[:, range(15), range(15)])
-        lines.append(("sigma of position [m]", sigma[:, 6:9], "xyz"))
-        lines.append(("sigma of yaw [rad]", sigma[:, 2:3], ["yaw"]))
-    for name, values, labels in lines:
-        if values is not None:
-            _log_lines(stream, ["estimate", name], index, values, labels)
+        yield ["estimate", "sigma of position [m]"], track.time, sigma[:, 6:9], axes
+        yield ["estimate", "sigma of yaw [rad]"], track.time, sigma[:, 2:3], ["yaw"]
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        update_index, nis = _times(innovations.time - start), innovations.nis[:, None]
-        _log_lines(stream, ["estimate", "NIS [1]"], update_index, nis, ["NIS"])
-
-
-def _log_lines(
-    stream: Any, path: list[str], index: list[Any], values: FloatArray, labels: Sequence[str]
-) -> None:
-    name = rr.new_entity_path(path)
-    stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
-    colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
-    stream.log(name, rr.SeriesLines(colors=colours, names=list(labels)), static=True)
+        yield ["estimate", "NIS [1]"], innovations.time, innovations.nis[:, None], ["NIS"]
 
 
 def _times(seconds: FloatArray) -> list[Any]:
