@@ -11,8 +11,7 @@ import sys
 
 import typer
 
-from stario.fusion.commands.by_group import fixes, fusion, gaps
-from stario.fusion.commands.checks import backends, benchmark, consistency, faults, models
+from stario.fusion.commands import checks
 from stario.fusion.commands.compare import compare
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
@@ -36,7 +35,10 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, table, fusion, backends, faults, gaps, fixes, consistency, benchmark):
+for command in (
+    *(checks.models, table, checks.fusion, checks.backends, checks.faults),
+    *(checks.gaps, checks.fixes, checks.consistency, checks.benchmark),
+):
     check.command()(command)
 app.add_typer(check, name="check")
 
