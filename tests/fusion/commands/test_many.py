@@ -240,13 +240,6 @@ def test_training_can_use_recordings_alone(
     assert trained_on == ["recorded, others: 0 min"]  # nothing simulated, no licence known
 
 
-def test_where_is_refused_with_the_packaged_lists(stario) -> None:
-    """Training would use all of their recordings, whatever the option says."""
-    stario("train", "--data", "data", "--where", "person=dan").assert_one_line_error(
-        "--where: found with --data"
-    )
-
-
 def test_a_recording_cannot_both_train_and_validate(
     stario, recording: Path, tmp_path: Path
 ) -> None:
@@ -270,13 +263,6 @@ def test_run_with_the_graph_writes_its_track(
     assert len(read_tum(tmp_path / "out" / "graph.tum").time) > 100
     notes = json.loads((tmp_path / "out" / "health.json").read_text())["notes"]
     assert notes[0].startswith("graph of")
-
-
-def test_an_unknown_back_end_is_a_one_line_error(stario, recording: Path) -> None:
-    done = stario("run", recording, "--backend", "ukf")
-    assert done.code == 1
-    assert "backend: found 'ukf'" in done.err
-    assert len(done.err.strip().splitlines()) == 1
 
 
 def test_backends_compares_filter_and_graph(stario) -> None:

@@ -78,7 +78,12 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
         (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
+        (["run", "RECORDING", "--backend", "ukf"], ["backend: found 'ukf'"]),
         (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
+        (
+            ["run", "RECORDING", "--model", "nothere"],  # the error names the known weights
+            ["nothere", "default, first-stage, open or walks-36min"],
+        ),
         (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
         (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
         (["simulate", "no/such/folder.csv"], ["folder"]),
@@ -89,6 +94,7 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
+        (["train", "--data", ".", "--where", "person=dan"], ["--where: found with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
@@ -142,14 +148,6 @@ def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_
 def test_a_file_extension_without_a_layout_is_refused(stario, recording: Path) -> None:
     stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
     assert not Path("walk.txt").exists()
-
-
-def test_unknown_weights_are_refused_with_the_names_of_the_known_ones(
-    stario, recording: Path
-) -> None:
-    stario("run", recording, "--model", "nothere").assert_one_line_error(
-        "nothere", "default, first-stage, open or walks-36min"
-    )
 
 
 def test_a_declination_without_a_source_of_north_is_reported(stario, recording: Path) -> None:
