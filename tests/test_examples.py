@@ -18,6 +18,7 @@ from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.engines import TorchEngine
+from stario.sequences import read_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples"
@@ -98,9 +99,6 @@ def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(tmp
 
 
 def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
-    from stario.fusion import Navigator
-    from stario.sequences import read_recording
-
     sample_count, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
     recording = read_recording(path)
     assert sample_count == len(recording) == 1200
@@ -154,8 +152,6 @@ def fix_at(stamp_ns, xyz, sigma):
 
 
 def test_ros2_node_keeps_odom_continuous_and_corrects_map_to_odom_by_fixes():
-    from stario.fusion import Navigator
-
     example = load("ros2_node")
     check_odometry(example.main(seconds=6.0))
     bridge = example.OdometryBridge(Navigator(load_model("default")))
@@ -183,8 +179,6 @@ def test_ros2_node_keeps_odom_continuous_and_corrects_map_to_odom_by_fixes():
 @pytest.mark.parametrize("ahead_ns", [0, 30_000_000])
 def test_ros2_node_follows_a_map_moved_by_a_fix_at_the_current_time(ahead_ns):
     """The fix waits for the sample of its time and is applied between two odometry outputs."""
-    from stario.fusion import Navigator
-
     example = load("ros2_node")
     bridge = example.OdometryBridge(Navigator(load_model("default")))
     outputs = []

@@ -1,1 +1,1 @@
-"""The commands of `stario`, one file each; `stario.fusion.commands.cli` registers them."""
+"""The commands of `stario`; `stario.fusion.commands.cli` registers them."""

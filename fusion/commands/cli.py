@@ -11,18 +11,13 @@ import sys
 
 import typer
 
-from stario.fusion.commands.backends import backends
-from stario.fusion.commands.benchmark import benchmark
-from stario.fusion.commands.by_group import fixes, fusion, gaps
+from stario.fusion.commands import checks
 from stario.fusion.commands.compare import compare
-from stario.fusion.commands.consistency import consistency
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
-from stario.fusion.commands.faults import faults
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
-from stario.fusion.commands.models import models
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
@@ -40,7 +35,10 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (models, table, fusion, backends, faults, gaps, fixes, consistency, benchmark):
+for command in (
+    *(checks.models, table, checks.fusion, checks.backends, checks.faults),
+    *(checks.gaps, checks.fixes, checks.consistency, checks.benchmark),
+):
     check.command()(command)
 app.add_typer(check, name="check")
 

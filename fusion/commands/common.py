@@ -23,27 +23,16 @@ Result = TypeVar("Result")
 
 
 def collect_results(
-    outcomes: Iterable[Result | Skipped],
-    skipped: list[Skipped],
-    progress: Callable[[int], None] = lambda done: None,
-) -> list[Result]:
-    """Return the results in order; append recordings that could not be used to `skipped`.
-
-    Args:
-        outcomes: results and failures from `stario.sequences.datasets.batch.each`.
-        skipped: list to extend.
-        progress: called with the number of recordings finished so far.
-    """
+    outcomes: Iterable[Result | Skipped], skipped: list[Skipped]
+) -> Iterator[Result]:
+    """Yield the results in order; append recordings that could not be used to `skipped`."""
     from stario.sequences.datasets.batch import Skipped
 
-    results: list[Result] = []
-    for done, outcome in enumerate(outcomes, 1):
+    for outcome in outcomes:
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
         else:
-            results.append(outcome)
-        progress(done)
-    return results
+            yield outcome
 
 
 def map_recordings(
@@ -52,43 +41,30 @@ def map_recordings(
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each recording with a progress bar; return results and failures.
-
-    Args:
-        title: label of the progress bar.
-        reading: options for reading recordings.
-        paths: recordings, folders or list files.
-        work: function of a recording's path and the recording.
-    """
+    """Apply `work` to each recording and its path; return results and failures."""
     from stario.sequences.datasets.batch import each
 
     files, skipped = reading.recordings(paths)
-
-    def done_with(file: Path) -> Result:
-        return work(file, reading.read(file))
-
-    with progress_bar(title, len(files)) as progress:
-        outcomes = each(done_with, files, jobs=1)
-        found = collect_results(outcomes, skipped, lambda done: progress(done / len(files)))
-    return found, skipped
+    outcomes = each(lambda file: work(file, reading.read(file)), files, jobs=1)
+    return list(collect_results(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 
 def process_each(
     reading: ReadingOptions,
     paths: Sequence[Path],
     out: Path | None,
-    work: Callable[[ImuSequence, Path], dict[str, object]],
+    work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
     as_json: bool,
     single: str = "",
 ) -> None:
-    """Apply `work` to each recording, giving each its own folder for files.
+    """Apply `work` to each recording, giving each its own folder for files, and print the results.
 
     Args:
         reading: options for reading recordings.
         paths: recordings, folders or list files.
         out: folder of a single recording, or parent folder of several; None for `runs`/NAME.
-        work: function of a recording and its folder, distinct for each; returns its record.
-        as_json: whether to print the records.
+        work: function of a recording and its folder, distinct for each; returns record and text.
+        as_json: whether to print the records rather than the texts.
         single: name of an option in use that allows only one recording; empty if none.
     """
     from stario.fusion.evaluation.many import distinct_name
@@ -102,11 +78,15 @@ def process_each(
     def recorded(file: Path) -> dict[str, object]:
         sequence = reading.read(file)
         name = distinct_name(sequence.name, names)
-        return work(sequence, out if out and len(files) == 1 else (out or Path("runs")) / name)
+        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
+        record, text = work(sequence, folder)
+        if not as_json:
+            typer.echo(text)
+        return record
 
-    records = collect_results(each(recorded, files, jobs=1), skipped)
+    records = list(collect_results(each(recorded, files, jobs=1), skipped))
     if as_json and records:
-        print_json(records[0] if len(files) == 1 else records)
+        print_result(True, records[0] if len(files) == 1 else records)
     exit_if_skipped(skipped)
 
 
@@ -117,6 +97,14 @@ def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
         typer.echo(f"stario: skipped: {where}{failure.reason}", err=True)
     if skipped:
         raise typer.Exit(1)
+
+
+def with_bar(title: str, items: Iterable[Result], total: int) -> Iterable[Result]:
+    """Yield the items with a progress bar on stderr; hidden without a terminal."""
+    from tqdm import tqdm
+
+    shown: Iterable[Result] = tqdm(items, title, total, leave=False, disable=None)
+    return shown
 
 
 @contextmanager
@@ -135,7 +123,6 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
 
 _FULL_COVERAGE = 0.98
 """Share of a track below which the coverage by ground truth is reported as partial."""
-
 
 _EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
 """Metrics explained below a table."""
@@ -179,8 +166,8 @@ def track_table(
     return "\n".join(lines)
 
 
-def print_json(content: object) -> None:
-    """Print JSON on stdout."""
+def print_result(as_json: bool, record: object, text: str = "") -> None:
+    """Print a result on stdout: its record as JSON, or else its text."""
     from stario.sequences.files import json_text
 
-    typer.echo(json_text(content), nl=False)
+    typer.echo(json_text(record) if as_json else text, nl=not as_json)

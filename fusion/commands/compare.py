@@ -10,7 +10,7 @@ import typer
 from stario.fusion.commands.common import (
     collect_results,
     exit_if_skipped,
-    print_json,
+    print_result,
     progress_bar,
     track_table,
 )
@@ -19,8 +19,8 @@ from stario.fusion.commands.options import (
     FixesOption,
     JobsOption,
     JsonOption,
+    OptionalPathsArgument,
     OutOption,
-    PathsArgument,
     ReadingOptions,
     ReportOption,
     expand_option_groups,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def compare(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
-    paths: PathsArgument = None,
+    paths: OptionalPathsArgument = None,
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
     out: OutOption = None,
@@ -52,7 +52,8 @@ def compare(
 
     if report:
         optional_package("plotly", "report")
-    settings, network = estimating.settings(), estimating.network_for(jobs)
+    settings, network = estimating.settings(), estimating.network()
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     comparisons: list[Comparison] = []
     files, skipped = reading.recordings(paths or [])
@@ -61,15 +62,13 @@ def compare(
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
         if not paths:
             typer.echo("demonstration: a simulated walk not used in training", err=True)
-            model = estimating.network()
-            comparison = compare_tracks(model, demonstration(), settings, progress, absolute_fixes)
-            comparisons.append(comparison)
-        comparisons += collect_results(
-            compare_recordings(
-                files, network, settings, reading.read, jobs, absolute_fixes, progress=progress
-            ),
-            skipped,
+            comparisons.append(
+                compare_tracks(network, demonstration(), settings, progress, absolute_fixes)
+            )
+        outcomes = compare_recordings(
+            files, model, settings, reading.read, jobs, absolute_fixes, progress=progress
         )
+        comparisons += collect_results(outcomes, skipped)
     folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:
@@ -78,27 +77,27 @@ def compare(
         for comparison in comparisons:
             inner = folder / comparison.sequence.name
             written.append(write_comparison_report(inner, comparison, settings))
-    if as_json and comparisons:
-        print_json(comparison_dict(comparisons))
-    elif comparisons:
-        for comparison in comparisons:
-            _print_comparison(comparison)
-        typer.echo(f"{len(written)} files in {folder}")
+    if comparisons:
+        lines = [line for comparison in comparisons for line in _lines(comparison)]
+        lines.append(f"{len(written)} files in {folder}")
+        print_result(as_json, comparison_dict(comparisons), "\n".join(lines))
     exit_if_skipped(skipped)
 
 
-def _print_comparison(comparison: Comparison) -> None:
+def _lines(comparison: Comparison) -> list[str]:
     from stario.fusion.evaluation.compare import metric_words
 
     sequence = comparison.sequence
     path = comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
-    typer.echo(f"{sequence.name}: {sequence.duration:.1f} s, {length}")
-    time = comparison.tracks["ekf"].time
-    words = metric_words(comparison.alignment)
-    typer.echo(track_table(comparison.metrics, time, sequence.truth, words))
+    time, words = comparison.tracks["ekf"].time, metric_words(comparison.alignment)
+    lines = [
+        f"{sequence.name}: {sequence.duration:.1f} s, {length}",
+        track_table(comparison.metrics, time, sequence.truth, words),
+    ]
     if sequence.truth is None and sequence.positions is not None:
         from stario.fusion.evaluation.known_positions import position_error_words
 
         for name, track in comparison.tracks.items():
-            typer.echo(f"{name}: {position_error_words(track, sequence.positions)}")
+            lines.append(f"{name}: {position_error_words(track, sequence.positions)}")
+    return lines

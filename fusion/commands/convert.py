@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped
+from stario.fusion.commands.common import collect_results, exit_if_skipped
 from stario.fusion.commands.options import ReadingOptions, expand_option_groups
-from stario.sequences.errors import InputError, StarioError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
@@ -84,15 +84,14 @@ def _read(
     reading: ReadingOptions, files: list[Path], skipped: list[Skipped]
 ) -> Iterator[ImuSequence]:
     """Yield one recording after the other; add those that cannot be converted to `skipped`."""
-    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.batch import each
     from stario.sequences.datasets.convert import check_content
 
-    for file in files:
-        try:
-            sequence = reading.read(file)
-            check_content(sequence)
-        except StarioError as error:
-            skipped.append(Skipped(str(file), str(error)))
-        else:
-            typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
-            yield sequence
+    def checked(file: Path) -> ImuSequence:
+        sequence = reading.read(file)
+        check_content(sequence)
+        return sequence
+
+    for sequence in collect_results(each(checked, files, jobs=1), skipped):
+        typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
+        yield sequence

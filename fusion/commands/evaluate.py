@@ -1,36 +1,46 @@
-"""`stario evaluate`: accuracy over many recordings with ground truth."""
+"""`stario evaluate`: accuracy over many recordings, of estimators or of networks alone."""
 
 from __future__ import annotations
 
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, print_json, progress_bar
-from stario.fusion.commands.judging import evaluate_by_group
+from stario.fusion.commands.common import (
+    collect_results,
+    exit_if_skipped,
+    print_result,
+    progress_bar,
+)
 from stario.fusion.commands.options import (
     EstimatorOptions,
     JobsOption,
     JsonOption,
+    OptionalPathsArgument,
     OutOption,
-    PathsArgument,
     ReadingOptions,
+    RunsOption,
     expand_option_groups,
 )
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
+    from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+    from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
+
+_GROUP = "{group}"
 
 
 @expand_option_groups
 def evaluate(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
-    paths: PathsArgument = None,
+    paths: OptionalPathsArgument = None,
     data: Annotated[
         Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
     ] = None,
@@ -44,7 +54,6 @@ def evaluate(
     by: Annotated[
         str | None,
         typer.Option(
-            "--by",
             help="Evaluate the network alone by set, group, person, device, place or carry. "
             "Ground truth may be poses, positions or waypoints.",
         ),
@@ -63,14 +72,11 @@ def evaluate(
     models: Annotated[
         str | None,
         typer.Option(
-            "--models",
             help="Networks to compare, separated by commas: names from `stario check models`, "
             "default, or weights files; several weights of one network are averaged.",
         ),
     ] = None,
-    runs: Annotated[
-        Path, typer.Option(help="Folder of training runs in which named networks are found.")
-    ] = Path("runs"),
+    runs: RunsOption = Path("runs"),
     convention: Annotated[
         str | None,
         typer.Option(help="How --models averages position errors: rms (default), ronin or mean."),
@@ -80,50 +86,22 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    from stario.fusion.evaluation.many import compare_recordings
-    from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
-    from stario.sequences.datasets.batch import Skipped
-
-    if by is not None:
-        listed, skipped = _listed(reading, paths or [], data, split)
-        skipped += evaluate_by_group(
-            listed, reading, by, estimating.model, against, ekf, jobs, out, as_json
-        )
-        exit_if_skipped(skipped)
-        return
-    if against is not None:
+    if by is None and against is not None:
         raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
-    listed, skipped = _listed(reading, paths or [], data, split)
-    files = [entry.path for entry in listed]
-    if models is not None:
-        names, settings = [name.strip() for name in models.split(",")], estimating.settings()
-        averaging = convention or "rms"
-        skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
-        exit_if_skipped(skipped)
-        return
-    if convention is not None:
+    if by is None and models is None and convention is not None:
         raise InputError(
             "--convention", f"{convention} without --models", "networks", "name them with --models"
         )
-    settings, network = estimating.settings(), estimating.network_for(jobs)
-    recordings = []
-    with progress_bar("evaluate", 100 * len(files)) as progress:
-        for outcome in compare_recordings(
-            files, network, settings, reading.read, jobs, truth_needed=True, progress=progress
-        ):
-            if isinstance(outcome, Skipped):
-                skipped.append(outcome)
-                continue
-            if out is not None:
-                write_recording(out, outcome, settings)
-            recordings.append(scores_of(outcome))
-    if recordings and out is not None:
-        write_summary(out, recordings, settings)
-    if recordings and as_json:
-        print_json(summary(recordings))
-    elif recordings:
-        typer.echo(summary_table(recordings))
+    listed, skipped = _listed(reading, paths or [], data, split)
+    files = [entry.path for entry in listed]
+    if by is not None:
+        skipped += _groups(listed, reading, by, estimating.model, against, ekf, jobs, out, as_json)
+    elif models is not None:
+        names, settings = [name.strip() for name in models.split(",")], estimating.settings()
+        averaging = convention or "rms"
+        skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
+    else:
+        skipped += _tracks(files, reading, estimating, jobs, out, as_json)
     exit_if_skipped(skipped)
 
 
@@ -146,6 +124,38 @@ def _listed(
     return read_packaged_list(split, data), []
 
 
+def _tracks(
+    files: list[Path],
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """Write and print the table of recordings; return those that were skipped."""
+    from stario.fusion.evaluation.many import compare_recordings
+    from stario.fusion.evaluation.results import write_recording, write_summary
+    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+
+    settings, network = estimating.settings(), estimating.network()
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
+    skipped: list[Skipped] = []
+    recordings = []
+    with progress_bar("evaluate", 100 * len(files)) as progress:
+        outcomes = compare_recordings(
+            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
+        )
+        for comparison in collect_results(outcomes, skipped):
+            if out is not None:
+                write_recording(out, comparison, settings)
+            recordings.append(scores_of(comparison))
+    if recordings:
+        if out is not None:
+            write_summary(out, recordings, settings)
+        print_result(as_json, summary(recordings), summary_table(recordings))
+    return skipped
+
+
 def _networks(
     names: list[str],
     runs: Path,
@@ -160,11 +170,7 @@ def _networks(
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
     from stario.fusion.evaluation.results import make_folder
-    from stario.fusion.evaluation.tables import (
-        compare_networks,
-        table_dict,
-        table_text,
-    )
+    from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import check_convention
 
@@ -184,8 +190,71 @@ def _networks(
     if table.entries:
         if out is not None:
             write_table(out, table)
-        if as_json:
-            print_json(table_dict(table))
-        else:
-            typer.echo(table_text(table))
+        print_result(as_json, table_dict(table), table_text(table))
     return skipped
+
+
+def _groups(
+    recordings: list[ListEntry],
+    reading: ReadingOptions,
+    by: str,
+    ours: str,
+    theirs: str | None,
+    ekf: bool,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """Write and print the table of groups; return the recordings that were skipped."""
+    from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
+    from stario.fusion.evaluation.judging.prepared import prepared_recordings
+    from stario.fusion.evaluation.judging.table import (
+        JudgingResult,
+        judgement_dict,
+        judgement_text,
+        write_judgement,
+    )
+    from stario.fusion.evaluation.results import make_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
+
+    grouping = check_by(by)
+    names = [ours] if theirs is None else [ours, theirs]
+    models = {name: partial(_for_group, name) for name in names}
+    for name in names:
+        if _GROUP not in name:
+            _for_group(name, "")  # fail on unloadable weights before preparing anything
+    if out is not None:
+        make_folder(out)
+    paths = [entry.path for entry in recordings]
+    prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
+    groups = {entry.path: entry.group for entry in recordings}
+    with progress_bar("judge", len(recordings)) as progress:
+        judged, skipped = judge(
+            prepared,
+            models,
+            groups,
+            reading.read if ekf else None,
+            lambda done: progress(done / len(recordings)),
+        )
+    if not judged:
+        return skipped
+    found = JudgingResult(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
+    if out is not None:
+        write_judgement(out, found)
+    print_result(as_json, judgement_dict(found), judgement_text(found))
+    return skipped
+
+
+@cache
+def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
+    from stario.fusion.evaluation.pedestrian import NAME, PedestrianDeadReckoning
+    from stario.network.model import load_model
+
+    if name == NAME:
+        return PedestrianDeadReckoning()
+    return load_model(name)
+
+
+def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
+    """Load weights by name; `{group}` in it stands for the group, with underscores for blanks."""
+    return _loaded(name.replace(_GROUP, group.replace(" ", "_")))

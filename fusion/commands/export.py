@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from stario.fusion.commands.options import RunsOption
 from stario.sequences.errors import InputError
 
 
@@ -14,16 +15,11 @@ def export(
     model: Annotated[
         str,
         typer.Option(
-            "--model",
             help="Network: a name from `stario check models`, default, or weights with their card.",
         ),
     ] = "default",
-    runs: Annotated[
-        Path, typer.Option(help="Folder of training runs in which named networks are found.")
-    ] = Path("runs"),
-    out: Annotated[
-        Path | None, typer.Option("--out", help="File to write. Default: ./NETWORK.onnx")
-    ] = None,
+    runs: RunsOption = Path("runs"),
+    out: Annotated[Path | None, typer.Option(help="File to write. Default: ./NETWORK.onnx")] = None,
 ) -> None:
     """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""
     from stario.network.model import load_model, weights_named

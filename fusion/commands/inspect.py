@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,24 +13,23 @@ from stario.fusion.commands.common import process_each
 from stario.fusion.commands.options import (
     JsonOption,
     OutOption,
+    PathsArgument,
     ReadingOptions,
     expand_option_groups,
 )
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.familiarity import Familiarity
     from stario.network.model import DisplacementModel
     from stario.sequences.sequence import ImuSequence
 
 
 @expand_option_groups
 def inspect(
-    paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
-    ],
+    paths: PathsArgument,
     reading: ReadingOptions,
     model: Annotated[
-        str, typer.Option("--model", help="Compare the motion with these weights' training.")
+        str, typer.Option(help="Compare the motion with these weights' training.")
     ] = "default",
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -37,13 +37,14 @@ def inspect(
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, kind of motion."""
     from stario.network.model import load_model
 
-    work = partial(_inspect, network=load_model(model), printed=not as_json)
-    process_each(reading, paths, out, work, as_json)
+    process_each(reading, paths, out, partial(_inspect, network=load_model(model)), as_json)
 
 
 def _inspect(
-    sequence: ImuSequence, folder: Path, network: DisplacementModel, printed: bool
-) -> dict[str, object]:
+    sequence: ImuSequence, folder: Path, network: DisplacementModel
+) -> tuple[dict[str, object], str]:
+    """Write one recording's figure and findings; return its record and the findings in words."""
+    from stario.fusion.evaluation.familiarity import familiarity
     from stario.fusion.evaluation.results import make_folder
     from stario.sequences.drawing.figures import save_figure
     from stario.sequences.drawing.plots import imu_overview
@@ -60,23 +61,10 @@ def _inspect(
         gaps=[(start, start + length) for start, length in found.timing.gaps],
     )
     save_figure(figure, folder / "inspection.png")
-    motion = _motion(sequence, network)
+    motion = None
+    with suppress(InputError):  # undetermined: the problems give the reason
+        motion = familiarity(network, sequence)
     record = found.as_dict() | {"motion": motion and motion.as_dict()}
     write_json(folder / "inspection.json", record)
-    if printed:
-        typer.echo(
-            "\n".join([sequence.summary(), *found.lines(), *(motion.lines() if motion else [])])
-        )
-        typer.echo(f"figure: {folder / 'inspection.png'}")
-    return record
-
-
-def _motion(sequence: ImuSequence, network: DisplacementModel) -> Familiarity | None:
-    """Return the kind of motion; None if undetermined, for which the problems give the reason."""
-    from stario.fusion.evaluation.familiarity import familiarity
-    from stario.sequences.errors import InputError
-
-    try:
-        return familiarity(network, sequence)
-    except InputError:
-        return None
+    lines = [sequence.summary(), *found.lines(), *(motion.lines() if motion else [])]
+    return record, "\n".join([*lines, f"figure: {folder / 'inspection.png'}"])

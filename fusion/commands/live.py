@@ -26,9 +26,7 @@ def live(
     phyphox: Annotated[
         list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the recordings.")] = Path(
-        "runs/live"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or lines of JSON."""
     from stario.sequences.readers.checked import optional_package

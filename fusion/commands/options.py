@@ -5,9 +5,8 @@ from __future__ import annotations
 import inspect
 import json
 import math
-import typing
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,17 +21,22 @@ if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
-PathsArgument = Annotated[
-    list[Path] | None,
-    typer.Argument(metavar="PATH...", help="Recordings, folders or list files."),
+_PATHS = typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
+PathsArgument = Annotated[list[Path], _PATHS]
+OptionalPathsArgument = Annotated[list[Path] | None, _PATHS]
+RunsOption = Annotated[
+    Path, typer.Option(help="Folder of training runs in which named networks are found.")
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for the results.")]
+CacheOption = Annotated[
+    Path | None, typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache.")
+]
+ConfigOption = Annotated[Path | None, typer.Option(help="TOML or JSON file with settings.")]
+OutOption = Annotated[Path | None, typer.Option(help="Folder for the results.")]
 FixesOption = Annotated[
     Path | None,
     typer.Option(
-        "--fixes",
         help="CSV of absolute fixes with columns t, kind, x, y, z, sx, sy, sz: position \\[m], "
-        "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas.",
+        "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas."
     ),
 ]
 BackendOption = Annotated[str, typer.Option(help="Estimator: ekf or graph.")]
@@ -40,7 +44,7 @@ ByOption = Annotated[
     str, typer.Option(help="Group by set, or by an attribute such as person, device or carry.")
 ]
 JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Number of processes that share the recordings.")
+    int, typer.Option(min=1, help="Number of processes that share the recordings.")
 ]
 ReportOption = Annotated[
     bool, typer.Option("--report", help="Also write report.html: map, time slider, plots, health.")
@@ -52,57 +56,46 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as J
 class ReadingOptions:
     """Options for reading a recording."""
 
-    format: Annotated[
-        str, typer.Option("--format", help="Format of the recording: auto or a format name.")
-    ] = "auto"
-    gyro_unit: Annotated[
-        str, typer.Option("--gyro-unit", help="Unit of the gyroscope: rad/s or deg/s.")
-    ] = "rad/s"
+    format: Annotated[str, typer.Option(help="Format of the recording: auto or a format name.")] = (
+        "auto"
+    )
+    gyro_unit: Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s or deg/s.")] = "rad/s"
     accel_unit: Annotated[
-        str,
-        typer.Option("--accel-unit", help="Unit of the accelerometer: m/s^2, g, -m/s^2 or -g."),
+        str, typer.Option(help="Unit of the accelerometer: m/s^2, g, -m/s^2 or -g.")
     ] = "m/s^2"
     accel_sign: Annotated[
-        str,
-        typer.Option(
-            "--accel-sign", help="Direction of the accelerometer at rest: up, or apple (down)."
-        ),
+        str, typer.Option(help="Direction of the accelerometer at rest: up, or apple (down).")
     ] = "up"
     axes: Annotated[
         str,
         typer.Option(
-            "--axes",
-            help="Axes of the ground truth in the file's axes, such as y,-x,z (or --axes=-y,x,z).",
+            help="Axes of the ground truth in the file's axes, such as y,-x,z (or --axes=-y,x,z)."
         ),
     ] = "x,y,z"
-    imu_topic: Annotated[
-        str | None, typer.Option("--imu-topic", help="IMU topic of a bag with several IMUs.")
-    ] = None
+    imu_topic: Annotated[str | None, typer.Option(help="IMU topic of a bag with several IMUs.")] = (
+        None
+    )
     truth_topic: Annotated[
-        str | None, typer.Option("--truth-topic", help="Topic of true poses or odometry in a bag.")
+        str | None, typer.Option(help="Topic of true poses or odometry in a bag.")
     ] = None
     gravity: Annotated[
         str,
         typer.Option(
-            "--gravity",
             help="Gravity in the accelerometer: included, or removed and restored from the true "
-            "attitude, or else the device's own.",
+            "attitude, or else the device's own."
         ),
     ] = "included"
     where: Annotated[
         list[str] | None,
         typer.Option(
-            "--where",
             help="Only recordings of archives with this attribute, such as person=dan or "
-            "'name=r*'. Repeatable: any value of one attribute, but all attributes must match.",
+            "'name=r*'. Repeatable: any value of one attribute, but all attributes must match."
         ),
     ] = None
 
     def as_read(self) -> dict[str, object]:
         """Return the options that affect a recording's values: all except `where`."""
-        return {
-            item.name: getattr(self, item.name) for item in fields(self) if item.name != "where"
-        }
+        return {name: value for name, value in asdict(self).items() if name != "where"}
 
     def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
         """Return the recordings at the paths, in folders or list files, and the skipped paths."""
@@ -138,27 +131,19 @@ class ReadingOptions:
 class EstimatorOptions:
     """Options of the estimator."""
 
-    config: Annotated[
-        Path | None, typer.Option("--config", help="TOML or JSON file with settings.")
-    ] = None
+    config: ConfigOption = None
     model: Annotated[
         str,
         typer.Option(
-            "--model",
-            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file.",
+            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file."
         ),
     ] = "default"
-    magnetometer: Annotated[
-        bool,
-        typer.Option(
-            "--magnetometer/--no-magnetometer", help="Use the magnetometer, if there is one."
-        ),
-    ] = True
-
+    magnetometer: Annotated[bool, typer.Option(help="Use the magnetometer, if there is one.")] = (
+        True
+    )
     declination: Annotated[
         float | None,
         typer.Option(
-            "--declination",
             min=-180.0,
             max=180.0,
             help="Magnetic declination in degrees east; the track's y axis then points north.",
@@ -183,50 +168,34 @@ class EstimatorOptions:
 
         return load_model(self.model)
 
-    def network_for(self, jobs: int) -> DisplacementModel | str:
-        """Return the loaded network, or for several jobs its name, after checking that it loads."""
-        network = self.network()
-        return network if jobs == 1 else self.model
-
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.
 
     Groups are `ReadingOptions` and `EstimatorOptions`: each option is thus defined only once.
     """
-    hints = typing.get_type_hints(command, include_extras=True)
-    groups = {
-        name: kind for name, kind in hints.items() if kind in (ReadingOptions, EstimatorOptions)
-    }
-    options: dict[str, inspect.Parameter] = {}
-    members: dict[str, list[str]] = {}
-    for parameter in inspect.signature(command).parameters.values():
-        group = groups.get(parameter.name)
-        if group is None:
-            options[parameter.name] = parameter.replace(
-                annotation=hints[parameter.name], kind=inspect.Parameter.KEYWORD_ONLY
-            )
-            continue
-        kinds = typing.get_type_hints(group, include_extras=True)
-        members[parameter.name] = [item.name for item in fields(group)]
-        for item in fields(group):
-            options[item.name] = inspect.Parameter(
-                item.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=item.default,
-                annotation=kinds[item.name],
-            )
+    options: list[inspect.Parameter] = []
+    groups: dict[str, tuple[type, list[str]]] = {}
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        group = parameter.annotation
+        if group in (ReadingOptions, EstimatorOptions):
+            members = inspect.signature(group, eval_str=True).parameters
+            groups[parameter.name] = group, list(members)
+            options += members.values()
+        else:
+            options.append(parameter)
+    options = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
 
     @wraps(command)
     def flat(**values: Any) -> None:
         grouped = {
-            name: groups[name](**{key: values.pop(key) for key in keys})
-            for name, keys in members.items()
+            name: group(**{key: values.pop(key) for key in keys})
+            for name, (group, keys) in groups.items()
         }
         command(**values, **grouped)
 
-    flat.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
-    flat.__annotations__ = {name: option.annotation for name, option in options.items()}
+    flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
 
 

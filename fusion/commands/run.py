@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +16,7 @@ from stario.fusion.commands.options import (
     FixesOption,
     JsonOption,
     OutOption,
+    PathsArgument,
     ReadingOptions,
     ReportOption,
     expand_option_groups,
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 
 @expand_option_groups
 def run(
-    paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
-    ],
+    paths: PathsArgument,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     fixes: FixesOption = None,
@@ -55,18 +53,8 @@ def run(
         optional_package("rerun", "view")
     navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    shown = Shown(report, view, figures=not as_json)
-    work = partial(_run, navigator=navigator, fixes=absolute_fixes, shown=shown)
+    work = partial(_run, navigator=navigator, fixes=absolute_fixes, report=report, view=view)
     process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Optional outputs of a run: report, viewer, results on stdout."""
-
-    report: bool
-    view: bool
-    figures: bool
 
 
 def _run(
@@ -74,9 +62,10 @@ def _run(
     folder: Path,
     navigator: Navigator,
     fixes: Sequence[Fix],
-    shown: Shown,
-) -> dict[str, object]:
-    """Write one recording's track, summarise it on stdout and return its record."""
+    report: bool,
+    view: bool,
+) -> tuple[dict[str, object], str]:
+    """Write one recording's track; return its record and a summary."""
     import numpy as np
 
     from stario.fusion.evaluation.compare import Comparison, alignment_with, measure, metric_words
@@ -96,33 +85,33 @@ def _run(
     words = metric_words(alignment)
     found = Comparison(sequence, {backend: track}, {backend: metrics}, alignment)
     written = write_run(folder, found, navigator.config)
-    if shown.report:
+    if report:
         from stario.fusion.report.page import write_report
 
-        path, config, name = folder / "report.html", navigator.config, str(backend)
-        figures = {name: metrics}
-        written.append(write_report(path, sequence, {name: track}, config, figures, alignment))
-    if shown.view:
+        tracks, figures = {str(backend): track}, {str(backend): metrics}
+        path = folder / "report.html"
+        written.append(write_report(path, sequence, tracks, navigator.config, figures, alignment))
+    if view:
         from stario.fusion.report.view import open_view, write_view
 
         written.append(write_view(folder / "track.rrd", sequence, track, aligned))
         open_view(written[-1])
+    length = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
+    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
+    lines = [
+        sequence.summary(),
+        f"{length} travelled (estimated), ending {ends:.1f} m from the start",
+    ]
+    if truth is not None:
+        lines.append(track_table({backend: metrics}, track.time, truth, words))
+    elif sequence.positions is not None:
+        lines.append(position_error_words(track, sequence.positions))
+    if track.health is not None:
+        lines += [*track.health.lines(), *health_lines(track.health)]
+    lines.append(f"{len(written)} files in {folder}")
     record: dict[str, object] = {
         "recording": sequence.name,
         backend: metrics,
         "folder": str(folder),
     }
-    if not shown.figures:
-        return record
-    typer.echo(sequence.summary())
-    length = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
-    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    typer.echo(f"{length} travelled (estimated), ending {ends:.1f} m from the start")
-    if truth is not None:
-        typer.echo(track_table({backend: metrics}, track.time, truth, words))
-    elif sequence.positions is not None:
-        typer.echo(position_error_words(track, sequence.positions))
-    if track.health is not None:
-        typer.echo("\n".join([*track.health.lines(), *health_lines(track.health)]))
-    typer.echo(f"{len(written)} files in {folder}")
-    return record
+    return record, "\n".join(lines)

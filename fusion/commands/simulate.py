@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import print_json
+from stario.fusion.commands.common import print_result
 from stario.fusion.commands.options import JsonOption
 from stario.sequences.errors import InputError
 
@@ -48,10 +48,5 @@ def simulate(
         "path_m": walk.path_length(),
         "samples": len(sequence),
     }
-    if as_json:
-        print_json(figures)
-        return
-    typer.echo(
-        f"{path}: {figures['samples']} samples, {sequence.duration:.1f} s, "
-        f"{walk.path_length():.1f} m"
-    )
+    amount = f"{len(sequence)} samples, {sequence.duration:.1f} s, {walk.path_length():.1f} m"
+    print_result(as_json, figures, f"{path}: {amount}")

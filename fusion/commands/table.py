@@ -9,18 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stario.fusion.commands.common import exit_if_skipped
-from stario.fusion.commands.options import ReadingOptions, recipe_values
+from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.table.cells import Cell
     from stario.fusion.table.sets import DataSet
 
 
 def table(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder of the finished cells; a rerun resumes there.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder of the finished cells; a rerun resumes there.")],
     data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
     sets: Annotated[
         str | None,
@@ -48,16 +45,11 @@ def table(
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
     ] = 2,
     config: Annotated[
-        Path | None,
-        typer.Option("--config", help="JSON file with the recipe. Default: the package's."),
+        Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache."),
-    ] = None,
+    cache: CacheOption = None,
     jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", help="Cells to run in parallel; -1 for as many as possible."),
+        int | None, typer.Option(help="Cells to run in parallel; -1 for as many as possible.")
     ] = None,
     backend: Annotated[
         str, typer.Option(help="Where cells run: loky (this machine), dask or ray.")
@@ -73,6 +65,7 @@ def table(
     from stario.fusion.table.filling import fill, table_cells
     from stario.fusion.table.sets import learned_from
     from stario.fusion.table.training import ReaderConfig
+    from stario.network.architectures import ARCHITECTURES
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import cache_folder
 
@@ -80,7 +73,8 @@ def table(
     chosen = None if networks is None else [name.strip() for name in networks.split(",")]
     cells = table_cells(datasets, _recipe(config), steps, chosen, seeds)
     make_folder(out)
-    costs = known_costs(_trained(cells), out)
+    requested = {cell.network for cell in cells}
+    costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
     learned = {} if data is None else learned_from(data)
     options = ReadingOptions()
     reading = ReaderConfig(options.read, options.as_read(), cache or cache_folder())
@@ -123,11 +117,3 @@ def _data_sets(
 def _recipe(path: Path | None) -> dict[str, Any]:
     packaged = importlib.resources.files("stario.network.weights").joinpath("recipe-table.json")
     return recipe_values(Path(str(packaged)) if path is None else path)
-
-
-def _trained(cells: list[Cell]) -> list[str]:
-    """Return the networks of the cells, in the order of the paper's table."""
-    from stario.network.architectures import ARCHITECTURES
-
-    requested = {cell.network for cell in cells}
-    return [name for name in ARCHITECTURES if name in requested]

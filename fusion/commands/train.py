@@ -9,10 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, progress_bar
+from stario.fusion.commands.common import (
+    exit_if_skipped,
+    progress_bar,
+    with_bar,
+)
 from stario.fusion.commands.options import (
+    CacheOption,
     JobsOption,
-    PathsArgument,
+    OptionalPathsArgument,
     ReadingOptions,
     expand_option_groups,
     recipe_values,
@@ -34,19 +39,17 @@ _GENERATED = 150
 @expand_option_groups
 def train(
     reading: ReadingOptions,
-    paths: PathsArgument = None,
+    paths: OptionalPathsArgument = None,
     model: Annotated[
         str | None,
         typer.Option(
-            "--model",
-            help="Network to train, from `stario check models`. Default: that of --start-from.",
+            help="Network to train, from `stario check models`. Default: that of --start-from."
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK.",
+            help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK."
         ),
     ] = None,
     validation: Annotated[
@@ -79,9 +82,7 @@ def train(
     recorded_only: Annotated[
         bool, typer.Option("--recorded-only", help="Train without simulated walks.")
     ] = False,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="JSON file with recipe settings.")
-    ] = None,
+    config: Annotated[Path | None, typer.Option(help="JSON file with recipe settings.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
     start_from: Annotated[
@@ -95,10 +96,7 @@ def train(
             "weights, which were trained without them.",
         ),
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache."),
-    ] = None,
+    cache: CacheOption = None,
     jobs: JobsOption = 1,
 ) -> None:
     """Train a network on recordings with ground truth and on simulated walks; a rerun resumes.
@@ -232,7 +230,12 @@ def _recorded(
     files, missing = reading.recordings(paths)
     held_files, held_missing = reading.recordings(validation)
     files, held_files = files + lists[0], held_files + lists[1]
-    _check_disjoint(files, held_files)
+    known = {path.resolve() for path in held_files}
+    if both := [path for path in files if path.resolve() in known]:  # would hide overfitting
+        raise InputError(
+            "--validation", f"{both[0]}, which is also trained on", "other recordings",
+            "remove it; without --validation the last fifth of each recording is held out",
+        )  # fmt: skip
     recordings, failed = streams_of(files)
     held_out, held_failed = streams_of(held_files)
     skipped = missing + failed + held_missing + held_failed
@@ -241,17 +244,6 @@ def _recorded(
     if held_files or not files:
         return recordings, held_out, skipped
     return *split_off(recordings), skipped
-
-
-def _check_disjoint(files: list[Path], held_files: list[Path]) -> None:
-    """Refuse a recording used for both training and validation: it would hide overfitting."""
-    held_out = {path.resolve() for path in held_files}
-    both = [path for path in files if path.resolve() in held_out]
-    if both:
-        raise InputError(
-            "--validation", f"{both[0]}, which is also trained on", "other recordings",
-            "remove it; without --validation the last fifth of each recording is held out",
-        )  # fmt: skip
 
 
 def _streams_of(
@@ -264,13 +256,12 @@ def _streams_of(
 
     recordings: list[RecordingStreams] = []
     skipped: list[Skipped] = []
-    with progress_bar("read", len(files)) as progress:
-        outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-        for done, (path, outcome) in enumerate(zip(files, outcomes, strict=True), 1):
-            if isinstance(outcome, Skipped):
-                skipped.append(outcome)
-            else:
-                licence = str(archive_attributes(path).get("licence", ""))
-                recordings.append(RecordingStreams(path, outcome, licence))
-            progress(done / len(files))
+    outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
+    pairs = with_bar("read", zip(files, outcomes, strict=True), len(files))
+    for path, outcome in pairs:
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            licence = str(archive_attributes(path).get("licence", ""))
+            recordings.append(RecordingStreams(path, outcome, licence))
     return recordings, skipped

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,12 @@ class Hub:
     """
 
     def __init__(self, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
-        self.ending = False
         self._folder, self._new_navigator = folder, new_navigator
         self.sessions: dict[str, Session] = {}
+        self.refused: Counter[str] = Counter()
+        self.ending = False
         self._locks: dict[str, asyncio.Lock] = {}
         self._news = asyncio.Event()
-        self.refused: Counter[str] = Counter()
 
     async def take(self, batch: Batch, accel_factor: float = 1.0) -> int:
         """Process a batch; return the number of samples it completed.
@@ -74,10 +75,6 @@ class Hub:
             await asyncio.to_thread(action, **values)
         self.announce()
 
-    def refuse(self, where: str) -> None:
-        """Count a refused message by transport."""
-        self.refused[where] += 1
-
     def announce(self) -> None:
         """Wake all tasks that wait for news."""
         self._news.set()
@@ -85,10 +82,8 @@ class Hub:
 
     async def news(self, seconds: float) -> None:
         """Wait for news, but no longer than `seconds`."""
-        try:
+        with suppress(TimeoutError):
             await asyncio.wait_for(self._news.wait(), seconds)
-        except TimeoutError:
-            return
 
     def end(self) -> None:
         """Disconnect the viewers."""
@@ -129,8 +124,7 @@ class Viewer:
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):
-            track = session.drawn
-            points, revision = track.points, track.revision
+            points, revision = session.drawn.points, session.drawn.revision
             sent_revision, sent = self._sent.get(device, (-1, 0))
             fresh = revision != sent_revision
             count = len(points)
@@ -139,5 +133,4 @@ class Viewer:
                 new = [*new[: -1 : -(-len(new) // MAX_SENT)], new[-1]]
             self._sent[device] = (revision, count)
             devices.append(session.status() | {"fresh": fresh, "points": new})
-        refused = dict(self._hub.refused)
-        return {"time": time.time(), "devices": devices, "refused": refused}
+        return {"time": time.time(), "devices": devices, "refused": dict(self._hub.refused)}

@@ -10,7 +10,8 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.payload import Batch, joined, json_from, parse_line
@@ -33,46 +34,37 @@ class LineServer:
     Args:
         hub: hub that takes the samples.
         token: required token; empty for none.
+
+    Attributes:
+        port: the port while listening.
     """
 
     def __init__(self, hub: Hub, token: str = "") -> None:
         self._hub, self._token = hub, token
         self._connections = 0
         self._packets: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue(MAX_WAITING)
-        self._bound = asyncio.Event()
         self.port = 0
 
-    async def serve(self, host: str, port: int) -> None:
-        """Listen until cancelled.
+    @asynccontextmanager
+    async def listening(self, host: str, port: int) -> AsyncIterator[None]:
+        """Listen within the context.
 
         Raises:
             OSError: the port is in use.
         """
         loop = asyncio.get_running_loop()
         server = await asyncio.start_server(self._connected, host, port)
-        number = server.sockets[0].getsockname()[1]
+        self.port = server.sockets[0].getsockname()[1]
         transport, _ = await loop.create_datagram_endpoint(
-            lambda: _Packets(self._packets, self._hub), local_addr=(host, number)
+            lambda: _Packets(self._packets, self._hub), local_addr=(host, self.port)
         )
-        self.port = number
-        self._bound.set()
+        packets = asyncio.create_task(self._process_packets())
         try:
-            await self._process_packets()
+            yield
         finally:
+            packets.cancel()
             transport.close()
             server.close()
-
-    async def listening(self, serving: asyncio.Task[None]) -> None:
-        """Wait until the task running `serve` is listening.
-
-        Raises:
-            OSError: it cannot listen.
-        """
-        bound = asyncio.create_task(self._bound.wait())
-        await asyncio.wait((bound, serving), return_when=asyncio.FIRST_COMPLETED)
-        bound.cancel()
-        if serving.done():
-            serving.result()
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self._connections >= MAX_CONNECTIONS:
@@ -82,7 +74,7 @@ class LineServer:
         sender = f"tcp {writer.get_extra_info('peername')[0]}"
         try:
             await self._read(reader, writer, sender)
-        except (ConnectionError, asyncio.IncompleteReadError) as error:
+        except ConnectionError as error:
             _log.info("%s: %s", sender, error)
         finally:
             self._connections -= 1
@@ -109,25 +101,21 @@ class LineServer:
 
     async def _answer(self, writer: asyncio.StreamWriter, errors: Sequence[str]) -> None:
         for error in errors:
-            self._hub.refuse("tcp")
+            self._hub.refused["tcp"] += 1
             writer.write(json.dumps({"error": error}).encode() + b"\n")
         await writer.drain()
 
     async def _process_packets(self) -> None:
         while True:
             data, sender = await self._packets.get()
+            lines = data.split(b"\n")
             try:
-                await self._process_packet(data.split(b"\n"), sender)
+                trusted = not self._token or self._is_token(lines.pop(0))
+                refused = len(await self._take(lines, sender)) if trusted else 1
+                self._hub.refused["udp"] += refused
             except Exception:  # no packet, whatever it holds, may stop the server
                 _log.exception("%s: a packet is skipped", sender)
-                self._hub.refuse("udp")
-
-    async def _process_packet(self, lines: list[bytes], sender: str) -> None:
-        if self._token and not self._is_token(lines.pop(0)):
-            self._hub.refuse("udp")
-            return
-        for _ in await self._take(lines, sender):
-            self._hub.refuse("udp")
+                self._hub.refused["udp"] += 1
 
     async def _take(self, lines: Sequence[bytes], sender: str) -> list[str]:
         """Process lines, batched by device; return the errors of those that fail."""
@@ -162,4 +150,4 @@ class _Packets(asyncio.DatagramProtocol):
         try:
             self._queue.put_nowait((data, f"udp {addr[0]}"))
         except asyncio.QueueFull:
-            self._hub.refuse("udp")
+            self._hub.refused["udp"] += 1

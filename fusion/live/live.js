@@ -10,7 +10,7 @@
   const MOST_DRAWN = 1200;
   const MOST_KEPT = 24000;
   const devices = new Map();
-  window.stario = { devices, delays: [] };
+  window.stario = { devices };
 
   // All devices share one map frame. Points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw].
   const sigmaOf = (p) => Math.sqrt((p[6] + p[8]) / 2 + Math.hypot((p[6] - p[8]) / 2, p[7]));
@@ -108,12 +108,7 @@
     while (wanted) {
       wanted = false;
       const began = performance.now();
-      const received = Math.max(0, ...[...devices.values()].map((d) => d.received));
       await draw();
-      const now = Date.now() / 1000;
-      window.stario.delays.push([performance.now() - began, now - received]);
-      if (window.stario.delays.length > 2000) window.stario.delays.shift();
-      document.body.dataset.drawn = String(Number(document.body.dataset.drawn || 0) + 1);
       await new Promise((done) => setTimeout(done, Math.max(150, performance.now() - began)));
     }
     drawing = false;

@@ -132,12 +132,10 @@ class Merger:
         """Sensor that a track needs but the device does not send; empty if none is missing."""
         if self._gyro or not self._waiting:
             return ""
-        sensors = {reading.sensor for reading in self._waiting}
-        if not sensors & set(_GYROS):
+        gyro, accel = self._best()
+        if not gyro:
             return "gyroscope"
-        if not any(set(names) <= sensors for names in _ACCELS):
-            return "total acceleration, or accelerometer with gravity"
-        return ""
+        return "" if accel else "total acceleration, or accelerometer with gravity"
 
     def add(self, readings: Iterable[Reading]) -> list[Sample]:
         """Add readings as they arrive; return the samples they complete."""
@@ -175,19 +173,24 @@ class Merger:
         elif sensor in self._accel:
             self._join.add(1, time, value)
 
+    def _best(self) -> tuple[str, tuple[str, ...]]:
+        """Return the best gyroscope and accelerometer of the readings so far; empty if none."""
+        sensors = {reading.sensor for reading in self._waiting}
+        gyro = next((name for name in _GYROS if name in sensors), "")
+        return gyro, next((names for names in _ACCELS if set(names) <= sensors), ())
+
     def _choose(self) -> bool:
         """Choose the best sensors, once the stream is long enough to contain all of them."""
         times = [reading.time_ns for reading in self._waiting]
         if not times or max(times) - min(times) < CHOOSING:
             return False
-        sensors = {reading.sensor for reading in self._waiting}
-        gyro = next((name for name in _GYROS if name in sensors), "")
-        accel = next((names for names in _ACCELS if set(names) <= sensors), ())
+        gyro, accel = self._best()
         if not gyro or not accel:
             newest = max(times)  # bounds memory
             self._waiting = [r for r in self._waiting if newest - r.time_ns < MAX_WAIT]
             return False
-        self._gyro, self._accel, self.magnetic = gyro, accel, MAG in sensors
+        self._gyro, self._accel = gyro, accel
+        self.magnetic = any(reading.sensor == MAG for reading in self._waiting)
         self.upward = _cosine(
             _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
             *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),

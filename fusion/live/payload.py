@@ -35,7 +35,7 @@ MAX_ENTRIES = 50_000
 MAX_SPAN = 600 * 10**9
 """Maximum time [ns] between a push's first and last sample; beyond it a timestamp is wrong."""
 
-_MAX_READING = 1e4
+MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
 _MAX_TIME_NS = 2**63
@@ -101,7 +101,11 @@ def parse_push(body: bytes) -> Batch:
         for k, entry in enumerate(payload)
         if (reading := _pushed(f"payload[{k}]", _object(f"payload[{k}]", entry))) is not None
     ]
-    return Batch(device, recording, _checked_span("payload", readings))
+    times = [reading.time_ns for reading in readings]
+    if times and max(times) - min(times) > MAX_SPAN:
+        found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
+        raise InputError("payload", found, f"at most {MAX_SPAN / 1e9:g} s in one push")
+    return Batch(device, recording, readings)
 
 
 def parse_line(line: bytes, sender: str) -> Batch:
@@ -168,10 +172,12 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
         return _vertical(entry.get("time"), values)
     if sensor not in SENSORS:
         return None
+    time_ns = _nanoseconds(f"{where}.time", entry.get("time"))
+    axes = _object(f"{where}.values", values)
     return Reading(
         sensor,
-        _nanoseconds(f"{where}.time", entry.get("time")),
-        _axes(f"{where}.values", _object(f"{where}.values", values)),
+        time_ns,
+        _vector((f"{where}.values.{axis}", axes.get(axis)) for axis in "xyz"),
     )
 
 
@@ -186,14 +192,6 @@ def _vertical(time: Any, values: Any) -> Reading | None:
         return None
     up_B = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     return Reading(ORIENTATION, time_ns, up_B)
-
-
-def _checked_span(where: str, readings: list[Reading]) -> list[Reading]:
-    times = [reading.time_ns for reading in readings]
-    if times and max(times) - min(times) > MAX_SPAN:
-        found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
-        raise InputError(where, found, f"at most {MAX_SPAN / 1e9:g} s in one push")
-    return readings
 
 
 def _object(where: str, value: Any) -> Mapping[str, Any]:
@@ -222,23 +220,22 @@ def _nanoseconds(where: str, value: Any) -> int:
     return value
 
 
-def _axes(where: str, values: Mapping[str, Any]) -> Vector:
-    x, y, z = (_reading(f"{where}.{axis}", values.get(axis)) for axis in "xyz")
-    return x, y, z
-
-
 def _three(where: str, values: Any) -> Vector:
     if not isinstance(values, list) or len(values) != 3:
         raise InputError(where, _describe(values), "a list of three numbers")
-    x, y, z = (_reading(f"{where}[{k}]", value) for k, value in enumerate(values))
+    return _vector((f"{where}[{k}]", value) for k, value in enumerate(values))
+
+
+def _vector(values: Iterable[tuple[str, Any]]) -> Vector:
+    """Return three readings, each given with its place in the message."""
+    numbers = []
+    for where, value in values:
+        numbers.append(_number(where, value))
+        if abs(numbers[-1]) > MAX_READING:
+            found = f"{numbers[-1]:.3g}"
+            raise InputError(where, found, f"at most {MAX_READING:g} rad/s, m/s^2 or uT")
+    x, y, z = numbers
     return x, y, z
-
-
-def _reading(where: str, value: Any) -> float:
-    number = _number(where, value)
-    if abs(number) > _MAX_READING:
-        raise InputError(where, f"{number:.3g}", f"at most {_MAX_READING:g} rad/s, m/s^2 or uT")
-    return number
 
 
 def _number(where: str, value: Any) -> float:
@@ -257,7 +254,9 @@ def _describe(value: Any) -> str:
     """Return a short description of a value of any size."""
     if value is None:
         return "nothing"
-    if isinstance(value, (dict, list)):
-        return f"a list of {len(value)}" if isinstance(value, list) else "an object"
-    text = repr(value) if isinstance(value, (str, float, bool)) else f"{str(value)[:20]}"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, dict):
+        return "an object"
+    text = repr(value) if isinstance(value, (str, float, bool)) else str(value)[:20]
     return text if len(text) <= 40 else f"{text[:40]}..."

@@ -15,7 +15,17 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.payload import GRAVITY, GYRO, LINEAR, MAG, TOTAL, Batch, Reading, json_from
+from stario.fusion.live.payload import (
+    GRAVITY,
+    GYRO,
+    LINEAR,
+    MAG,
+    MAX_READING,
+    TOTAL,
+    Batch,
+    Reading,
+    json_from,
+)
 from stario.sequences.errors import InputError
 
 PERIOD = 0.2
@@ -31,7 +41,6 @@ _SENSORS = {
 _TIMEOUT = 3.0
 _RETRY_SECONDS = 2.0
 _MAX_RESPONSE_BYTES = 16 * 1024 * 1024
-_MAX_READING = 1e4
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +104,7 @@ class Phyphox:
         if columns[0] and columns[0][-1] < self._newest.get(sensor, -1.0):
             self._newest = {}  # the experiment was cleared: its time restarts
         for t, *value in zip(*columns, strict=False):  # one column may be a sample longer
-            if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > _MAX_READING:
+            if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > MAX_READING:
                 continue
             self._newest[sensor] = t
             x, y, z = value

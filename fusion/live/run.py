@@ -99,26 +99,25 @@ class LiveServer:
         return lines
 
     async def _run(self, started: Callable[[], None]) -> None:
-        lines = asyncio.create_task(self._lines.serve(self._host, self._lines_port))
-        tasks = [lines]
+        phones: list[asyncio.Task[None]] = []
         try:
-            await self._lines.listening(lines)
-            tasks += [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
-            web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
-            while not self._server.started and not web.done():
-                await asyncio.sleep(0.01)
-            started()
-            while not self._server.should_exit:
-                await asyncio.sleep(_POLL_SECONDS)
-            self.hub.end()
-            await web
+            async with self._lines.listening(self._host, self._lines_port):
+                phones += [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
+                web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
+                while not self._server.started and not web.done():
+                    await asyncio.sleep(0.01)
+                started()
+                while not self._server.should_exit:
+                    await asyncio.sleep(_POLL_SECONDS)
+                self.hub.end()
+                await web
         except OSError as error:
             found = f"{self._lines_port}: {error.strerror or error}"
             raise InputError("lines-port", found, "a free port", "--lines-port N") from error
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            for phone in phones:
+                phone.cancel()
+            await asyncio.gather(*phones, return_exceptions=True)
             self._socket.close()
             self.hub.close()
 
@@ -139,11 +138,10 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-    except socket.gaierror as error:
-        listener.close()
-        raise InputError("--host", host, "an address of this computer, or 0.0.0.0") from error
     except OSError as error:
         listener.close()
+        if isinstance(error, socket.gaierror):
+            raise InputError("--host", host, "an address of this computer, or 0.0.0.0") from error
         found = f"{host} {port}: {error.strerror or error}"
         raise InputError("port", found, "a free port of this computer", "--port N") from error
     return listener

@@ -125,34 +125,24 @@ def tokens_match(shown: str, token: str) -> bool:
     return hmac.compare_digest(*(text.encode("utf-8", "surrogatepass") for text in (shown, token)))
 
 
-def accel_factor(unit: str) -> float:
-    """Return the factor from an accelerometer's unit to specific force in m/s^2.
-
-    Raises:
-        InputError: the unit is unknown.
-    """
-    name = unit_named(unit)
-    if name not in ACCEL_UNITS:
-        raise InputError("accel_unit", repr(unit[:20]), ", ".join(ACCEL_UNITS))
-    return ACCEL_UNITS[name]
-
-
 async def _data(request: Request) -> Response:
     hub: Hub = request.app.state.hub
     try:
         _check_origin(request)
-        factor = accel_factor(request.query_params.get("accel_unit", "m/s^2"))
+        unit = request.query_params.get("accel_unit", "m/s^2")
+        if (name := unit_named(unit)) not in ACCEL_UNITS:
+            raise InputError("accel_unit", repr(unit[:20]), ", ".join(ACCEL_UNITS))
         body = await _body(request)
         lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
         sender = f"http {request.client.host if request.client else ''}"
         # In a thread, so that a large body does not block other requests.
         batches = await asyncio.to_thread(_parsed, body, sender if lines else "")
     except InputError:
-        hub.refuse("http")
+        hub.refused["http"] += 1
         raise
     count = 0
     for batch in batches:
-        count += await hub.take(batch, factor)
+        count += await hub.take(batch, ACCEL_UNITS[name])
     return JSONResponse({"samples": count})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,26 +42,24 @@ class Session:
     def __init__(self, device: str, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
         self.device = device
         self._folder, self._new_navigator = folder, new_navigator
-        self.running = True
-        self.drawn = DisplayedTrack()
-        self.problem = ""
-        self.words: list[dict[str, str]] = []
-        self.samples = self.ignored = self.fixes = 0
-        self.received = 0.0
-        self.rate, self._factor = 0.0, 1.0
+        self.drawn, self.received, self._factor = DisplayedTrack(), 0.0, 1.0
         self._file: LiveFile | None = None
-        self._begin("")
+        self.start()
 
-    def _begin(self, recording: str) -> None:
+    def start(self, recording: str = "") -> None:
+        """Start a new track and a new recording."""
+        self.close()
         self._recording, self._merger = recording, Merger()
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
         self._health_time = -math.inf
         self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
-        self.problem, self.words = "", []
+        self.problem = ""
+        self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
         self.samples = self.fixes = 0
         self.rate = 0.0
+        self.running = True
 
     @property
     def path(self) -> Path | None:
@@ -80,10 +79,8 @@ class Session:
         """
         self.received = received
         if not self.running:
-            self.ignored += len(batch.readings)
             return 0
         if self._is_new(batch):
-            self.stop()
             self.start(batch.recording)
         self._recording, self._factor = batch.recording, accel_factor
         samples = [
@@ -110,13 +107,6 @@ class Session:
             self._push_field(time_ns, field)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
-
-    def start(self, recording: str = "") -> None:
-        """Start a new track and a new recording."""
-        if self._file is not None:
-            self._file.close()
-        self._begin(recording)
-        self.running = True
 
     def stop(self) -> None:
         """End the track; ignore data until `start`."""
@@ -210,8 +200,7 @@ class Session:
         if time - self._health_time < _HEALTH_SECONDS:
             return
         self._health_time = time
-        found = findings(self._navigator.health)
-        self.words = [{"level": f.level, "text": f.text, "advice": f.advice} for f in found]
+        self.words = [asdict(finding) for finding in findings(self._navigator.health)]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""

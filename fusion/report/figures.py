@@ -18,13 +18,27 @@ PANEL_HEIGHT = 190
 _ELLIPSES = 12
 """Number of ellipses drawn along a track."""
 
-_FONT = {"family": "system-ui, sans-serif", "size": 13, "color": INK}
+_LAYOUT = {
+    "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
+    "paper_bgcolor": "white",
+    "plot_bgcolor": "white",
+    "showlegend": False,
+}
+_AXIS = {
+    "gridcolor": GRID,
+    "zeroline": False,
+    "linecolor": FAINT,
+    "showline": True,
+    "ticks": "outside",
+    "tickcolor": FAINT,
+    "ticklen": 4,
+}
 _LEFT = 58
 """Left margin [px]: enough for the panels' labels, and all that a phone can spare."""
 
 
 def map_figure(
-    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None = None
+    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
 ) -> go.Figure:
     """Draw all tracks from above on equal axes, with 3-sigma ellipses where there is covariance.
 
@@ -36,9 +50,10 @@ def map_figure(
     figure, frame = go.Figure(), _frame(tracks, truth)
     if truth is not None:
         figure.add_trace(_path(TRUTH, truth, 3.0))
+    largest = 0.4 * float(np.ptp(frame, axis=1).max())
     for name, series in tracks.items():
         if series.position_covariance is not None:
-            figure.add_trace(_ellipses(name, series, 0.4 * float(np.ptp(frame, axis=1).max())))
+            figure.add_trace(_ellipses(name, series, series.position_covariance, largest))
     for name, series in tracks.items():
         figure.add_trace(_path(name, series, 2.0))
     for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
@@ -46,25 +61,15 @@ def map_figure(
     if known is not None:
         figure.add_trace(_known(known))
     figure.update_layout(
-        font=_FONT,
-        paper_bgcolor="white",
-        plot_bgcolor="white",
+        **_LAYOUT,
         margin={"l": _LEFT, "r": 12, "t": 8, "b": 44},
-        showlegend=False,
         hovermode="closest",
         dragmode="pan",
     )
-    for axis, limits, title in (("xaxis", frame[0], "x [m]"), ("yaxis", frame[1], "y [m]")):
-        figure.update_layout(
-            {
-                axis: {
-                    "title": {"text": title, "standoff": 6, "font": {"size": 13}},
-                    "range": limits,
-                    **_axis(),
-                }
-            }
-        )
-    figure.update_layout(yaxis={"scaleanchor": "x", "scaleratio": 1})
+    figure.update_xaxes(title=_title("x [m]"), range=frame[0], **_AXIS)
+    figure.update_yaxes(
+        title=_title("y [m]"), range=frame[1], scaleanchor="x", scaleratio=1, **_AXIS
+    )
     return figure
 
 
@@ -82,37 +87,24 @@ def time_figure(panels: Sequence[Panel]) -> go.Figure:
     for row, panel in enumerate(panels, start=1):
         for trace in panel.traces:
             figure.add_trace(trace, row=row, col=1)
-        figure.update_yaxes(row=row, col=1, **_axis(), **panel.layout)
-        figure.update_xaxes(row=row, col=1, showticklabels=True, **_axis())
-    figure.update_xaxes(
-        title={"text": "time since the first sample [s]", "standoff": 6, "font": {"size": 13}},
-        row=count,
-    )
+        figure.update_yaxes(row=row, col=1, **panel.layout)
+    figure.update_xaxes(showticklabels=True, **_AXIS)
+    figure.update_yaxes(**_AXIS)
+    figure.update_xaxes(title=_title("time since the first sample [s]"), row=count)
     # Titles start at the panels' left edge: on a phone there is no room around a centred one.
     figure.update_annotations(x=0.0, xanchor="left", font={"size": 13, "color": INK})
     figure.update_layout(
-        font=_FONT,
-        paper_bgcolor="white",
-        plot_bgcolor="white",
+        **_LAYOUT,
         height=height,
         margin={"l": _LEFT, "r": 12, "t": 28, "b": 44},
-        showlegend=False,
         hovermode="x",
         dragmode="zoom",
     )
     return figure
 
 
-def _axis() -> dict[str, object]:
-    return {
-        "gridcolor": GRID,
-        "zeroline": False,
-        "linecolor": FAINT,
-        "showline": True,
-        "ticks": "outside",
-        "tickcolor": FAINT,
-        "ticklen": 4,
-    }
+def _title(text: str) -> dict[str, object]:
+    return {"text": text, "standoff": 6, "font": {"size": 13}}
 
 
 def _path(name: str, series: Series, width: float) -> go.Scatter:
@@ -133,19 +125,14 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
     )
 
 
-def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
-    """Draw some outlines in one trace, separated by NaN; skip any too large for the map.
+def _ellipses(name: str, series: Series, covariance: FloatArray, largest: float) -> go.Scatter:
+    """Draw some outlines in one trace, separated by NaN.
 
-    Args:
-        name: name of the track.
-        series: track with a covariance.
-        largest: largest semi-axis drawn [m]; larger ellipses appear only at the slider's time.
+    Semi-axes beyond `largest` [m] are too large for the map: they appear at the slider's time only.
     """
-    _, colour, _ = style(name)
-    assert series.position_covariance is not None  # called only where there is one
     valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
     rows = np.unique(valid[np.linspace(0, len(valid) - 1, _ELLIPSES).round().astype(int)])
-    outlines = [(k, ellipse(series.position_covariance[k])) for k in rows]
+    outlines = [(k, ellipse(covariance[k])) for k in rows]
     parts = [
         np.vstack([series.position[k, :2] + outline, [[np.nan] * 2]])
         for k, outline in outlines
@@ -159,7 +146,7 @@ def _ellipses(name: str, series: Series, largest: float) -> go.Scatter:
         legendgroup=name,
         showlegend=False,
         mode="lines",
-        line={"color": colour, "width": 0.8},
+        line={"color": style(name)[1], "width": 0.8},
         opacity=0.55,
         hoverinfo="skip",
     )
@@ -199,7 +186,7 @@ def _known(known: PositionTrack) -> go.Scatter:
 
 def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
     """Return limits (2, 2) of x and y that fit all tracks except the inertial-only one."""
-    bounded = [s for name, s in tracks.items() if name != "inertial"] or list(tracks.values())
+    bounded = [s for name, s in tracks.items() if name != "inertial"]
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]

@@ -7,6 +7,7 @@ the next thing to try; `stario live` shows the same text during a walk.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -60,8 +61,8 @@ def findings(health: Health) -> list[Finding]:
     found = [*reasons, *_fixes(health), *_direction(health), *map(_noted, notes)]
     if not health.notes and not any(finding.level == "warning" for finding in found):
         found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
-    order: dict[str, int] = {"warning": 0, "good": 1, "note": 2}
-    return sorted(found, key=lambda finding: order[finding.level])
+    order = ("warning", "good", "note")
+    return sorted(found, key=lambda finding: order.index(finding.level))
 
 
 def health_lines(health: Health) -> list[str]:
@@ -108,92 +109,87 @@ def _noted(note: str) -> Finding:
     return Finding("warning", text, advice)
 
 
-def _samples(health: Health) -> list[Finding]:
+def _samples(health: Health) -> Iterator[Finding]:
     used = health.samples.get("used", 0)
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
     if any(map(_is_set_back, health.notes)):
         dropped.pop("out_of_order", None)  # explained by that note
     count = sum(dropped.values())
     share = count / max(1, used + count)
-    found = []
-    if dropped:
-        reasons = _counted(dropped)
+    amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
+    text = f"{amount} of the samples were dropped ({_counted(dropped)})."
+    if share > DROPPED_SHARE:
         advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
-        many = share > DROPPED_SHARE
-        amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
-        text = f"{amount} of the samples were dropped ({reasons})."
-        found.append(Finding("warning" if many else "note", text, advice if many else ""))
-    return found
+        yield Finding("warning", text, advice)
+    elif dropped:
+        yield Finding("note", text)
 
 
 def _has_flagged(health: Health) -> bool:
     return sum(health.flagged.values()) > FLAGGED_SHARE * max(1, health.samples.get("used", 0))
 
 
-def _flagged(health: Health) -> list[Finding]:
-    if not _has_flagged(health):
-        return []
-    text = f"Samples that motion cannot explain: {_counted(health.flagged)}."
-    advice = "Hold or strap the device more firmly, or choose a larger sensor range."
-    return [Finding("warning", text, advice)]
+def _flagged(health: Health) -> Iterator[Finding]:
+    if _has_flagged(health):
+        text = f"Samples that motion cannot explain: {_counted(health.flagged)}."
+        advice = "Hold or strap the device more firmly, or choose a larger sensor range."
+        yield Finding("warning", text, advice)
 
 
-def _gaps(health: Health) -> list[Finding]:
+def _gaps(health: Health) -> Iterator[Finding]:
     if not health.gap_count:
-        return []
+        return
     amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
     text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
     if health.longest_gap < LONG_GAP:
-        return [Finding("note", text)]
-    advice = (
-        "Keep the logger in the foreground and exempt it from battery saving; "
-        "a yaw fix or position fixes after the gap restore the heading."
-    )
-    return [Finding("warning", text, advice)]
+        yield Finding("note", text)
+    else:
+        advice = (
+            "Keep the logger in the foreground and exempt it from battery saving; "
+            "a yaw fix or position fixes after the gap restore the heading."
+        )
+        yield Finding("warning", text, advice)
 
 
-def _updates(health: Health) -> list[Finding]:
-    found = []
-    if health.updates:
+def _updates(health: Health) -> Iterator[Finding]:
+    if health.gated > GATED_SHARE * health.updates:
         gated = health.gated / health.updates
-        if gated > GATED_SHARE:
-            text = f"{gated:.0%} of the network's displacements contradict the IMU."
-            advice = (
-                "The motion may differ from the training data (carrying, running, wheels): "
-                "fine-tune the weights on recordings of this kind with `stario train`."
-            )
-            found.append(Finding("warning", text, advice))
+        text = f"{gated:.0%} of the network's displacements contradict the IMU."
+        advice = (
+            "The motion may differ from the training data (carrying, running, wheels): "
+            "fine-tune the weights on recordings of this kind with `stario train`."
+        )
+        yield Finding("warning", text, advice)
     ratio = health.mean_nis / health.nis_expected
     if ratio > NIS_RATIO:
         text = f"Innovations are larger than expected (mean NIS {health.mean_nis:.1f})."
         advice = "Sigmas are too small by about the ratio's square root; recalibrate the weights."
-        found.append(Finding("warning", text, f"{advice} Ratio: {ratio:.1f}."))
+        yield Finding("warning", text, f"{advice} Ratio: {ratio:.1f}.")
     elif ratio < 1.0 / NIS_RATIO:
         text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
         advice = (
             "Innovations reveal little about the track's sigmas: persistent errors keep them small."
         )
-        found.append(Finding("note", text, advice))
+        yield Finding("note", text, advice)
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")
     useless = bearings - health.bearings.get("applied", 0)
     if useless > 0.5 * bearings:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
         advice = "`stario inspect` reports its magnitude, unit and problems."
-        found.append(Finding("note", text, advice))
-    refused = _counted(health.refused)
-    if refused:
-        found.append(Finding("note", f"Displacements not used: {refused}."))
-    return found
+        yield Finding("note", text, advice)
+    if refused := _counted(health.refused):
+        yield Finding("note", f"Displacements not used: {refused}.")
 
 
-def _fixes(health: Health) -> list[Finding]:
+def _fixes(health: Health) -> Iterator[Finding]:
     if not health.fixes:
-        return []
+        return
     applied = health.fixes.get("applied", 0)
     other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
     text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
     if not other:
-        return [Finding("note", f"{text}.")]
+        yield Finding("note", f"{text}.")
+        return
     reasons = _counted(other)
     harmless = ("gated", "waiting", "yaw not known")
     refused = sum(n for name, n in other.items() if name not in harmless)
@@ -201,16 +197,17 @@ def _fixes(health: Health) -> list[Finding]:
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
     if not wrong and other.get("yaw not known", 0) > applied:
         advice = "Positions give the heading once you have walked some metres; so does a yaw fix."
-    return [Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)]
+    yield Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)
 
 
-def _direction(health: Health) -> list[Finding]:
+def _direction(health: Health) -> Iterator[Finding]:
     yaw = health.final_sigma.get("yaw_rad", 0.0)
-    if yaw <= YAW_SIGMA:
-        return []
-    text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
-    advice = "Keep still for two seconds now and then, or supply a yaw fix or two position fixes."
-    return [Finding("warning", text, advice)]
+    if yaw > YAW_SIGMA:
+        text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
+        advice = (
+            "Keep still for two seconds now and then, or supply a yaw fix or two position fixes."
+        )
+        yield Finding("warning", text, advice)
 
 
 def _counted(counts: dict[str, int]) -> str:

@@ -7,22 +7,22 @@ import importlib.resources
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from plotly.offline import get_plotlyjs
 
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import Comparison, Metrics, metric_words
+from stario.fusion.evaluation.known_positions import shown_positions
+from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.health import Finding, findings
+from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
+from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
-from stario.sequences.accuracy.metrics import align
+from stario.sequences.accuracy.metrics import Alignment, align
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.checked import optional_package
-
-if TYPE_CHECKING:
-    from stario.fusion.config import NavigatorConfig
-    from stario.fusion.evaluation.compare import Comparison, Metrics
-    from stario.fusion.report.series import Series
-    from stario.sequences.accuracy.metrics import Alignment
-    from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import ImuSequence
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
 _COLUMNS = {
@@ -48,7 +48,7 @@ def write_report(
     Args:
         path: the HTML file; its folder must exist.
         sequence: the recording; its ground truth is drawn if it has one.
-        tracks: tracks by name, as from `compare`, or the only one of a run.
+        tracks: tracks by name, as from `compare`, or a run's only one, `ekf` or `graph`.
         config: settings, for the filter's gate.
         metrics: metrics by track, for the table.
         alignment: alignment of the tracks with the truth.
@@ -57,12 +57,48 @@ def write_report(
         The path.
 
     Raises:
-        InputError: plotly is not installed, or the folder does not exist.
+        InputError: the folder does not exist.
     """
-    optional_package("plotly", "report")
-    content = report_html(sequence, tracks, config, metrics, alignment)
+    start = float(sequence.time[np.isfinite(sequence.time)][0])
+    truth = sequence.truth
+    series = {
+        name: track_series(
+            track,
+            track.trajectory if truth is None else align(track.trajectory, truth, alignment),
+            start,
+        )
+        for name, track in tracks.items()
+    }
+    true_series = None if truth is None else trajectory_series(truth, start)
+    main = "ekf" if "ekf" in tracks else "graph"  # whose facts, health and innovations are shown
+    # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
+    drawn = {name: s for name, s in series.items() if name != "inertial"}
+    panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
+    innovations = tracks[main].innovations
+    if innovations is not None and len(innovations.time):
+        panels += innovation_panels(innovations, start, config.filter.gate)
+    mapped = drawn if truth is None else series
+    known = shown_positions(sequence, tracks[main])
+    data = {
+        "map": json.loads(map_figure(mapped, true_series, known).to_json()),
+        "time": json.loads(time_figure(panels).to_json()),
+        "cursors": _cursors(drawn, main),
+    }
+    health = tracks[main].health
+    parts = {
+        "TITLE": html.escape(sequence.name),
+        "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
+        "FACTS": _facts(sequence, tracks[main], series[main]),
+        "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
+        "HEALTH": "" if health is None else _health(findings(health)),
+        "TABLE": "" if truth is None else _table(metrics, alignment),
+        "STYLE": _asset("report.css"),
+        "SCRIPT": _asset("report.js"),
+        "DATA": _script_json(data),
+        "PLOTLY": get_plotlyjs(),
+    }
     with atomic_write(path) as file:
-        file.write(content)
+        file.write(_filled(parts))
     return path
 
 
@@ -78,84 +114,14 @@ def write_comparison_report(folder: Path, comparison: Comparison, config: Naviga
     )
 
 
-def report_html(
-    sequence: ImuSequence,
-    tracks: Mapping[str, Track],
-    config: NavigatorConfig,
-    metrics: Mapping[str, Metrics],
-    alignment: Alignment,
-) -> str:
-    """Return the report as HTML; arguments as for `write_report`."""
-    from plotly.offline import get_plotlyjs
-
-    from stario.fusion.evaluation.known_positions import shown_positions
-    from stario.fusion.report.figures import map_figure, time_figure
-    from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels
-    from stario.fusion.report.series import track_series, trajectory_series
-
-    start = float(sequence.time[np.isfinite(sequence.time)][0])
-    truth = sequence.truth
-    series = {
-        name: track_series(
-            track,
-            track.trajectory if truth is None else align(track.trajectory, truth, alignment),
-            start,
-        )
-        for name, track in tracks.items()
-    }
-    true_series = None if truth is None else trajectory_series(truth, start)
-    main = main_track(tracks)
-    # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
-    drawn = {name: s for name, s in series.items() if name != "inertial"} or series
-    panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
-    innovations = tracks[main].innovations or next(
-        (t.innovations for t in tracks.values() if t.innovations), None
-    )
-    if innovations is not None and len(innovations.time):
-        panels += innovation_panels(innovations, start, config.filter.gate, "m")
-    figures = {
-        "map": json.loads(
-            map_figure(
-                drawn if truth is None else series,
-                true_series,
-                shown_positions(sequence, tracks[main]),
-            ).to_json()
-        ),
-        "time": json.loads(time_figure(panels).to_json()),
-    }
-    health = tracks[main].health
-    return _filled(
-        {
-            "TITLE": html.escape(sequence.name),
-            "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
-            "FACTS": _facts(sequence, tracks[main], series[main]),
-            "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
-            "HEALTH": "" if health is None else _health(findings(health)),
-            "TABLE": "" if truth is None else _table(metrics, alignment),
-            "STYLE": asset("report.css"),
-            "SCRIPT": asset("report.js"),
-            "DATA": _script_json({**figures, "cursors": _cursors(drawn, main), "main": main}),
-            "PLOTLY": get_plotlyjs(),
-        }
-    )
-
-
-def main_track(tracks: Mapping[str, Track]) -> str:
-    """Return the name of the track whose facts, health and innovations are shown."""
-    for name in ("ekf", "graph"):
-        if name in tracks:
-            return name
-    return next(iter(tracks))
-
-
-def asset(name: str) -> str:
+def _asset(name: str) -> str:
     """Read a text file of this package."""
     return importlib.resources.files("stario.fusion.report").joinpath(name).read_text("utf-8")
 
 
 def _filled(parts: Mapping[str, str]) -> str:
     """Fill the template; it is split first, so that a part may contain anything."""
-    pieces = asset("report.html").split("%%")
+    pieces = _asset("report.html").split("%%")
     return "".join(piece if k % 2 == 0 else parts[piece] for k, piece in enumerate(pieces))
 
 
@@ -181,8 +147,6 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
 
 def _legend(names: Sequence[str]) -> str:
     """Return a button for each track, with its line, that hides and shows it everywhere."""
-    from stario.fusion.report.panels import style
-
     dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
     buttons = []
     for name in names:
@@ -209,9 +173,6 @@ def _health(found: Sequence[Finding]) -> str:
 
 
 def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
-    from stario.fusion.evaluation.compare import metric_words
-    from stario.fusion.report.panels import style
-
     head = "".join(f"<th>{title}</th>" for title, _ in _COLUMNS.values())
     rows = []
     for name, figures in metrics.items():
@@ -236,8 +197,6 @@ def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
 
 def _cursors(tracks: Mapping[str, Series], main: str) -> list[dict[str, Any]]:
     """Return what the slider moves: position, ellipse and values of each track, the main first."""
-    from stario.fusion.report.panels import style
-
     cursors = []
     for name in sorted(tracks, key=lambda name: name != main):
         series = tracks[name]

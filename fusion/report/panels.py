@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
@@ -17,7 +16,7 @@ from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
-AXIS_COLOURS = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
+_AXIS_LOOKS = (("x", "#0072B2", "solid"), ("y", "#D55E00", "dash"), ("z", "#009E73", "dot"))
 TRUTH = "truth"
 _DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
 _MAX_INNOVATIONS = 1500
@@ -27,19 +26,12 @@ Column = Callable[[Series], FloatArray | None]
 """Function from a track to the column that a panel draws."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One row of the figure over time.
-
-    Attributes:
-        title: title with unit.
-        traces: plotly traces.
-        layout: layout of its y axis.
-    """
+class Panel(NamedTuple):
+    """One row of the figure over time: title with unit, plotly traces, layout of its y axis."""
 
     title: str
     traces: list[go.Scatter]
-    layout: dict[str, Any] = field(default_factory=dict)
+    layout: dict[str, Any]
 
 
 def style(name: str) -> tuple[str, str, str]:
@@ -66,7 +58,7 @@ def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Pa
             assert value is not None  # only a sigma may be unknown
             if title.startswith("Yaw"):
                 value = value + _whole_turns(value, next(iter(shown.values())).yaw)
-            traces += curve(name, series.time, value, unit, sigma)
+            traces += _curve(name, series.time, value, unit, sigma)
         panels.append(Panel(f"{title}, band: 3 sigma", traces, {"range": _limits(traces)}))
     return panels
 
@@ -81,25 +73,21 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
         if bias is None:
             continue
         label, traces = style(name)[0], []
-        for k, axis in enumerate("xyz"):
-            line_style = (f"{label} {axis}", AXIS_COLOURS[axis], ("solid", "dash", "dot")[k])
+        for k, (axis, *look) in enumerate(_AXIS_LOOKS):
             value, sigma = bias[0][:, k], bias[1][:, k]
-            traces += curve(f"{name} {axis}", series.time, value, unit, sigma, line_style)
+            traces += _curve(name, series.time, value, unit, sigma, (f"{label} {axis}", *look))
         words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
         panels.append(Panel(words, traces, {"range": _limits(traces)}))
     return panels
 
 
-def innovation_panels(
-    innovations: Innovations, start: float, gate: float, unit: str
-) -> list[Panel]:
+def innovation_panels(innovations: Innovations, start: float, gate: float) -> list[Panel]:
     """Return panels of the innovations by axis with 3 sigma, and of their NIS with the gate.
 
     Args:
         innovations: innovations of an estimator's updates.
         start: time of the recording's first sample [s].
         gate: probability of the chi-square test.
-        unit: unit of the residuals.
     """
     count = len(innovations.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_INNOVATIONS)).round().astype(int))
@@ -109,8 +97,8 @@ def innovation_panels(
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
         traces = _band("innovation", time, 0.0 * residual, sigma, FAINT)
-        traces += _dots(time, residual, gated, unit)
-        title = f"Innovation {axis} [{unit}], band: 3 sigma"
+        traces += _dots(time, residual, gated, "m")
+        title = f"Innovation {axis} [m], band: 3 sigma"
         panels.append(Panel(title, traces, {"range": _limits(traces)}))
     limit = chi2_quantile(gate, 3)
     nis = np.maximum(innovations.nis[rows], 1e-2)
@@ -125,13 +113,13 @@ def innovation_panels(
     return panels
 
 
-def curve(
+def _curve(
     name: str,
     time: FloatArray,
     value: FloatArray,
     unit: str,
     sigma: FloatArray | None = None,
-    look: tuple[str, str, str] | None = None,
+    look: tuple[str, ...] = (),
 ) -> list[go.Scatter]:
     """Return a line with hover text, and its 3-sigma band if there is a sigma."""
     label, colour, dash = look or style(name)
@@ -139,8 +127,7 @@ def curve(
         x=_rounded(time),
         y=_rounded(value),
         name=label,
-        legendgroup=name.split()[0],
-        showlegend=False,
+        legendgroup=name,
         mode="lines",
         line={"color": colour, "dash": dash, "width": 1.6},
         customdata=None if sigma is None else _rounded(sigma),
@@ -148,7 +135,7 @@ def curve(
         + ("" if sigma is None else f", sigma %{{customdata:.2g}} {unit}")
         + "<extra></extra>",
     )
-    band = [] if sigma is None else _band(name.split()[0], time, value, sigma, colour)
+    band = [] if sigma is None else _band(name, time, value, sigma, colour)
     return [*band, line]
 
 
@@ -159,7 +146,7 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
         valid = np.isfinite(truth.position[:, 0])
         true_position = interpolated(series.time, truth.time[valid], truth.position[valid, :2])
         error = np.linalg.norm(series.position[:, :2] - true_position, axis=1)
-        traces += curve(name, series.time, np.where(inside, error, np.nan), "m")
+        traces += _curve(name, series.time, np.where(inside, error, np.nan), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
 
 
@@ -173,7 +160,6 @@ def _band(
         "line": {"width": 0},
         "hoverinfo": "skip",
         "legendgroup": group,
-        "showlegend": False,
     }
     fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
     return [
@@ -182,12 +168,7 @@ def _band(
     ]
 
 
-def _dots(
-    time: FloatArray,
-    value: FloatArray,
-    gated: BoolArray,
-    unit: str,
-) -> list[go.Scatter]:
+def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> list[go.Scatter]:
     marker_styles: Sequence[tuple[Any, str, dict[str, Any]]] = (
         (~gated, "used", {"color": "#0072B2", "size": 3}),
         (gated, "gated", {"color": "#D55E00", "size": 7, "symbol": "x-thin-open"}),
@@ -197,7 +178,6 @@ def _dots(
             x=_rounded(time[rows]),
             y=_rounded(value[rows]),
             name=name,
-            showlegend=False,
             mode="markers",
             marker=marker,
             hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
@@ -212,7 +192,6 @@ def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
         x=_rounded(ends),
         y=[value, value],
         name=label,
-        showlegend=False,
         mode="lines",
         line={"color": INK, "dash": dash, "width": 1.2},
         hoverinfo="skip",

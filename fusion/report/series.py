@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from stario.sequences.sequence import FloatArray, Trajectory
 
 MAX_POINTS = 1500
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
+
+
+Bias = tuple[FloatArray, FloatArray]
+"""A bias (N, 3) and its sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +42,8 @@ class Series:
     position_covariance: FloatArray | None = None
     speed_sigma: FloatArray | None = None
     yaw_sigma: FloatArray | None = None
-    gyro_bias: tuple[FloatArray, FloatArray] | None = None
-    accel_bias: tuple[FloatArray, FloatArray] | None = None
+    gyro_bias: Bias | None = None
+    accel_bias: Bias | None = None
 
     @property
     def height_sigma(self) -> FloatArray | None:
@@ -71,22 +75,16 @@ def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
         return plain
     P, velocity = track.covariance[rows], track.trajectory.velocity_W
     sigma = np.sqrt(P[:, range(15), range(15)])
-    biases = [
-        None if bias is None else (scale * bias[rows], scale * sigma[:, part])
-        for bias, scale, part in (
-            (track.b_g, float(np.degrees(1.0)), slice(9, 12)),
-            (track.b_a, 1.0, slice(12, 15)),
-        )
-    ]
-    return Series(
-        plain.time,
-        plain.position,
-        plain.speed,
-        plain.yaw,
-        plain.position_covariance,
-        None if velocity is None else _speed_sigma(velocity[rows], P[:, 3:6, 3:6]),
-        np.degrees(sigma[:, 2]),
-        *biases,
+
+    def bias(values: FloatArray | None, scale: float, part: slice) -> Bias | None:
+        return None if values is None else (scale * values[rows], scale * sigma[:, part])
+
+    return replace(
+        plain,
+        speed_sigma=None if velocity is None else _speed_sigma(velocity[rows], P[:, 3:6, 3:6]),
+        yaw_sigma=np.degrees(sigma[:, 2]),
+        gyro_bias=bias(track.b_g, float(np.degrees(1.0)), slice(9, 12)),
+        accel_bias=bias(track.b_a, 1.0, slice(12, 15)),
     )
 
 
@@ -111,18 +109,16 @@ def trajectory_series(trajectory: Trajectory, start: float) -> Series:
     )
 
 
-def ellipse(covariance: FloatArray, sigmas: float = 3.0, points: int = 49) -> FloatArray:
-    """Return the outline (points, 2) of the horizontal error ellipse about zero [m].
+def ellipse(covariance: FloatArray) -> FloatArray:
+    """Return the closed outline (49, 2) of the horizontal 3-sigma ellipse about zero [m].
 
     Args:
         covariance: (3, 3) or (2, 2) [m^2].
-        sigmas: size in standard deviations.
-        points: number of points, the last equal to the first.
     """
     values, axes = np.linalg.eigh(covariance[:2, :2])
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    angle = np.linspace(0.0, 2.0 * np.pi, 49)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    outline: FloatArray = (axes * sigmas * np.sqrt(np.maximum(values, 0.0))) @ circle
+    outline: FloatArray = (axes * 3.0 * np.sqrt(np.maximum(values, 0.0))) @ circle
     return outline.T
 
 

@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.readers.checked import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
-_TIME = "time"
+rr: Any = optional_package("rerun", "view")
+
 _AXIS_LENGTH = 0.4
 _SIGMAS = 3.0
 _BLUE, _BLACK = (0, 114, 178), (0, 0, 0)
@@ -38,9 +40,8 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
         The path.
 
     Raises:
-        InputError: rerun is not installed, or the file cannot be written.
+        InputError: the file cannot be written.
     """
-    rr = optional_package("rerun", "view")
     stream = rr.RecordingStream("stario", recording_id=None)
     try:
         stream.save(path)
@@ -48,12 +49,15 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
         raise InputError("view", f"{path}: {error}", "a writable path") from error
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _log_path(rr, stream, "world/track", trajectory, _BLUE)
+    _log_path(stream, "world/track", trajectory, _BLUE)
     if sequence.truth is not None:
-        _log_path(rr, stream, "world/truth", sequence.truth, _BLACK)
-    _log_device(rr, stream, trajectory, start)
-    _log_sensors(rr, stream, sequence, start)
-    _log_estimates(rr, stream, track, start)
+        _log_path(stream, "world/truth", sequence.truth, _BLACK)
+    _log_device(stream, trajectory, start)
+    for entity, time, values, labels in _quantities(sequence, track):
+        name, index = rr.new_entity_path(entity), _times(time - start)
+        stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
+        colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
+        stream.log(name, rr.SeriesLines(colors=colours, names=labels), static=True)
     stream.disconnect()
     return path
 
@@ -74,7 +78,7 @@ def open_view(path: Path) -> None:
 
 
 def _log_path(
-    rr: Any, stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
+    stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
 ) -> None:
     """Log a whole path at once, broken where poses are not valid."""
     valid = trajectory.valid
@@ -84,9 +88,9 @@ def _log_path(
     stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
 
 
-def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> None:
+def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:
     """Log the device's axes at its position, with the 3-sigma ellipsoid of the position."""
-    index = _times(rr, trajectory.time[trajectory.valid] - start)
+    index = _times(trajectory.time[trajectory.valid] - start)
     position = trajectory.position_W[trajectory.valid]
     columns = rr.Transform3D.columns(
         translation=position, quaternion=trajectory.quat_xyzw[trajectory.valid]
@@ -97,8 +101,6 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
     covariance = trajectory.position_covariance_W
     if covariance is None:
         return
-    from scipy.spatial.transform import Rotation
-
     values, vectors = np.linalg.eigh(covariance[trajectory.valid])
     vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, not a reflection
     count = np.ones(len(position), dtype=int)
@@ -110,51 +112,31 @@ def _log_device(rr: Any, stream: Any, trajectory: Trajectory, start: float) -> N
     stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
 
 
-def _log_sensors(rr: Any, stream: Any, sequence: ImuSequence, start: float) -> None:
-    finite = np.isfinite(sequence.time)
-    index = _times(rr, sequence.time[finite] - start)
-    for name, values in (
-        ("gyroscope [rad/s]", sequence.gyro),
-        ("specific force [m/s^2]", sequence.accel),
+def _quantities(
+    sequence: ImuSequence, track: Track
+) -> Iterator[tuple[list[str], FloatArray, FloatArray, list[str]]]:
+    """Yield path, times (N,), values (N, k) and labels of each quantity over time."""
+    finite, axes = np.isfinite(sequence.time), list("xyz")
+    time = sequence.time[finite]
+    yield ["sensors", "gyroscope [rad/s]"], time, sequence.gyro[finite], axes
+    yield ["sensors", "specific force [m/s^2]"], time, sequence.accel[finite], axes
+    for name, bias in (
+        ("gyroscope bias [rad/s]", track.b_g),
+        ("accelerometer bias [m/s^2]", track.b_a),
     ):
-        _log_lines(rr, stream, ("sensors", name), index, values[finite], "xyz")
-
-
-def _log_estimates(rr: Any, stream: Any, track: Track, start: float) -> None:
-    index = _times(rr, track.time - start)
-    lines: list[tuple[str, FloatArray | None, Sequence[str]]] = [
-        ("gyroscope bias [rad/s]", track.b_g, "xyz"),
-        ("accelerometer bias [m/s^2]", track.b_a, "xyz"),
-    ]
+        if bias is not None:
+            yield ["estimate", name], track.time, bias, axes
     if track.trajectory.velocity_W is not None:
         speed = np.linalg.norm(track.trajectory.velocity_W, axis=1)[:, None]
-        lines.append(("speed [m/s]", speed, ["speed"]))
+        yield ["estimate", "speed [m/s]"], track.time, speed, ["speed"]
     if track.covariance is not None:
         sigma = np.sqrt(track.covariance[:, range(15), range(15)])
-        lines.append(("sigma of position [m]", sigma[:, 6:9], "xyz"))
-        lines.append(("sigma of yaw [rad]", sigma[:, 2:3], ["yaw"]))
-    for name, values, labels in lines:
-        if values is not None:
-            _log_lines(rr, stream, ("estimate", name), index, values, labels)
+        yield ["estimate", "sigma of position [m]"], track.time, sigma[:, 6:9], axes
+        yield ["estimate", "sigma of yaw [rad]"], track.time, sigma[:, 2:3], ["yaw"]
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        update_index, nis = _times(rr, innovations.time - start), innovations.nis[:, None]
-        _log_lines(rr, stream, ("estimate", "NIS [1]"), update_index, nis, ["NIS"])
+        yield ["estimate", "NIS [1]"], innovations.time, innovations.nis[:, None], ["NIS"]
 
 
-def _log_lines(
-    rr: Any,
-    stream: Any,
-    path: Sequence[str],
-    index: list[Any],
-    values: FloatArray,
-    labels: Sequence[str],
-) -> None:
-    name = rr.new_entity_path(list(path))
-    stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
-    colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
-    stream.log(name, rr.SeriesLines(colors=colours, names=list(labels)), static=True)
-
-
-def _times(rr: Any, seconds: FloatArray) -> list[Any]:
-    return [rr.TimeColumn(_TIME, duration=seconds)]
+def _times(seconds: FloatArray) -> list[Any]:
+    return [rr.TimeColumn("time", duration=seconds)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,13 @@ from typer.testing import CliRunner
 from stario.fusion.commands.cli import app, main
 
 
+@dataclass(frozen=True)
 class CommandResult:
     """Exit code and output of one call of the command."""
 
-    def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
+    code: int
+    out: str
+    err: str
 
     def assert_one_line_error(self, *words: str) -> None:
         assert self.code == 1

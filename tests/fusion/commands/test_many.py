@@ -168,12 +168,20 @@ def test_evaluate_compares_with_other_weights_by_groups(
 # --- train -------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A recipe of one step."""
+    path = tmp_path / "tiny.json"
+    path.write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
+    return path
+
+
 @pytest.mark.usefixtures("no_figures")
-def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path: Path) -> None:
-    settings = {"epoch_windows": 64, "batch": 32, "epochs": 1}
-    (tmp_path / "tiny.json").write_text(json.dumps(settings))
+def test_weights_that_train_writes_can_be_run(
+    stario, recording: Path, tmp_path: Path, tiny: Path
+) -> None:
     done = stario(
-        "train", recording, "--generated", 1, "--config", "tiny.json", "--out", "trained",
+        "train", recording, "--generated", 1, "--config", tiny, "--out", "trained",
         "--seed", 3,
     )  # fmt: skip
     assert done.code == 0, done.err
@@ -191,12 +199,11 @@ def test_weights_that_train_writes_can_be_run(stario, recording: Path, tmp_path:
 
 
 def test_training_continues_after_failures_and_caches_its_windows(
-    stario, recording: Path, tmp_path: Path
+    stario, recording: Path, tmp_path: Path, tiny: Path
 ) -> None:
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
-    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
-    call = ("train", recording, "list.txt", "--generated", 1, "--config", "tiny.json")
+    call = ("train", recording, "list.txt", "--generated", 1, "--config", tiny)
     done = stario(*call, "--out", "a", "--cache", "kept")
     assert done.code == 1
     assert Path(done.out.strip()) == Path("a/model.safetensors")
@@ -212,9 +219,10 @@ def test_training_continues_after_failures_and_caches_its_windows(
     assert first == second
 
 
-def test_weights_to_start_from_set_the_network(stario, recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
-    call = ("train", recording, "--recorded-only", "--config", "tiny.json")
+def test_weights_to_start_from_set_the_network(
+    stario, recording: Path, tmp_path: Path, tiny: Path
+) -> None:
+    call = ("train", recording, "--recorded-only", "--config", tiny)
     assert stario(*call, "--model", "R-ResNet", "--out", "first").code == 0
     first = ("--start-from", "first/model.safetensors")
     assert stario(*call, *first, "--out", "second").code == 0
@@ -223,19 +231,13 @@ def test_weights_to_start_from_set_the_network(stario, recording: Path, tmp_path
     stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", "R-ResNet")
 
 
-def test_training_can_use_recordings_alone(stario, recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "tiny.json").write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
-    done = stario("train", recording, "--recorded-only", "--config", "tiny.json", "--out", "alone")
+def test_training_can_use_recordings_alone(
+    stario, recording: Path, tmp_path: Path, tiny: Path
+) -> None:
+    done = stario("train", recording, "--recorded-only", "--config", tiny, "--out", "alone")
     assert done.code == 0, done.err
     trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
     assert trained_on == ["recorded, others: 0 min"]  # nothing simulated, no licence known
-
-
-def test_where_is_refused_with_the_packaged_lists(stario) -> None:
-    """Training would use all of their recordings, whatever the option says."""
-    stario("train", "--data", "data", "--where", "person=dan").assert_one_line_error(
-        "--where: found with --data"
-    )
 
 
 def test_a_recording_cannot_both_train_and_validate(
@@ -261,13 +263,6 @@ def test_run_with_the_graph_writes_its_track(
     assert len(read_tum(tmp_path / "out" / "graph.tum").time) > 100
     notes = json.loads((tmp_path / "out" / "health.json").read_text())["notes"]
     assert notes[0].startswith("graph of")
-
-
-def test_an_unknown_back_end_is_a_one_line_error(stario, recording: Path) -> None:
-    done = stario("run", recording, "--backend", "ukf")
-    assert done.code == 1
-    assert "backend: found 'ukf'" in done.err
-    assert len(done.err.strip().splitlines()) == 1
 
 
 def test_backends_compares_filter_and_graph(stario) -> None:

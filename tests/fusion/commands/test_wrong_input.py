@@ -12,37 +12,27 @@ from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 
 
-@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize(
+    ("field", "factor", "options", "truth"),
+    [
+        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], True),
+        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], False),
+        ("accel", 1.0 / 9.80665, ["--accel-unit", "g"], True),
+        ("accel", -1.0, ["--accel-unit=-m/s^2"], True),
+    ],
+)
 @pytest.mark.usefixtures("no_figures")
-def test_degrees_are_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path, truth: bool
-) -> None:
+def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
+    stario, recording: Path, tmp_path: Path, field: str, factor: float, options: list[str],
+    truth: bool,
+) -> None:  # fmt: skip
     sequence = read_generic_csv(recording)
     sequence = sequence if truth else sequence.without_truth()
-    write_csv(tmp_path / "deg.csv", replace(sequence, gyro=np.degrees(sequence.gyro)))
-    done = stario("run", "deg.csv", "--out", "out")
-    done.assert_one_line_error("--gyro-unit deg/s", "deg")
+    write_csv(tmp_path / "odd.csv", replace(sequence, **{field: factor * getattr(sequence, field)}))
+    stario("run", "odd.csv", "--out", "out").assert_one_line_error(" ".join(options))
     assert not (tmp_path / "out").exists()
     if truth:
-        assert stario("run", "deg.csv", "--out", "out", "--gyro-unit", "deg/s").code == 0
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_g_is_refused_with_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "g.csv", replace(sequence, accel=sequence.accel / 9.80665))
-    stario("run", "g.csv").assert_one_line_error("--accel-unit g")
-    assert stario("run", "g.csv", "--accel-unit", "g").code == 0
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_wrong_sign_of_gravity_is_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "apple.csv", replace(sequence, accel=-sequence.accel))
-    stario("run", "apple.csv").assert_one_line_error("--accel-unit=-m/s^2")
-    assert stario("run", "apple.csv", "--accel-unit=-m/s^2").code == 0
+        assert stario("run", "odd.csv", "--out", "out", *options).code == 0
 
 
 @pytest.mark.parametrize(
@@ -88,7 +78,12 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
         (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
+        (["run", "RECORDING", "--backend", "ukf"], ["backend: found 'ukf'"]),
         (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
+        (
+            ["run", "RECORDING", "--model", "nothere"],  # the error names the known weights
+            ["nothere", "default, first-stage, open or walks-36min"],
+        ),
         (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
         (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
         (["simulate", "no/such/folder.csv"], ["folder"]),
@@ -99,6 +94,7 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
+        (["train", "--data", ".", "--where", "person=dan"], ["--where: found with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
@@ -152,14 +148,6 @@ def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_
 def test_a_file_extension_without_a_layout_is_refused(stario, recording: Path) -> None:
     stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
     assert not Path("walk.txt").exists()
-
-
-def test_unknown_weights_are_refused_with_the_names_of_the_known_ones(
-    stario, recording: Path
-) -> None:
-    stario("run", recording, "--model", "nothere").assert_one_line_error(
-        "nothere", "default, first-stage, open or walks-36min"
-    )
 
 
 def test_a_declination_without_a_source_of_north_is_reported(stario, recording: Path) -> None:

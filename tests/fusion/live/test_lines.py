@@ -149,8 +149,6 @@ def test_a_phyphox_phone_is_polled_until_all_samples_are_recorded(serve, walk):
 def test_an_experiment_without_both_sensors_is_refused():
     with pytest.raises(InputError, match="gyroscope and acceleration with g"):
         buffers_of({"inputs": CONFIG["inputs"][1:]})
-    with pytest.raises(InputError, match="phyphox"):
-        Phyphox("file:///etc/passwd")
 
 
 def test_a_stopping_server_closes_the_connections_of_its_viewers(serve, caplog):
@@ -171,13 +169,6 @@ def test_only_loopback_needs_no_token(tmp_path, new_navigator):
     assert len(server.token) >= 16
     assert server.token in "\n".join(server.addresses())
     server._socket.close()
-
-
-def test_a_port_in_use_is_refused(tmp_path, new_navigator):
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        with pytest.raises(InputError, match="port"):
-            LiveServer(new_navigator, tmp_path, port=port)
 
 
 def test_an_invalid_packet_does_not_stop_the_server_from_listening(serve, walk):

@@ -23,6 +23,10 @@ def client(hub):
         yield client
 
 
+def send(client, bodies):
+    return [client.post("/data", content=body) for body in bodies]
+
+
 def command(client, device, name, **content):
     url = f"/devices/{device}/{name}"
     return client.post(url, content=json.dumps(content), headers=JSON)
@@ -36,7 +40,7 @@ def rerun(session, new_navigator):
 
 
 def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navigator, walk):
-    taken = [client.post("/data", content=body).json()["samples"] for body in pushes()]
+    taken = [answer.json()["samples"] for answer in send(client, pushes())]
     session = hub.sessions["phone"]
     assert sum(taken) == session.samples == len(walk)
     track = rerun(session, new_navigator)
@@ -50,11 +54,9 @@ def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navi
 
 
 def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pushes):
-    for body in pushes(seconds=3.0):
-        client.post("/data", content=body)
+    send(client, pushes(seconds=3.0))
     first = hub.sessions["phone"].path
-    for body in pushes(session="two", seconds=3.0):
-        client.post("/data", content=body)
+    send(client, pushes(session="two", seconds=3.0))
     session = hub.sessions["phone"]
     assert session.path != first
     assert session.samples == 300
@@ -63,51 +65,44 @@ def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pu
 
 def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
     for offset in (2 * 10**18, 10**18):
-        for body in pushes(session="", offset_ns=offset, seconds=3.0):
-            client.post("/data", content=body)
+        send(client, pushes(session="", offset_ns=offset, seconds=3.0))
     assert hub.sessions["phone"].samples == 300
 
 
 def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
     bodies = pushes(seconds=6.0)
-    for body in bodies[:15]:
-        client.post("/data", content=body)
+    send(client, bodies[:15])
     assert command(client, "phone", "stop").status_code == 200
     assert client.post("/data", content=bodies[15]).json() == {"samples": 0}
     session = hub.sessions["phone"]
     assert session.samples == 300
     assert command(client, "phone", "start").status_code == 200
-    for body in bodies[16:]:
-        client.post("/data", content=body)
+    send(client, bodies[16:])
     assert session.samples == 280
 
 
 def test_zero_moves_the_drawn_origin_and_not_the_estimate(client, hub, pushes, new_navigator):
     bodies = pushes(seconds=8.0)
-    for body in bodies[:30]:
-        client.post("/data", content=body)
+    send(client, bodies[:30])
     session = hub.sessions["phone"]
     command(client, "phone", "zero")
     at = session.drawn.points[-1][1:4]
     np.testing.assert_allclose(session.status()["origin"], at, atol=1e-3)
-    for body in bodies[30:]:
-        client.post("/data", content=body)
+    send(client, bodies[30:])
     end = rerun(session, new_navigator).trajectory.position_W[-1]
     np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-5)
 
 
 def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes, new_navigator):
     bodies = pushes()
-    for body in bodies[:20]:
-        client.post("/data", content=body)
+    send(client, bodies[:20])
     session = hub.sessions["phone"]
     shape = np.array(session.drawn.points)[:, 1:3]
     assert command(client, "phone", "fix", x=50.0, y=-20.0, sigma=0.1).status_code == 200
     moved = np.array(session.drawn.points)[: len(shape), 1:3]
     np.testing.assert_allclose(session.drawn.points[-1][1:3], [50.0, -20.0], atol=0.2)
     np.testing.assert_allclose(moved - moved[0], shape - shape[0], atol=1e-4)
-    for body in bodies[20:90]:
-        client.post("/data", content=body)
+    send(client, bodies[20:90])
     walked = np.array(session.drawn.points[-1][1:3]) - [50.0, -20.0]
     assert np.linalg.norm(walked) > 5.0
     turned = [50.0 - walked[1], -20.0 + walked[0]]  # a quarter turn to the left
@@ -116,8 +111,7 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
     start = np.array(session.drawn.points[len(shape) // 2][1:3])
     before = moved[len(shape) // 2] - [50.0, -20.0]
     np.testing.assert_allclose(start - [50.0, -20.0], [-before[1], before[0]], atol=0.6)
-    for body in bodies[90:]:
-        client.post("/data", content=body)
+    send(client, bodies[90:])
     end = rerun(session, new_navigator).trajectory.position_W[-1]
     np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-3)
     assert session.fixes == 2
@@ -182,8 +176,7 @@ def test_a_thousand_malformed_pushes_do_not_affect_a_replay(client, hub, pushes,
             sent.append(client.post("/data", content=body).json()["samples"])
 
     push()
-    for body in bodies:
-        sent.append(client.post("/data", content=body).json()["samples"])
+    sent += [answer.json()["samples"] for answer in send(client, bodies)]
     assert len(refused) >= 1000
     assert sum(sent) == len(walk)
     assert list(hub.sessions) == ["phone"]
@@ -196,15 +189,14 @@ def test_a_thousand_malformed_pushes_do_not_affect_a_replay(client, hub, pushes,
 
 def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monkeypatch):
     for device in ("full", "phone"):
-        for body in pushes(device=device, seconds=2.0):
-            client.post("/data", content=body)
+        send(client, pushes(device=device, seconds=2.0))
 
     def disk_full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(hub.sessions["full"]._file, "append", disk_full)
     bodies = [pushes(device=device, seconds=4.0)[10] for device in ("full", "phone")]
-    full, phone = (client.post("/data", content=body) for body in bodies)
+    full, phone = send(client, bodies)
     assert (full.status_code, "No space" in full.json()["error"]) == (507, True)
     assert phone.json() == {"samples": 20}
 
@@ -212,8 +204,7 @@ def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monke
 def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, pushes):
     bodies = pushes()
     for part in (bodies[:20], bodies[20:60]):
-        for body in part:
-            client.post("/data", content=body)
+        send(client, part)
         session = hub.sessions["phone"]
         x, y = session.drawn.points[-1][1:3]
         command(client, "phone", "fix", x=x, y=y, sigma=0.1)
@@ -269,14 +260,12 @@ def test_every_request_off_loopback_needs_the_token(hub, pushes):
 
 def test_viewers_get_new_points_and_after_a_change_the_whole_track(client, hub, pushes):
     bodies = pushes(seconds=6.0)
-    for body in bodies[:15]:
-        client.post("/data", content=body)
+    send(client, bodies[:15])
     viewer = Viewer(hub)
     (first,) = viewer.message()["devices"]
     assert first["fresh"]
     assert viewer.message()["devices"][0]["points"] == []
-    for body in bodies[15:]:
-        client.post("/data", content=body)
+    send(client, bodies[15:])
     (second,) = viewer.message()["devices"]
     assert not second["fresh"]
     assert first["points"] + second["points"] == hub.sessions["phone"].drawn.points

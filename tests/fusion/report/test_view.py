@@ -2,28 +2,27 @@
 
 import pytest
 
-from stario.fusion.report import view
-from stario.fusion.report.view import write_view
-
-pytest.importorskip("rerun", reason="pip install 'stario[view]'")
-
 
 @pytest.fixture
-def track(walk, still_model):
+def view():
+    pytest.importorskip("rerun", reason="pip install 'stario[view]'")
+    from stario.fusion.report import view
+
+    return view
+
+
+def test_file_holds_every_quantity_over_time(tmp_path, view, walk, still_model):
     from stario.fusion import Navigator
 
-    return Navigator(still_model).run(walk)
-
-
-def test_file_holds_every_quantity_over_time(tmp_path, walk, track):
     reader = pytest.importorskip("rerun.chunk", reason="requires rerun 0.41 or newer").RrdReader
-    path = write_view(tmp_path / "track.rrd", walk, track, track.trajectory)
+    track = Navigator(still_model).run(walk)
+    path = view.write_view(tmp_path / "track.rrd", walk, track, track.trajectory)
     entities = {str(chunk.entity_path) for chunk in reader(str(path)).stream()}
     for name in ("world/track", "world/truth", "world/device", "NIS", "bias", "force", "yaw"):
         assert any(name in entity for entity in entities), (name, entities)
 
 
-def test_the_viewer_is_started_on_the_file(tmp_path, monkeypatch):
+def test_the_viewer_is_started_on_the_file(tmp_path, view, monkeypatch):
     started = []
     monkeypatch.setattr(view.subprocess, "Popen", lambda command, **_: started.append(command))
     view.open_view(tmp_path / "track.rrd")

@@ -1,0 +1,252 @@
+"""`stario check ...`: estimators and networks checked on this machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stario.fusion.commands.common import (
+    exit_if_skipped,
+    map_recordings,
+    print_result,
+    progress_bar,
+    with_bar,
+)
+from stario.fusion.commands.options import (
+    BackendOption,
+    ByOption,
+    ConfigOption,
+    EstimatorOptions,
+    JsonOption,
+    OptionalPathsArgument,
+    ReadingOptions,
+    expand_option_groups,
+)
+
+if TYPE_CHECKING:
+    from stario.fusion.backends import BackendName
+    from stario.fusion.config import NavigatorConfig
+    from stario.fusion.evaluation.checks.backends import Score
+    from stario.fusion.imu.stateful import Predictor
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.sequence import ImuSequence
+
+    Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
+
+RecordingsArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="PATH...", help="Recordings, folders, archives or list files."),
+]
+
+
+def models(
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Networks. Default: all of the paper's table.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List parameters, FLOPs, time and memory of each network next to the paper's values."""
+    from stario.network.architectures import ARCHITECTURES
+    from stario.network.runtime.survey import survey, survey_table
+    from stario.sequences.datasets.stream_cache import cache_folder
+
+    with progress_bar("models") as progress:
+        rows = survey(names or list(ARCHITECTURES), cache_folder(), progress)
+    print_result(as_json, [row.as_dict() for row in rows], survey_table(rows))
+
+
+@expand_option_groups
+def backends(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of the development recordings to use instead.")
+    ] = None,
+    split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
+    as_json: JsonOption = False,
+) -> None:
+    """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
+
+    Without PATH or --data, use simulated walks, measured with white noise of known magnitude.
+    """
+    from stario.fusion.evaluation.checks.backends import (
+        score_recording,
+        score_table,
+        score_walk,
+        summary,
+    )
+    from stario.network.training.splits import split_paths
+
+    scores: list[Score] = []
+    skipped: list[Skipped] = []
+    if paths or data is not None:
+        settings, network = estimating.settings(), estimating.network()
+        scores, skipped = map_recordings(
+            "backends",
+            reading,
+            paths or split_paths(data or Path(), split),
+            lambda path, sequence: score_recording(network, sequence, settings),
+        )
+    else:
+        for seed in with_bar("backends", range(walks), walks):
+            scores.append(score_walk(seed, seconds))
+    if scores:
+        record = {"summary": summary(scores), "scores": [asdict(score) for score in scores]}
+        print_result(as_json, record, score_table(scores))
+    exit_if_skipped(skipped)
+
+
+@expand_option_groups
+def faults(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    path: Annotated[
+        Path | None,
+        typer.Argument(help="Recording with true poses. Default: a simulated walk."),
+    ] = None,
+    network: Annotated[
+        bool,
+        typer.Option(
+            "--network",
+            help="Use the network's displacements instead of true ones with white noise.",
+        ),
+    ] = False,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the faults and of the simulated walk, if any.")
+    ] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Inject faults into a recording one at a time; print the resulting error and the report."""
+    from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
+
+    settings = estimating.settings()
+    if path is not None:
+        sequence = reading.read(path)
+    else:
+        sequence, matched = matched_walk(seed=seed)
+        settings = matched if estimating.config is None else settings
+    results = run_faults(sequence, settings, estimating.network() if network else None, seed)
+    record = {"recording": sequence.name, "faults": [asdict(result) for result in results]}
+    title = f"{sequence.name}: {sequence.duration:.1f} s"
+    print_result(as_json, record, f"{title}\n{fault_table(results)}")
+
+
+def consistency(
+    config: ConfigOption = None,
+    yaw: Annotated[float, typer.Option(min=0.0, help="Sigma of the initial yaw in deg.")] = 10.0,
+    runs: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Duration of each walk in s.")] = 300.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first walk.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
+    from stario.fusion.config import NavigatorConfig, read_config
+    from stario.fusion.evaluation.checks.consistency import consistency as monte_carlo
+
+    checked = read_config(config) if config else NavigatorConfig()
+    with progress_bar("consistency") as progress:
+        result = monte_carlo(checked, max(math.radians(yaw), 1e-6), runs, seconds, seed, progress)
+    print_result(as_json, asdict(result), "\n".join(result.lines()))
+
+
+def benchmark(as_json: JsonOption = False) -> None:
+    """Measure speed on this machine: filter against dense algebra, network, whole run."""
+    from stario.fusion.evaluation.checks.speed import speed_report, speed_table
+    from stario.network.model import load_model
+
+    report = speed_report(load_model("default"))
+    print_result(as_json, report, speed_table(report))
+
+
+@expand_option_groups
+def fusion(
+    paths: RecordingsArgument,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    by: ByOption = "set",
+    graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
+    from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
+
+    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
+    _judge_each(
+        "check fusion",
+        (reading, paths, estimating, by, as_json),
+        lambda model, recording, config, group: [
+            fusion_gain(model, recording, config, group, backends)
+        ],
+        fusion_gain_table,
+    )
+
+
+@expand_option_groups
+def fixes(
+    paths: RecordingsArgument,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    every: Annotated[float, typer.Option(min=0.1, help="Interval between fixes in s.")] = 5.0,
+    sigma: Annotated[float, typer.Option(min=0.001, help="Fix sigma per axis \\[m].")] = 0.3,
+    backend: BackendOption = "ekf",
+    by: ByOption = "set",
+    as_json: JsonOption = False,
+) -> None:
+    """Supply periodic true positions; check that position and yaw errors match their sigmas."""
+    from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
+
+    _judge_each(
+        "check fixes",
+        (reading, paths, estimating, by, as_json),
+        lambda model, recording, config, group: [
+            track_with_fixes(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
+        ],
+        fixes_table,
+    )
+
+
+@expand_option_groups
+def gaps(
+    paths: RecordingsArgument,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    by: ByOption = "set",
+    as_json: JsonOption = False,
+) -> None:
+    """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
+    from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
+
+    _judge_each(
+        "check gaps", (reading, paths, estimating, by, as_json), end_shifts, end_shift_table
+    )
+
+
+def _judge_each(
+    title: str,
+    options: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
+    judge: Judge,
+    table: Callable[[Sequence[Any]], str],
+) -> None:
+    """Evaluate each recording, print a table or JSON, and exit with 1 if any was skipped."""
+    from stario.fusion.evaluation.judging.judge import check_by, labels
+
+    reading, paths, estimating, by, as_json = options
+    grouping = check_by(by)
+    model, settings = estimating.network(), estimating.settings()
+
+    def judged(path: Path, sequence: ImuSequence) -> Sequence[Any]:
+        return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
+
+    results, skipped = map_recordings(title, reading, paths, judged)
+    found = [result for group in results for result in group]
+    if as_json or found:
+        print_result(as_json, [asdict(result) for result in found], table(found) if found else "")
+    exit_if_skipped(skipped)
