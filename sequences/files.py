@@ -97,7 +97,7 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
 @contextmanager
 def _temporary(path: Path, kind: str) -> Iterator[Path]:
     """Yield a path next to `path`, removed after an exception; `OSError`s get a remedy."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:
         if not path.parent.is_dir():
             expected = f"{kind} in an existing folder"
