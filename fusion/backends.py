@@ -18,7 +18,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, IntervalMeasurements
-from stario.fusion.filter.frame_transform import smoothed_track, to_final_frame
+from stario.fusion.filter.frame_transform import smoothed_track, to_final_frame, with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix, FixQueue
 from stario.fusion.graph.batch import smooth
@@ -110,10 +110,12 @@ class EkfBackend:
 
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """Return the filter's states."""
-        transforms = filtered.estimator.map_frame_state.transforms
-        states = to_final_frame(nav_states(filtered.estimates), transforms)
-        smoothed = smoothed_track(smoothed_poses(filtered.clones), transforms)
-        return Solution(states, smoothed, [])
+        frame = filtered.estimator.map_frame_state
+        states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
+        smoothed = smoothed_track(
+            smoothed_poses(filtered.clones), (*frame.transforms, *frame.undirected)
+        )
+        return Solution(with_undirected(states, frame.undirected), smoothed, [])
 
 
 class GraphBackend:
@@ -128,18 +130,17 @@ class GraphBackend:
     def solve(self, filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
         """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
         estimator = filtered.estimator
-        transforms, states = estimator.map_frame_state.transforms, nav_states(filtered.estimates)
+        frame, states = estimator.map_frame_state, nav_states(filtered.estimates)
         end, has_field = states[-1], estimator.ekf.state.field is not None
         bias = (end.b_g, end.covariance[9:12, 9:12]) if has_field else None
-        filtered_states = to_final_frame(states, transforms)
+        filtered_states = to_final_frame(states, frame.transforms)
         first = _with_bias_prior(states[0], estimator.bias_prior.variance)
         sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
         smoothed = smooth(
-            filtered_states, first, filtered.measurements, transforms, config, bias, sigma
+            filtered_states, first, filtered.measurements, frame.transforms, config, bias, sigma
         )
-        return Solution(
-            filtered_states if smoothed.fell_back else smoothed.states, None, [smoothed.note]
-        )
+        solved = filtered_states if smoothed.fell_back else smoothed.states
+        return Solution(with_undirected(solved, frame.undirected), None, [smoothed.note])
 
 
 def _with_bias_prior(first: NavState, variance: float) -> NavState:

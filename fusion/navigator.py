@@ -140,8 +140,9 @@ class Navigator:
         It is applied at its own time, which may lie up to one window (1 s) before the newest state
         or in the future. Older fixes, values that are not finite and invalid covariances are
         refused and counted in `health`. A track that started without a pose is moved to its first
-        position fix and turned by the first later one that is far enough away (`filter.map_frame`);
-        states with different `map_frame` must not be compared.
+        position fix and turned by the first later one that is far enough away (`filter.map_frame`).
+        Between the two its yaw in the map is unknown, and so are positions further on: covariances
+        say so. States with different `map_frame` must not be compared.
 
         Args:
             time: [s], on the samples' clock.

@@ -23,6 +23,7 @@ from stario.fusion.filter.estimator_state import (
     IntervalMeasurements,
     Step,
 )
+from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.innovations import (
@@ -350,8 +351,8 @@ class Estimator:
         return self.ekf.state.estimate(self.in_gap, self.map_frame)
 
     def nav_state(self) -> NavState:
-        """Return the newest state with plain errors."""
-        return nav_states([self.estimate()])[0]
+        """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
+        return with_undirected(nav_states([self.estimate()]), self._map_frame.state.undirected)[0]
 
     def innovations(self) -> Innovations:
         """Return every innovation so far."""

@@ -139,6 +139,17 @@ def to_final_frame(states: list[NavState], transforms: Sequence[FrameTransform])
     return states
 
 
+def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]) -> list[NavState]:
+    """Return the states of a track with the yaw uncertainty of stretches without a direction.
+
+    The filter keeps the arbitrary yaw of such a stretch as if it were known, so that the first fix
+    that determines it turns the track exactly; those who read the states must know better.
+    """
+    for stretch in undirected:
+        states = [changed(stretch.state(s), map_frame=s.map_frame) for s in states]
+    return states
+
+
 def smoothed_track(
     poses: list[SmoothedPose], transforms: Sequence[FrameTransform]
 ) -> Trajectory | None:

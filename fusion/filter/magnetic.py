@@ -9,8 +9,10 @@ azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the
 vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
 much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
 or dip for the place has less weight, as does one that the device has extrapolated by its own
-gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. If a
-declination is given, and only then, the field determines north once, as a fix of yaw.
+gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. While
+the field does not rotate against the device as the gyroscope does (other axes, a magnet attached),
+it is not used. If a declination is given, and only then, the field
+determines north once, as a fix of yaw.
 
 The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
 """
@@ -83,11 +85,24 @@ _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 _EXTRAPOLATED_FACTOR = 10.0
 """Factor on the variance of a field that the device has extrapolated by its own gyroscope."""
 
+_MIN_ROTATION, _MAX_STEP = 0.2, 1.1
+"""Two bearings are compared with the gyroscope if the device has rotated by at least the first
+[rad] in at most the second [s]."""
+
+_MAX_UNEXPLAINED = 1.1
+"""Change of the field in W beyond which it contradicts the gyroscope, as a fraction of the change
+in B that rotation alone causes (sums of squares). Swapped or mirrored axes are at 1 to 5; without
+magnets the medians of OxIOD, RIDI, KIPD and tyrex are 0.02 to 0.6, except for two phones that
+hardly rotate on the body."""
+
+_ROTATION_MEMORY, _MIN_ROTATIONS = 0.9, 5
+"""Weight of earlier rotations relative to the next one, and number of rotations before a verdict."""
+
 _MIN_SPEED = 0.3
 """Speed below which the spread is not updated [m/s]: in one spot the field hardly varies."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MagneticReference:
     """Usual properties of the field, and its last measurement.
 
@@ -99,6 +114,10 @@ class MagneticReference:
         spread: mean deviation of size (fraction) and dip [rad] from their usual values in motion.
         moving_count: number of bearings averaged in `spread`.
         measured: size of the last measured field, including hard iron [uT].
+        before: (3,) last field in B [uT] and (3, 3) attitude R_WB there; None at first.
+        rotations: number of rotations between bearings that were compared with the gyroscope.
+        unexplained: weighted sum of the field's squared changes in W over them [uT^2].
+        explained: likewise of the changes in B that rotation alone would cause [uT^2].
     """
 
     time: float = -math.inf
@@ -108,6 +127,44 @@ class MagneticReference:
     spread: float = _FIRST_SPREAD
     moving_count: int = 0
     measured: float = 0.0
+    before: tuple[FloatArray, FloatArray] | None = None
+    rotations: int = 0
+    unexplained: float = 0.0
+    explained: float = 0.0
+
+    @property
+    def contradicts_gyro(self) -> bool:
+        """Whether the field does not rotate against the device as the gyroscope does."""
+        return (
+            self.rotations >= _MIN_ROTATIONS
+            and self.unexplained > _MAX_UNEXPLAINED * self.explained
+        )
+
+    def compared(self, s: EkfState, m_B: FloatArray) -> MagneticReference:
+        """Return the reference after comparing the change of a field (3,) with the rotation.
+
+        Call it before `updated`, which notes the time.
+
+        Args:
+            s: the filter's state at the field's time.
+            m_B: (3,) field [uT].
+        """
+        reference = changed(self, before=(m_B, s.R_WB))
+        if self.before is None or s.time - self.time > _MAX_STEP or s.field is None:
+            return reference
+        (earlier_B, earlier_R), iron = self.before, s.field.hard_iron_B
+        rotation = s.R_WB.T @ earlier_R
+        if np.trace(rotation) > 1.0 + 2.0 * math.cos(_MIN_ROTATION):
+            return reference
+        earlier = earlier_B - iron
+        by_rotation = rotation @ earlier - earlier
+        other = m_B - iron - rotation @ earlier
+        return changed(
+            reference,
+            rotations=self.rotations + 1,
+            unexplained=_ROTATION_MEMORY * self.unexplained + float(other @ other),
+            explained=_ROTATION_MEMORY * self.explained + float(by_rotation @ by_rotation),
+        )
 
     @property
     def wander_sigma(self) -> float:
@@ -222,6 +279,10 @@ def update_bearing(
         return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
             reference, time=now
         )
+    reference = reference.compared(s, m_B)
+    if reference.contradicts_gyro:
+        reason = "contradicts the gyroscope"
+        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
     extrapolated = reference.is_held(measured)
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)

@@ -84,6 +84,8 @@ class MapFrameState:
             applied once the frame is oriented.
         jumps: number of times that the track, not the positions, proved to be wrong.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
+        arbitrary_yaw: whether the track still has the yaw zero with which it began without a pose;
+            its covariance does not know that this is not the map's.
     """
 
     placed: bool
@@ -98,6 +100,16 @@ class MapFrameState:
     unoriented: tuple[FrameTransform, ...] = ()
     jumps: int = 0
     yaw_variance: float = 0.0
+    arbitrary_yaw: bool = False
+
+    @property
+    def undirected(self) -> tuple[FrameTransform, ...]:
+        """Yaw uncertainty in the map of stretches that were placed and not yet oriented."""
+        if self.oriented:
+            return ()
+        if not (self.placed and self.arbitrary_yaw):
+            return self.unoriented
+        return (*self.unoriented, _unoriented_stretch(self.pivot, self.since, math.inf))
 
 
 class MapFrame:
@@ -123,7 +135,7 @@ class MapFrame:
         turn_sigma: float,
     ) -> None:
         self.state = (
-            MapFrameState(False, oriented)
+            MapFrameState(False, oriented, arbitrary_yaw=not oriented)
             if pivot is None
             else MapFrameState(True, oriented, pivot=pivot, pivot_variance=2.0 * pivot_sigma**2)
         )

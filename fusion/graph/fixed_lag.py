@@ -18,6 +18,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
+from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import gained_bias_information
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.network_turn import turn_estimate
@@ -149,7 +150,8 @@ class FixedLagEstimator:
     def nav_state(self) -> NavState:
         """Return the newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
-        return nav_states([ahead])[0].shifted(self._origin_W)
+        states = [nav_states([ahead])[0].shifted(self._origin_W)]
+        return with_undirected(states, self._filter.map_frame_state.undirected)[0]
 
     def health(self, counts: SampleCounts) -> Health:
         """Return the filter's report with the graph's sigmas and the number of fallbacks."""
@@ -186,7 +188,7 @@ class FixedLagEstimator:
 
     def _begin(self, count: int) -> None:
         """Begin a new graph from the filter's state."""
-        first = self._filter.nav_state()
+        first = nav_states([self._filter.estimate()])[0]
         self._map_frame, self._origin_W = first.map_frame, first.p_W
         self._jumps = self._filter.map_frame_state.jumps
         self._bias_prior = self._filter.bias_prior.variance

@@ -111,15 +111,22 @@ _MAX_DELAY = 0.1
 """A field older than the end of the last interval by more than this [s] is dropped as late."""
 
 
+_MAX_REPEATED = 0.5
+"""Maximum time for which a field may repeat itself [s]: slow sensors are logged several times, but
+one that repeats its value for longer has stopped."""
+
+
 class FieldBuffer:
     """The newest magnetic fields of a stream."""
 
     def __init__(self) -> None:
+        self._value: tuple[float, ...] = ()
+        self._since = math.inf
         self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
         self._last_query = -math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
-        """Add a field; return False if its value or time cannot be right.
+        """Add a field; return False if its value or time cannot be right, or the sensor stopped.
 
         Args:
             time: time of the field [s].
@@ -135,14 +142,16 @@ class FieldBuffer:
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         newest = max(newest, self._last_query - _MAX_DELAY)
-        valid = (
-            math.isfinite(time)
-            and time > newest
-            and float(np.abs(field_B).sum()) < MAX_SENSOR_VALUE
-        )
-        if valid:
-            self._fields.append((time, field_B))
-        return valid
+        size = float(np.abs(field_B).sum())
+        if not (math.isfinite(time) and time > newest and size < MAX_SENSOR_VALUE):
+            return False
+        value = tuple(field_B.tolist())
+        if value != self._value:
+            self._value, self._since = value, time
+        if time - self._since > _MAX_REPEATED:
+            return False
+        self._fields.append((time, field_B))
+        return True
 
     def at(self, time: float) -> FloatArray | None:
         """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""

@@ -97,6 +97,9 @@ GAPS_LISTED = 100
 LATE_NOTE_SECONDS = 0.5
 """Duration of consecutive late samples beyond which the health report notes them [s]."""
 
+FIELD_DROPS_NOTED = 50
+"""Number of dropped magnetic fields beyond which the health report notes them."""
+
 UNFAMILIAR_SHARE = 0.3
 """Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
 
@@ -115,7 +118,7 @@ class SampleCounts:
         future: dropped: the time is ahead of later samples.
         spike: used, but replaced because they differ too much from their neighbours.
         saturated: used, but at the sensor's limit.
-        field_dropped: magnetic fields dropped: a value or a time is wrong.
+        field_dropped: magnetic fields dropped: a value or a time is wrong, or the sensor stopped.
         gap_count: stretches without samples longer than `MAX_IMU_GAP`.
         longest_gap: length of the longest [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED`.
@@ -169,6 +172,11 @@ class SampleCounts:
             notes.append(
                 f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
                 "from a clock that was set back; if so, that time is missing and no sigma covers it"
+            )
+        if self.field_dropped > FIELD_DROPS_NOTED:
+            notes.append(
+                f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "
+                "value, or their times or values are wrong"
             )
         if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
             share = self.unfamiliar / self.windows

@@ -20,7 +20,7 @@ from stario.fusion.filter.jacobians import (
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.cutting import split_at
 from stario.fusion.imu.front_end import cut_recording
-from stario.fusion.lie import yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
@@ -279,6 +279,26 @@ def test_positions_too_close_together_do_not_turn_the_map_frame(
     fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
     track = Navigator(model, CONFIG).run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_one_position_leaves_the_direction_in_the_map_unknown(
+    walk: ImuSequence, model: Any, backend: Any
+) -> None:
+    """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
+    fix = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE)
+    track = Navigator(model, CONFIG, backend=backend).run(walk, fixes=[fix])
+    streamed = Navigator(model, CONFIG, backend=backend)
+    apply_fix(streamed, fix)
+    end = support.stream(streamed, walk)[-1]
+    arm = np.linalg.norm((track.trajectory.position_W - fix.value)[:, :2], axis=1)
+    sigma = np.sqrt(track.covariance[:, 6, 6] + track.covariance[:, 7, 7])
+    assert (sigma > 0.9 * arm).all()
+    assert sigma[np.argmin(arm)] < 0.5
+    assert np.sqrt(track.covariance[-1, 2, 2]) == pytest.approx(UNKNOWN_YAW, rel=0.05)
+    assert end.map_frame == 1
+    np.testing.assert_allclose(np.sqrt(end.covariance[2, 2]), UNKNOWN_YAW, rtol=0.05)
+    assert streamed.health.final_sigma["yaw_rad"] > 1.5
 
 
 def test_states_of_a_stream_carry_the_number_of_their_map_frame(

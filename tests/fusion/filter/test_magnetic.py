@@ -209,6 +209,30 @@ def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
     )
 
 
+@pytest.mark.parametrize("fault", ["axes swapped", "axis mirrored", "stopped"])
+def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
+    biased_walk: ImuSequence, make_oracle: Make, fault: str
+) -> None:
+    field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
+    if fault == "axes swapped":
+        field = field[:, [1, 0, 2]]
+    elif fault == "axis mirrored":
+        field[:, 0] *= -1.0
+    else:
+        field[time > 40.0] = field[np.searchsorted(time, 40.0)]
+    wrong = replace(biased_walk, magnetometer=Magnetometer(time, field))
+    oracle = make_oracle(biased_walk, biased_walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    track = Navigator(oracle, CONFIG).run(wrong)
+    bias_error = abs(track.b_g[-1, 2] - 0.006)
+    assert bias_error < 3.0 * np.sqrt(track.covariance[-1, 11, 11])
+    if fault == "stopped":
+        assert any("magnetic fields were dropped" in note for note in track.health.notes)
+    else:
+        assert track.health.bearings["contradicts the gyroscope"] > 0.7 * 2 * 120
+    right = Navigator(oracle, CONFIG).run(biased_walk)
+    assert "contradicts the gyroscope" not in right.health.bearings
+
+
 def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):

@@ -15,11 +15,17 @@ from stario.sequences.sequence import ImuSequence, Magnetometer
 FIELD_B = np.array([20.0, 0.0, -40.0])
 
 
+def noisy(k: int) -> np.ndarray:
+    """Sample k of a sensor whose last digit changes."""
+    return FIELD_B + 0.1 * (k % 2)
+
+
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
     sequence = simulate_imu(generate_walk(3, 20.0), 100.0, PHONE_IMU, 3)
     time = sequence.time[::4]
-    return replace(sequence, magnetometer=Magnetometer(time, np.tile(FIELD_B, (len(time), 1))))
+    field = np.array([noisy(k) for k in range(len(time))])
+    return replace(sequence, magnetometer=Magnetometer(time, field))
 
 
 def count_with_field(sequence: ImuSequence) -> int:
@@ -38,7 +44,7 @@ def test_a_wild_field_time_costs_one_field(wild: float) -> None:
     buffer = FieldBuffer()
     for k in range(200):
         time = 0.02 * k
-        buffer.add(time + wild if k == 100 else time, FIELD_B, now=time)
+        buffer.add(time + wild if k == 100 else time, noisy(k), now=time)
         if k != 100:
             assert buffer.at(time) is not None
 
@@ -57,7 +63,7 @@ def test_fields_may_arrive_seconds_before_their_samples() -> None:
     buffer = FieldBuffer()
     for batch in range(5):
         for k in range(60):
-            assert buffer.add(3.0 * batch + 0.05 * k, FIELD_B, now=3.0 * batch - 0.01)
+            assert buffer.add(3.0 * batch + 0.05 * k, noisy(k), now=3.0 * batch - 0.01)
         assert buffer.at(3.0 * batch + 0.12) is not None
 
 
@@ -67,3 +73,10 @@ def test_a_field_too_late_for_any_interval_is_refused() -> None:
     assert buffer.at(1.5) is None
     assert not buffer.add(1.3, FIELD_B, 1.5)
     assert buffer.add(1.45, FIELD_B, 1.5)
+
+
+def test_a_sensor_that_repeats_its_value_has_stopped() -> None:
+    buffer = FieldBuffer()
+    used = [buffer.add(0.1 * k, FIELD_B, now=0.1 * k) for k in range(20)]
+    assert used == [True] * 6 + [False] * 14  # slow sensors are logged several times
+    assert buffer.add(2.0, noisy(1), now=2.0)
