@@ -11,8 +11,8 @@ much these vary along the path indicates how far the azimuth wanders there. A fi
 or dip for the place has less weight, as does one that the device has extrapolated by its own
 gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. While
 the field does not rotate against the device as the gyroscope does (other axes, a magnet attached),
-it is not used. If a declination is given, and only then, the field
-determines north once, as a fix of yaw.
+it is not used. If a declination is given, and only then, the field determines north once, as a fix
+of yaw.
 
 The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
 """
@@ -96,7 +96,7 @@ magnets the medians of OxIOD, RIDI, KIPD and tyrex are 0.02 to 0.6, except for t
 hardly rotate on the body."""
 
 _ROTATION_MEMORY, _MIN_ROTATIONS = 0.9, 5
-"""Weight of earlier rotations relative to the next one, and number of rotations before a verdict."""
+"""Weight of earlier rotations relative to the next one, and their number before a verdict."""
 
 _MIN_SPEED = 0.3
 """Speed below which the spread is not updated [m/s]: in one spot the field hardly varies."""
