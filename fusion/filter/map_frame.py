@@ -53,6 +53,9 @@ _OUTLIERS_IN_A_ROW, _SAME_DIRECTION = 3, 0.8
 and the track is wrong. If the distances of as many positions in a row from the pivot differ from
 the track's, the pivot was wrong."""
 
+_POSITIONS_APART = 5
+"""If the track jumps again within this many positions, its direction is wrong too."""
+
 _SIGMA_RATIO = 2.0
 """A position whose sigma is smaller by this factor than that of the one that placed the track
 places it again."""
@@ -84,6 +87,7 @@ class MapFrameState:
             applied once the frame is oriented.
         jumps: number of times that the track, not the positions, proved to be wrong.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
+        since_jump: number of positions since the last jump.
         arbitrary_yaw: whether the track still has the yaw zero with which it began without a pose;
             its covariance does not know that this is not the map's.
     """
@@ -101,6 +105,7 @@ class MapFrameState:
     jumps: int = 0
     yaw_variance: float = 0.0
     arbitrary_yaw: bool = False
+    since_jump: float = math.inf
 
     @property
     def undirected(self) -> tuple[FrameTransform, ...]:
@@ -272,6 +277,7 @@ class MapFrame:
     def _update_position(self, ekf: StateCloningEkf, fix: Fix, gate: float) -> UpdateResult:
         """Update with a position; inflate an outlier, but move the track after similar ones."""
         before = ekf.state
+        self.state = changed(self.state, since_jump=self.state.since_jump + 1)
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
         residual = result.residual
         if residual is None or not is_gated(result):
@@ -285,9 +291,31 @@ class MapFrame:
         self.state = changed(self.state, outlier_residuals=(*aligned, residual))
         if len(self.state.outlier_residuals) < _OUTLIERS_IN_A_ROW:
             return result
-        self.state = changed(self.state, outlier_residuals=(), jumps=self.state.jumps + 1)
+        repeated = self.state.since_jump <= _POSITIONS_APART
+        self.state = changed(
+            self.state, outlier_residuals=(), jumps=self.state.jumps + 1, since_jump=0
+        )
         ekf.state = before.with_position_inflated(float(norm(residual)))
-        return ekf.update_position_W(fix.value, fix.covariance, gate)
+        result = ekf.update_position_W(fix.value, fix.covariance, gate)
+        if repeated and self.state.oriented:
+            self._reopen_direction(ekf, fix)
+        return result
+
+    def _reopen_direction(self, ekf: StateCloningEkf, fix: Fix) -> None:
+        """Let later fixes turn the track from here on: its direction has proved to be wrong."""
+        self.state = changed(
+            self.state,
+            oriented=False,
+            pivot=fix.value,
+            since=fix.time,
+            pivot_variance=float(np.trace(fix.covariance[:2, :2])),
+            alignment=PlanarAlignment(),
+            distance_mismatches=0,
+            yaw_variance=float(_nav_state(ekf).covariance[2, 2]),
+            arbitrary_yaw=True,
+            since_jump=math.inf,
+        )
+        self._add_to_alignment(ekf, fix)
 
 
 def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:

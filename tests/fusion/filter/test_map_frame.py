@@ -175,6 +175,27 @@ def test_a_wrong_first_position_does_not_turn_the_track(
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_positions_undo_a_yaw_that_pointed_backwards(
+    make_walk: Make, make_oracle: Make, backend: Any
+) -> None:
+    walk = make_walk(3, 60.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi
+    right = [position_fix(t, true_at(walk, t), 0.09 * np.eye(3)) for t in np.arange(5.0, 58.0, 1.0)]
+    track = Navigator(oracle, CONFIG, backend=backend).run(
+        walk, fixes=[yaw_fix(4.0, wrong, 0.1), *right]
+    )
+    late = track.time > 40.0
+    truth = walk.truth.at(track.time[late])
+    turned = yaw_of(track.trajectory.attitude_WB[late] * truth.attitude_WB.inv())
+    sigma = np.sqrt(track.covariance[late, 2, 2])
+    assert (np.abs(turned) < np.maximum(3.0 * sigma, 0.1)).all()
+    assert sigma.max() < 0.3
+    error = np.linalg.norm(track.trajectory.position_W[late] - truth.position_W, axis=1)
+    assert error.max() < 1.0
+
+
 def test_more_accurate_positions_move_a_stationary_track(still_model: Any) -> None:
     time = np.arange(0.0, 20.0, 0.01)
     still = ImuSequence(
