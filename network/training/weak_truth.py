@@ -191,12 +191,12 @@ def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     kind = streams[0].kind
     interval = float(np.median(np.concatenate([s.stop - s.start for s in streams])))
     longest = max(len(stream) for stream in streams) / WINDOW_RATE
-    return InputError(
-        kind,
-        f"one every {interval:.1f} s in stretches of up to {longest:.0f} s",
-        f"two legs within {seconds} s",
-        f"set `{_SECONDS[kind]}` in the recipe to about {math.ceil(2.0 * interval) + 1}",
-    )
+    needed = math.ceil(2.0 * interval) + 1
+    fix = f"set `{_SECONDS[kind]}` in the recipe to about {needed}"
+    if needed > longest:
+        fix = "use longer recordings; `--validation` names those to validate on"
+    found = f"one every {interval:.1f} s in stretches of up to {longest:.0f} s"
+    return InputError(kind, found, f"two legs within {seconds} s", fix)
 
 
 def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:

@@ -309,6 +309,13 @@ def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> 
     assert int(sampler_of(legs, 51).batch(4).known.sum()) == 8
 
 
+def test_a_recording_shorter_than_two_legs_is_not_told_to_change_the_recipe() -> None:
+    legs = leg_streams(with_positions("waypoints", 25.0))
+    short = [stream.part(0, 30 * 200) for stream in legs]
+    with pytest.raises(InputError, match="use longer recordings; `--validation`"):
+        sampler_of(short, 20)
+
+
 def test_validation_skips_legs_without_information(caplog: pytest.LogCaptureFixture) -> None:
     """Their error would be 0, the best possible."""
     held_out = ValidationSet(
