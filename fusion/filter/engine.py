@@ -2,7 +2,7 @@
 
 filterpy multiplies full-size matrices. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
-`benchmark.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never modified in
+`speed.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never modified in
 place, so a reference to an earlier one can be restored. README.md, "Gates".
 """
 
