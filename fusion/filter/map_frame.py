@@ -29,9 +29,14 @@ from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.filter.innovations import is_gated
 from stario.fusion.filter.network_turn import with_turn
-from stario.fusion.filter.planar_alignment import PlanarAlignment
+from stario.fusion.filter.planar_alignment import (
+    PlanarAlignment,
+    plane_sigma,
+    turn_from_fix,
+    without_yaw,
+)
 from stario.fusion.fixes import Fix
-from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.attitude.so3 import exp_so3
@@ -189,7 +194,7 @@ class MapFrame:
             return True
         now, pivot = _nav_state(ekf), self.state.pivot
         fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-        differs = abs(fix_distance - track_distance) > 3.0 * _plane_sigma(
+        differs = abs(fix_distance - track_distance) > 3.0 * plane_sigma(
             now, 6, fix
         ) + _LENGTH_TOLERANCE * min(fix_distance, track_distance)
         self.state = changed(
@@ -220,7 +225,7 @@ class MapFrame:
         """Turn the frame to a fix; return None if the fix does not determine the direction."""
         pivot, since = self.state.pivot, self.state.since
         now = _nav_state(ekf)
-        turn, sigma = _turn_from_fix(now, pivot, fix)
+        turn, sigma = turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself then measures the turn
         max_sigma = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
         if not (math.isfinite(turn) and sigma <= max_sigma):
@@ -251,7 +256,7 @@ class MapFrame:
         now, pivot = _nav_state(ekf), self.state.pivot
         track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
-        drift = 0.5 * float(np.trace(_without_yaw(now.covariance, 6)))
+        drift = 0.5 * float(np.trace(without_yaw(now.covariance, 6)))
         alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
 
@@ -328,28 +333,3 @@ def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameT
 
 def _nav_state(ekf: StateCloningEkf) -> NavState:
     return nav_states([ekf.state.estimate()])[0]
-
-
-def _turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
-    """Return the frame's turn about the pivot according to a fix, and its sigma [rad]."""
-    if fix.kind == "yaw":
-        turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
-        return turn, math.sqrt(fix.covariance[0, 0])
-    first, measured, estimated = 3, fix.value, state.v_W
-    if fix.kind == "position":
-        first, measured, estimated = 6, fix.value - pivot, state.p_W - pivot
-    arm = min(math.hypot(measured[0], measured[1]), math.hypot(estimated[0], estimated[1]))
-    turn = math.atan2(measured[1], measured[0]) - math.atan2(estimated[1], estimated[0])
-    return turn, _plane_sigma(state, first, fix) / arm if arm > 0.0 else math.inf
-
-
-def _plane_sigma(state: NavState, first: int, fix: Fix) -> float:
-    """Return the largest horizontal sigma of a fix minus two rows of the state, without yaw."""
-    P = _without_yaw(state.covariance, first) + fix.covariance[:2, :2]
-    return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
-
-
-def _without_yaw(P: FloatArray, first: int) -> FloatArray:
-    """Return the covariance (2, 2) of two rows without yaw's part, which the fixes determine."""
-    by_yaw = P[first : first + 2, 2]
-    return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])

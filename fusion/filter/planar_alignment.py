@@ -1,4 +1,4 @@
-"""Direction of a track from several position fixes together, while it is still unknown.
+"""Direction of a track from one fix, or from several position fixes together.
 
 A single position far enough from the first determines the direction. In a room none is, but several
 suffice: with track t_k and fixes f_k as complex numbers, each of variance s_k^2 per axis (that of
@@ -16,6 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stario.fusion.fixes import Fix
+from stario.fusion.lie import yaw_twist
+from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
 
@@ -61,3 +64,28 @@ class PlanarAlignment:
         # Noise inflates both the fixes' and the track's spread: use the smaller.
         modulus = min(math.hypot(along, across), size - (a * a + b * b) / weight)
         return math.atan2(across, along), 1.0 / math.sqrt(modulus) if modulus > 0.0 else math.inf
+
+
+def turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, float]:
+    """Return the frame's turn about the pivot according to a fix, and its sigma [rad]."""
+    if fix.kind == "yaw":
+        turn = math.remainder(float(fix.value[0]) - yaw_twist(state.R_WB), 2.0 * math.pi)
+        return turn, math.sqrt(fix.covariance[0, 0])
+    first, measured, estimated = 3, fix.value, state.v_W
+    if fix.kind == "position":
+        first, measured, estimated = 6, fix.value - pivot, state.p_W - pivot
+    arm = min(math.hypot(measured[0], measured[1]), math.hypot(estimated[0], estimated[1]))
+    turn = math.atan2(measured[1], measured[0]) - math.atan2(estimated[1], estimated[0])
+    return turn, plane_sigma(state, first, fix) / arm if arm > 0.0 else math.inf
+
+
+def plane_sigma(state: NavState, first: int, fix: Fix) -> float:
+    """Return the largest horizontal sigma of a fix minus two rows of the state, without yaw."""
+    P = without_yaw(state.covariance, first) + fix.covariance[:2, :2]
+    return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
+
+
+def without_yaw(P: FloatArray, first: int) -> FloatArray:
+    """Return the covariance (2, 2) of two rows without yaw's part, which the fixes determine."""
+    by_yaw = P[first : first + 2, 2]
+    return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])
