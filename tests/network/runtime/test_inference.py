@@ -156,9 +156,3 @@ def test_speed_of_both_forms_is_measured_for_each_batch() -> None:
     for speed in speeds:
         assert 0.0 < speed.inference_form_least <= speed.inference_form
         assert 0.0 < speed.training_form_least <= speed.training_form
-
-
-@pytest.mark.slow
-def test_the_inference_form_is_faster() -> None:
-    for speed in network_speed(randomised_network(), runs=10):
-        assert speed.inference_form_least < speed.training_form_least
