@@ -93,8 +93,8 @@ class MapFrameState:
         jumps: number of times that the track, not the positions, proved to be wrong.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
         since_jump: number of positions since the last jump.
-        arbitrary_yaw: whether the track still has the yaw zero with which it began without a pose;
-            its covariance does not know that this is not the map's.
+        arbitrary_yaw: whether the track's covariance does not know that its yaw is not the map's:
+            that of the start, zero without a pose, or one that has proved to be wrong.
     """
 
     placed: bool
@@ -209,17 +209,21 @@ class MapFrame:
         variance = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
         sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
         ekf.state = ekf.state.with_position_inflated(sigma)
+        self.state = changed(self.state, placed=True)
+        self._begin_alignment(ekf, fix)
+        return transform
+
+    def _begin_alignment(self, ekf: StateCloningEkf, fix: Fix) -> None:
+        """Take a position as the pivot about which later fixes turn the track."""
         self.state = changed(
             self.state,
-            placed=True,
             pivot=fix.value,
             pivot_variance=float(np.trace(fix.covariance[:2, :2])),
             alignment=PlanarAlignment(),
             distance_mismatches=0,
-            yaw_variance=float(now.covariance[2, 2]),
+            yaw_variance=float(_nav_state(ekf).covariance[2, 2]),
         )
         self._add_to_alignment(ekf, fix)
-        return transform
 
     def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
         """Turn the frame to a fix; return None if the fix does not determine the direction."""
@@ -309,18 +313,9 @@ class MapFrame:
     def _reopen_direction(self, ekf: StateCloningEkf, fix: Fix) -> None:
         """Let later fixes turn the track from here on: its direction has proved to be wrong."""
         self.state = changed(
-            self.state,
-            oriented=False,
-            pivot=fix.value,
-            since=fix.time,
-            pivot_variance=float(np.trace(fix.covariance[:2, :2])),
-            alignment=PlanarAlignment(),
-            distance_mismatches=0,
-            yaw_variance=float(_nav_state(ekf).covariance[2, 2]),
-            arbitrary_yaw=True,
-            since_jump=math.inf,
+            self.state, oriented=False, since=fix.time, arbitrary_yaw=True, since_jump=math.inf
         )
-        self._add_to_alignment(ekf, fix)
+        self._begin_alignment(ekf, fix)
 
 
 def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
