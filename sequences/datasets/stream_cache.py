@@ -48,6 +48,8 @@ Stream = WorldStream | LegStream
 _POSES = "poses"
 _SUFFIX = ".streams"
 _ABANDONED_S = 3600.0
+_OPEN_FILES = 10_240
+"""Number of open files to ask for where a system states no limit; macOS allows no more."""
 
 
 def cache_folder() -> Path:
@@ -75,6 +77,7 @@ def recorded(
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
         attitude: as for `world_streams`.
     """
+    _allow_many_files()
     work = partial(_stored, read=read, options=dict(options), folder=folder, attitude=attitude)
     for path, outcome in zip(paths, each(work, paths, jobs), strict=True):
         # Worker processes return the name of a cache file rather than its content.
@@ -85,6 +88,19 @@ def recorded(
             except StarioError as error:
                 streams = Skipped(str(path), str(error))
         yield streams
+
+
+def _allow_many_files() -> None:
+    """Raise the number of files that may be open: each recording keeps one, systems allow 1,024."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _OPEN_FILES if hard == resource.RLIM_INFINITY else hard
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def cached(

@@ -91,6 +91,21 @@ def test_a_cached_recording_keeps_a_single_file_open(recording: Path, tmp_path: 
     assert len({id(map_of(array)) for s in streams for array in (s.imu_W, s.position_W)}) == 1
 
 
+def test_more_recordings_are_mapped_than_a_process_may_open_files(
+    recording: Path, tmp_path: Path
+) -> None:
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.dup(0)  # descriptors are numbered from below
+    os.close(lowest)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest + 20, limits[1]))
+    try:
+        kept = [streams_of(recording, tmp_path / "cache", Reader(), number=k) for k in range(24)]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert all(is_mapped(s.imu_W) for streams in kept for s in streams)
+
+
 def test_changed_content_options_or_code_change_the_key(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
