@@ -24,12 +24,16 @@ def simulate(
         ),
     ] = "random",
     imu: Annotated[str, typer.Option(help="Sensor model: phone, good or perfect.")] = "phone",
+    magnetometer: Annotated[
+        bool, typer.Option("--magnetometer", help="Also simulate a magnetometer inside a building.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Write a simulated walk with its ground truth as a CSV recording."""
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
+    from stario.sequences.simulation.magnetometer import INDOOR_FIELD
     from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
@@ -40,7 +44,8 @@ def simulate(
         raise InputError("--carry", repr(carry), f"one of {', '.join(modes)}")
     style = None if carry == "random" else WalkStyle(carry=carry)
     walk = generate_walk(seed, seconds, style=style)
-    sequence = simulate_imu(walk, rate, sensors[imu], seed, name=path.stem)
+    field = INDOOR_FIELD if magnetometer else None
+    sequence = simulate_imu(walk, rate, sensors[imu], seed, name=path.stem, magnetic_field=field)
     write_csv(path, sequence)
     figures = {
         "path": str(path),

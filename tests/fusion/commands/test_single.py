@@ -111,6 +111,18 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
 
 
+def test_simulated_magnetometer_leaves_the_imu_as_it_is(stario, tmp_path: Path) -> None:
+    walk = ("--seconds", 5, "--rate", 50, "--seed", 7)
+    stario("simulate", "without.csv", *walk)
+    stario("simulate", "with.csv", *walk, "--magnetometer")
+    without, with_field = (read_generic_csv(tmp_path / f) for f in ("without.csv", "with.csv"))
+    assert without.magnetometer is None
+    assert with_field.magnetometer is not None
+    size = np.linalg.norm(with_field.magnetometer.field, axis=1)
+    assert 25.0 < np.median(size) < 65.0  # uT: the earth's field, disturbed indoors
+    np.testing.assert_array_equal(without.gyro, with_field.gyro)
+
+
 def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
