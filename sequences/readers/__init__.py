@@ -171,14 +171,16 @@ def find_recordings(
             each attribute, one of which must match, `{"person": ["dan", "ha*"]}`.
 
     Raises:
-        ReadError: the path does not exist, a folder holds no recording, no recording has the
-            attributes, or a list entry is invalid.
+        ReadError: the path does not exist, a folder or archive holds no recording, no recording has
+            the attributes, or a list entry is invalid.
     """
     path = Path(path)
     if not split_name(path)[0].exists():
         raise ReadError(path, "path", "no such file or folder", "a recording or a folder of them")
     if is_archive(path):
-        return archive_members(path, where)
+        if members := archive_members(path, where):
+            return members
+        raise ReadError(path, "imu/t", "none in the whole archive", "recordings with IMU samples")
     if _is_recording(path):
         return _with_attributes([path], where)
     if is_list(path):

@@ -70,6 +70,15 @@ def test_an_unknown_attribute_value_is_refused_with_the_known_ones(tmp_path: Pat
         find_recordings(path, where={"person": ["eve"]})
 
 
+def test_an_archive_of_poses_alone_is_refused(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with h5py.File(path, "a") as file:
+        for group in file.values():
+            del group["imu"]
+    with pytest.raises(ReadError, match="imu/t: found none in the whole archive"):
+        find_recordings(path)
+
+
 def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     path = _archive(tmp_path / "walks.h5")
     with pytest.raises(ReadError, match="'d', expected a name in it, such as a, b, c"):
