@@ -115,7 +115,7 @@ class Session:
         fields = [*self._unwritten[1], *self._merger.fields()]
         self._unwritten = samples, fields
         if self._file is None:
-            self._file = LiveFile(self._folder, self.device, self._merger.magnetic)
+            self._file = LiveFile(self._folder, self.device)
             self._first_ns = samples[0][0]
         self._file.append(samples, received, fields)
         self._unwritten = [], []
