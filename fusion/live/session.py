@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -236,7 +236,10 @@ class Session:
         if time - self._health_time < _HEALTH_SECONDS:
             return
         self._health_time = time
-        self.words = [asdict(finding) for finding in findings(self._navigator.health)]
+        health, late = self._navigator.health, self._dropped().get("late", 0)
+        # The navigator never sees them; if the clock was set back a little, it sees no gap either.
+        health = replace(health, samples=health.samples | {"late": late})
+        self.words = [asdict(finding) for finding in findings(health)]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""

@@ -58,6 +58,7 @@ def test_a_push_that_comes_much_too_late_does_not_begin_a_new_track(session, pus
     take(session, [*bodies[:60], delayed, *bodies[60:]])
     assert session.samples == len(walk) - 20
     assert session.status()["dropped"] == {"late": 40}
+    assert any("dropped (40 late)" in word["text"] for word in session.status()["health"])
     assert len(list(session.path.parent.glob("*.csv"))) == 1
 
 
