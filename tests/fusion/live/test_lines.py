@@ -193,3 +193,14 @@ def test_a_cleared_experiment_is_followed_from_its_new_start():
     assert len(phone._readings("gyro", answer([1.0, 2.0, 3.0]))) == 3
     assert len(phone._readings("gyro", answer([3.0, 4.0]))) == 1
     assert len(phone._readings("gyro", answer([0.1, 0.2]))) == 2
+
+
+def test_a_paused_experiment_continues_as_another_recording(monkeypatch):
+    """Its time does not count the pause, so the same track would miss what happened meanwhile."""
+    phone, recordings = Phyphox("phone:8080"), []
+    for measuring in (False, True, True, False, False, True, True):
+        answer = {"buffer": {}, "status": {"session": "abc", "measuring": measuring}}
+        monkeypatch.setattr(phone, "_get", lambda path, a=answer: CONFIG if "config" in path else a)
+        recordings.append(phone.fetch().recording)
+    assert len(set(recordings[1:5])) == len(set(recordings[5:])) == 1
+    assert recordings[4] != recordings[5]
