@@ -99,6 +99,8 @@ class Session:
         return sum(self._process(*each) for each in self._order.ready(now))
 
     def _process(self, batch: Batch, received: float) -> int:
+        if not batch.readings:
+            return 0
         if self._is_new(batch):
             self._previous, self._opened_ns = self._recording, _middle(batch)
             self._begin(batch.recording)
@@ -203,7 +205,7 @@ class Session:
 
     def _is_new(self, batch: Batch) -> bool:
         """Return whether a batch belongs to a different recording than those before."""
-        if self._newest_ns < 0 or not batch.readings:
+        if self._newest_ns < 0:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
             return True

@@ -84,3 +84,11 @@ def test_what_waits_is_processed_when_the_track_ends(session, pushes):
     assert session.samples == 360
     session.stop()
     assert session.samples == 380
+
+
+def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, pushes):
+    empty = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
+    second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=4.0)[1:]
+    take(session, [*pushes(seconds=3.0), empty, *second])
+    assert session.samples == 380
+    assert len(list(session.path.parent.glob("*.csv"))) == 2
