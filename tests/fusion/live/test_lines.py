@@ -161,6 +161,16 @@ def test_a_stopping_server_closes_the_connections_of_its_viewers(serve, caplog):
     assert caplog.records == []
 
 
+def test_a_server_stops_quietly_while_a_device_is_connected(serve, walk, caplog):
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.lines_port)) as device:
+        device.sendall(b"".join(lines_of(walk, 100, device="d")))
+        wait_for(lambda: samples(server, "d") == 100)
+        server.stop()
+        assert device.recv(10) == b""
+    assert caplog.records == []
+
+
 def test_only_loopback_needs_no_token(tmp_path, new_navigator):
     assert is_loopback("127.0.0.1")
     assert is_loopback("::1")
