@@ -98,8 +98,8 @@ class WindowBuffer:
         return Window(imu_N, blocks[0].R_NB, heading, any(block.flagged for block in blocks))
 
 
-_MAX_FIELDS = 64
-"""Maximum number of fields kept, more than arrive between two intervals."""
+_MAX_FIELDS = 1000
+"""Maximum number of fields that wait for their samples: ten seconds of a fast sensor."""
 
 _MAX_AHEAD = 1.0
 """A field further than this ahead of the newest sample [s] is dropped once an earlier one comes."""
@@ -128,6 +128,8 @@ class FieldBuffer:
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
         """Add a field; return False if its value or time cannot be right, or the sensor stopped.
 
+        It also returns False if too many fields wait, so that the first of them is dropped.
+
         Args:
             time: time of the field [s].
             field_B: (3,) magnetic field in B [uT].
@@ -150,12 +152,13 @@ class FieldBuffer:
             self._value, self._since = value, time
         if time - self._since > _MAX_REPEATED:
             return False
+        room = len(self._fields) < _MAX_FIELDS
         self._fields.append((time, field_B))
-        return True
+        return room
 
     def at(self, time: float) -> FloatArray | None:
         """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
         self._last_query = time
-        return next(
-            (m_B for t, m_B in reversed(self._fields) if time - _MAX_FIELD_AGE <= t <= time), None
-        )
+        while self._fields and self._fields[0][0] < time - _MAX_FIELD_AGE:
+            self._fields.popleft()
+        return next((m_B for t, m_B in reversed(self._fields) if t <= time), None)

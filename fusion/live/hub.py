@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -20,6 +21,8 @@ MAX_DEVICES = 16
 
 MAX_SENT = 3000
 """Maximum number of points of a device in one message, as to a new viewer."""
+
+_log = logging.getLogger(__name__)
 
 
 class Hub:
@@ -93,7 +96,10 @@ class Hub:
     def close(self) -> None:
         """Close all recordings."""
         for session in self.sessions.values():
-            session.close()
+            try:
+                session.close()
+            except (OSError, InputError) as error:  # of pushes that still waited
+                _log.error("%s: the end of its recording is lost: %s", session.device, error)
 
     def _session(self, device: str) -> Session:
         if device not in self.sessions:

@@ -76,6 +76,8 @@ class LineServer:
             await self._read(reader, writer, sender)
         except ConnectionError as error:
             _log.info("%s: %s", sender, error)
+        except asyncio.CancelledError:
+            pass  # the server stops; asyncio would report the task that ends so
         finally:
             self._connections -= 1
             writer.close()

@@ -106,11 +106,10 @@ class Merger:
     Attributes:
         upward: cosine between the specific force and the upward vertical of the device's own
             attitude; 0 if it sends none.
-        magnetic: whether the device has a magnetometer.
     """
 
     def __init__(self) -> None:
-        self.upward, self.magnetic = 0.0, False
+        self.upward = 0.0
         self._fields: list[Field] = []
         self._newest_field, self._field_late = -1, 0
         self._waiting: list[Reading] = []
@@ -160,7 +159,7 @@ class Merger:
 
     def _take(self, reading: Reading) -> None:
         sensor, time, value = reading.sensor, reading.time_ns, reading.value
-        if sensor == MAG and self.magnetic:
+        if sensor == MAG:
             if time > self._newest_field:
                 self._newest_field = time
                 self._fields.append((time, value))
@@ -190,7 +189,6 @@ class Merger:
             self._waiting = [r for r in self._waiting if newest - r.time_ns < MAX_WAIT]
             return False
         self._gyro, self._accel = gyro, accel
-        self.magnetic = any(reading.sensor == MAG for reading in self._waiting)
         self.upward = _cosine(
             _mean(r.value for r in self._waiting if r.sensor == ORIENTATION),
             *(_mean(r.value for r in self._waiting if r.sensor == name) for name in accel),

@@ -74,11 +74,13 @@ class Batch:
         device: name of the device.
         recording: the device's name for the recording; empty if it gives none.
         readings: readings in order of arrival.
+        number: place of a push among those of its recording; -1 if it gives none.
     """
 
     device: str
     recording: str
     readings: list[Reading]
+    number: int = -1
 
 
 def parse_push(body: bytes) -> Batch:
@@ -105,7 +107,10 @@ def parse_push(body: bytes) -> Batch:
     if times and max(times) - min(times) > MAX_SPAN:
         found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
         raise InputError("payload", found, f"at most {MAX_SPAN / 1e9:g} s in one push")
-    return Batch(device, recording, readings)
+    number = message.get("messageId")
+    if not recording or type(number) is not int:
+        number = -1
+    return Batch(device, recording, readings, number)
 
 
 def parse_line(line: bytes, sender: str) -> Batch:
@@ -137,10 +142,11 @@ def parse_line(line: bytes, sender: str) -> Batch:
 
 
 def joined(batches: Iterable[Batch]) -> list[Batch]:
-    """Merge consecutive batches of the same device and recording."""
+    """Merge consecutive batches without numbers of the same device and recording."""
     merged: list[Batch] = []
     for batch in batches:
-        if merged and (merged[-1].device, merged[-1].recording) == (batch.device, batch.recording):
+        key = (batch.device, batch.recording, -1)
+        if merged and (merged[-1].device, merged[-1].recording, batch.number) == key:
             merged[-1].readings.extend(batch.readings)
         else:
             merged.append(batch)

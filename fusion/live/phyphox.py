@@ -64,6 +64,7 @@ class Phyphox:
         self._buffers: dict[str, tuple[str, str, str, str]] = {}
         self._newest: dict[str, float] = {}
         self._session = ""
+        self._pauses, self._measuring = 0, True
 
     def fetch(self) -> Batch:
         """Fetch the samples recorded since the last call.
@@ -85,7 +86,11 @@ class Phyphox:
                 self._buffers, self._newest = {}, {}
                 return Batch(self.device, session, [])
         readings = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
-        return Batch(self.device, session, readings)
+        measuring = status.get("measuring") is not False
+        if measuring and not self._measuring:
+            self._pauses += 1  # phyphox's time does not count it, so the track cannot continue
+        self._measuring = measuring
+        return Batch(self.device, f"{session} {self._pauses}", readings)
 
     def _query(self) -> list[str]:
         parts = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from stario.fusion.fixes import position_fix
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import Field, Merger, Sample
+from stario.fusion.live.ordering import PushOrder
 from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.navigator import Navigator
@@ -44,12 +45,20 @@ class Session:
         self._folder, self._new_navigator = folder, new_navigator
         self.drawn, self.received, self._factor = DisplayedTrack(), 0.0, 1.0
         self._file: LiveFile | None = None
-        self.start()
+        self._order = PushOrder()
+        self._previous, self._opened_ns = "", 0  # recording before this, start of this
+        self._begin()
 
-    def start(self, recording: str = "") -> None:
+    def start(self) -> None:
         """Start a new track and a new recording."""
         self.close()
-        self._recording, self._merger = recording, Merger()
+        self._order = PushOrder()  # pushes that came after `stop` are not missing
+        self._begin()
+
+    def _begin(self, recording: str = "") -> None:
+        if self._file is not None:
+            self._file.close()
+        self._recording, self._number, self._merger = recording, -1, Merger()
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
         self._health_time = -math.inf
@@ -57,7 +66,7 @@ class Session:
         self.problem = ""
         self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
-        self.samples = self.fixes = 0
+        self.samples = self.fixes = self._delayed = 0
         self.rate = 0.0
         self.running = True
 
@@ -67,7 +76,7 @@ class Session:
         return None if self._file is None else self._file.path
 
     def take(self, batch: Batch, received: float, accel_factor: float = 1.0) -> int:
-        """Write a batch to disk, then pass it to the navigator.
+        """Write a batch to disk, then pass it to the navigator, once its turn has come.
 
         Args:
             batch: batch of this device.
@@ -77,14 +86,28 @@ class Session:
         Returns:
             Number of samples processed.
         """
-        self.received = received
+        self.received, self._factor = received, accel_factor
         if not self.running:
             return 0
+        if self._is_of_previous(batch):
+            self._delayed += len(batch.readings)
+            return 0
+        self._order.add(batch, received)
+        return self._process_ready(received)
+
+    def _process_ready(self, now: float) -> int:
+        return sum(self._process(*each) for each in self._order.ready(now))
+
+    def _process(self, batch: Batch, received: float) -> int:
+        if not batch.readings:
+            return 0
         if self._is_new(batch):
-            self.start(batch.recording)
-        self._recording, self._factor = batch.recording, accel_factor
+            self._previous, self._opened_ns = self._recording, _middle(batch)
+            self._begin(batch.recording)
+        self._recording, self._number = batch.recording, max(self._number, batch.number)
+        factor = self._factor
         samples = [
-            (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
+            (time, gyro, (factor * a[0], factor * a[1], factor * a[2]))
             for time, gyro, a in self._merger.add(batch.readings)
         ]
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
@@ -94,7 +117,7 @@ class Session:
         fields = [*self._unwritten[1], *self._merger.fields()]
         self._unwritten = samples, fields
         if self._file is None:
-            self._file = LiveFile(self._folder, self.device, self._merger.magnetic)
+            self._file = LiveFile(self._folder, self.device)
             self._first_ns = samples[0][0]
         self._file.append(samples, received, fields)
         self._unwritten = [], []
@@ -110,6 +133,7 @@ class Session:
 
     def stop(self) -> None:
         """End the track; ignore data until `start`."""
+        self._process_ready(math.inf)
         self.running = False
 
     def zero(self) -> None:
@@ -142,9 +166,12 @@ class Session:
         self._update_health(after.time)
 
     def close(self) -> None:
-        """Close the recording."""
-        if self._file is not None:
-            self._file.close()
+        """Process what still waits, and close the recording."""
+        try:
+            self._process_ready(math.inf)
+        finally:
+            if self._file is not None:
+                self._file.close()
 
     def status(self) -> dict[str, Any]:
         """Return what the page shows next to the track."""
@@ -165,21 +192,32 @@ class Session:
             "received": self.received,
             "origin": self.drawn.origin.round(4).tolist(),
             "fixes": self.fixes,
-            "dropped": self._merger.dropped,
+            "dropped": self._dropped(),
             "file": None if self.path is None else self.path.name,
             "problem": problem,
             "health": self.words,
         }
 
+    def _dropped(self) -> dict[str, int]:
+        dropped = self._merger.dropped
+        late = dropped.get("late", 0) + self._delayed
+        return dropped | ({"late": late} if late else {})
+
     def _is_new(self, batch: Batch) -> bool:
         """Return whether a batch belongs to a different recording than those before."""
-        if self._newest_ns < 0 or not batch.readings:
+        if self._newest_ns < 0:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
             return True
-        times = sorted(reading.time_ns for reading in batch.readings)
-        jump = times[len(times) // 2] - self._newest_ns
-        return not -BACKWARD < jump < FORWARD
+        jump = _middle(batch) - self._newest_ns
+        delayed = 0 <= batch.number < self._number  # rather than after the clock was set back
+        return jump >= FORWARD or (jump <= -BACKWARD and not delayed)
+
+    def _is_of_previous(self, batch: Batch) -> bool:
+        """Return whether a batch is a delayed one of the recording before this."""
+        if batch.number < 0 or not batch.readings or batch.recording == self._recording:
+            return False
+        return batch.recording == self._previous and _middle(batch) < self._opened_ns
 
     def _push_field(self, time_ns: int, field: Vector) -> None:
         self._navigator.push_magnetometer((time_ns - self._first_ns) / 1e9, field)
@@ -200,7 +238,10 @@ class Session:
         if time - self._health_time < _HEALTH_SECONDS:
             return
         self._health_time = time
-        self.words = [asdict(finding) for finding in findings(self._navigator.health)]
+        health, late = self._navigator.health, self._dropped().get("late", 0)
+        # The navigator never sees them; if the clock was set back a little, it sees no gap either.
+        health = replace(health, samples=health.samples | {"late": late})
+        self.words = [asdict(finding) for finding in findings(health)]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""
@@ -217,3 +258,9 @@ class Session:
         if state is None:
             raise InputError(self.device, "no position yet", "a second of samples first")
         return state
+
+
+def _middle(batch: Batch) -> int:
+    """Return the median time of a batch that is not empty [ns]."""
+    times = sorted(reading.time_ns for reading in batch.readings)
+    return times[len(times) // 2]

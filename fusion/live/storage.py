@@ -20,10 +20,10 @@ from stario.fusion.live.merging import Field, Sample
 from stario.sequences.errors import InputError
 
 HEADER = (
-    "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],received [unix s]\n"
+    "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],"
+    "mx [uT],my [uT],mz [uT],received [unix s]\n"
 )
-MAGNETIC_HEADER = HEADER.replace("received", "mx [uT],my [uT],mz [uT],received")
-"""Header for a device with a magnetometer, whose readings have rows of their own."""
+"""Header; a magnetometer, which may start later, has rows of its own."""
 
 FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
@@ -34,7 +34,6 @@ class LiveFile:
     Args:
         folder: folder to write into; created if missing.
         device: part of the file's name.
-        magnetic: whether the file has columns for a magnetic field.
 
     Attributes:
         path: path of the recording.
@@ -44,7 +43,7 @@ class LiveFile:
         InputError: the folder or file cannot be created.
     """
 
-    def __init__(self, folder: Path, device: str, magnetic: bool = False) -> None:
+    def __init__(self, folder: Path, device: str) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self.path, self._file = _new_file(folder, device)
@@ -52,8 +51,7 @@ class LiveFile:
             found = f"{folder}: {error.strerror or error}"
             raise InputError("out", found, "a writable folder") from error
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
-        self._empty_columns = ",,,," if magnetic else ","
-        self._file.write((MAGNETIC_HEADER if magnetic else HEADER).encode())
+        self._file.write(HEADER.encode())
 
     def append(
         self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
@@ -66,7 +64,7 @@ class LiveFile:
         end = f"{received:.3f}\n"
         rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
         rows += [
-            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r}{self._empty_columns}{end}"
+            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},,,,{end}"
             for time, g, a in samples
         ]
         _write_whole(self._file, "".join(rows).encode())

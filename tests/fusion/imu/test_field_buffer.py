@@ -67,6 +67,15 @@ def test_fields_may_arrive_seconds_before_their_samples() -> None:
         assert buffer.at(3.0 * batch + 0.12) is not None
 
 
+def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted() -> None:
+    buffer = FieldBuffer()
+    kept = [buffer.add(0.01 * k, noisy(k), now=-0.01) for k in range(1200)]
+    assert kept == [True] * 1000 + [False] * 200
+    assert buffer.at(1.0) is None
+    assert all(buffer.at(0.1 * k + 0.001) is not None for k in range(21, 119))
+    assert len(buffer._fields) < 50
+
+
 def test_a_field_too_late_for_any_interval_is_refused() -> None:
     buffer = FieldBuffer()
     assert buffer.add(1.0, FIELD_B, 1.0)

@@ -161,6 +161,16 @@ def test_a_stopping_server_closes_the_connections_of_its_viewers(serve, caplog):
     assert caplog.records == []
 
 
+def test_a_server_stops_quietly_while_a_device_is_connected(serve, walk, caplog):
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.lines_port)) as device:
+        device.sendall(b"".join(lines_of(walk, 100, device="d")))
+        wait_for(lambda: samples(server, "d") == 100)
+        server.stop()
+        assert device.recv(10) == b""
+    assert caplog.records == []
+
+
 def test_only_loopback_needs_no_token(tmp_path, new_navigator):
     assert is_loopback("127.0.0.1")
     assert is_loopback("::1")
@@ -193,3 +203,14 @@ def test_a_cleared_experiment_is_followed_from_its_new_start():
     assert len(phone._readings("gyro", answer([1.0, 2.0, 3.0]))) == 3
     assert len(phone._readings("gyro", answer([3.0, 4.0]))) == 1
     assert len(phone._readings("gyro", answer([0.1, 0.2]))) == 2
+
+
+def test_a_paused_experiment_continues_as_another_recording(monkeypatch):
+    """Its time does not count the pause, so the same track would miss what happened meanwhile."""
+    phone, recordings = Phyphox("phone:8080"), []
+    for measuring in (False, True, True, False, False, True, True):
+        answer = {"buffer": {}, "status": {"session": "abc", "measuring": measuring}}
+        monkeypatch.setattr(phone, "_get", lambda path, a=answer: CONFIG if "config" in path else a)
+        recordings.append(phone.fetch().recording)
+    assert len(set(recordings[1:5])) == len(set(recordings[5:])) == 1
+    assert recordings[4] != recordings[5]
