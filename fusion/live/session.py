@@ -15,7 +15,7 @@ from stario.fusion.fixes import position_fix
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import Field, Merger, Sample
 from stario.fusion.live.ordering import PushOrder
-from stario.fusion.live.payload import Batch, Vector
+from stario.fusion.live.payload import Batch, Reading, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import findings
@@ -24,6 +24,10 @@ from stario.sequences.errors import InputError
 
 BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
 """A jump of the device's clock beyond these [ns] starts a new track."""
+
+_STRAY_SHARE = 0.1
+"""Maximum share of a batch's readings whose times, `BACKWARD` or more from the batch's middle, are
+taken to be wrong; more are a backlog."""
 
 _HEALTH_SECONDS = 1.0
 
@@ -66,7 +70,7 @@ class Session:
         self.problem = ""
         self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
-        self.samples = self.fixes = self._delayed = 0
+        self.samples = self.fixes = self._delayed = self._stray = 0
         self.rate = 0.0
         self.running = True
 
@@ -105,10 +109,11 @@ class Session:
             self._previous, self._opened_ns = self._recording, _middle(batch)
             self._begin(batch.recording)
         self._recording, self._number = batch.recording, max(self._number, batch.number)
-        factor = self._factor
+        factor, readings = self._factor, _with_credible_time(batch)
+        self._stray += len(batch.readings) - len(readings)
         samples = [
             (time, gyro, (factor * a[0], factor * a[1], factor * a[2]))
-            for time, gyro, a in self._merger.add(batch.readings)
+            for time, gyro, a in self._merger.add(readings)
         ]
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
         samples = [*self._unwritten[0], *samples]
@@ -201,7 +206,8 @@ class Session:
     def _dropped(self) -> dict[str, int]:
         dropped = self._merger.dropped
         late = dropped.get("late", 0) + self._delayed
-        return dropped | ({"late": late} if late else {})
+        counts = dropped | {"late": late, "wrong time": self._stray}
+        return {reason: count for reason, count in counts.items() if count}
 
     def _is_new(self, batch: Batch) -> bool:
         """Return whether a batch belongs to a different recording than those before."""
@@ -258,6 +264,14 @@ class Session:
         if state is None:
             raise InputError(self.device, "no position yet", "a second of samples first")
         return state
+
+
+def _with_credible_time(batch: Batch) -> list[Reading]:
+    """Return the readings without single ones far from the rest, which would seem to be newest."""
+    middle = _middle(batch)
+    near = [reading for reading in batch.readings if abs(reading.time_ns - middle) < BACKWARD]
+    stray = len(batch.readings) - len(near)
+    return near if stray <= _STRAY_SHARE * len(batch.readings) else batch.readings
 
 
 def _middle(batch: Batch) -> int:

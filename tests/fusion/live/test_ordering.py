@@ -1,6 +1,7 @@
 """Pushes that overtake one another, are repeated or come late do no harm to the track."""
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -92,3 +93,15 @@ def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, 
     take(session, [*pushes(seconds=3.0), empty, *second])
     assert session.samples == 380
     assert len(list(session.path.parent.glob("*.csv"))) == 2
+
+
+@pytest.mark.parametrize("seconds", [30, -30, 500])
+def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, walk, seconds):
+    bodies = [parse_push(body) for body in pushes()]
+    readings = bodies[20].readings
+    readings[3] = replace(readings[3], time_ns=readings[3].time_ns + seconds * 10**9)
+    for k, batch in enumerate(bodies):
+        session.take(batch, 0.2 * k)
+    assert session.status()["dropped"] == {"wrong time": 1}
+    assert len(walk) - 2 <= session.samples <= len(walk)
+    assert session.drawn.revision == 1  # still the first track
