@@ -124,7 +124,9 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
 _FULL_COVERAGE = 0.98
 """Share of a track below which the coverage by ground truth is reported as partial."""
 
-_EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+_EXPLAINED = (
+    *("ate_m", "horizontal", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis"),
+)
 """Metrics explained below a table."""
 
 

@@ -246,6 +246,7 @@ def test_summary_has_median_and_mean_over_recordings(
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
     fitted = compared.metrics["ekf"]["ate_fit_m"]
     assert f"3.00 ({fitted:.2f})" in lines[4]
+    assert "in x and y only" in table
 
 
 def test_recordings_with_the_same_name_get_distinct_folders() -> None:
