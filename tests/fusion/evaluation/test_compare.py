@@ -254,6 +254,7 @@ def test_recordings_with_the_same_name_get_distinct_folders() -> None:
     for name in ("walk", "walk", "walk-2", "walk"):
         taken.add(distinct_name(name, taken))
     assert taken == {"walk", "walk-2", "walk-2-2", "walk-3"}
+    assert distinct_name("..", taken) == "recording"
 
 
 def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() -> None:
