@@ -36,7 +36,7 @@ def convert(
         bool, typer.Option("--overwrite", help="Replace an existing file.")
     ] = False,
 ) -> None:
-    """Convert recordings without loss to a CSV, the EuRoC layout or an archive."""
+    """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""
     from stario.sequences.datasets.convert import convert as convert_sequence
     from stario.sequences.datasets.convert import convert_all, layout_of
 
