@@ -90,6 +90,13 @@ def process_each(
     exit_if_skipped(skipped)
 
 
+def check_new(field: str, path: Path, overwrite: bool) -> None:
+    """Refuse a path whose file would be replaced, unless `overwrite` is given."""
+    if path.is_file() and not overwrite:
+        found = f"{path}, which already exists"
+        raise InputError(field, found, "a new file", "or pass --overwrite")
+
+
 def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
     """List what was skipped on stderr and exit with status 1 if there was any."""
     for failure in skipped:

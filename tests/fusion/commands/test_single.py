@@ -111,6 +111,17 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
 
 
+def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path: Path) -> None:
+    own = tmp_path / "own.csv"
+    own.write_text("own")
+    refused = stario("simulate", "own.csv", "--seconds", 5)
+    assert refused.code == 1
+    assert "--overwrite" in refused.err
+    assert own.read_text() == "own"
+    assert stario("simulate", "own.csv", "--seconds", 5, "--overwrite").code == 0
+    assert len(read_generic_csv(own)) == 1001
+
+
 def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
