@@ -90,6 +90,13 @@ def process_each(
     exit_if_skipped(skipped)
 
 
+def check_new(field: str, path: Path, overwrite: bool) -> None:
+    """Refuse a path whose file would be replaced, unless `overwrite` is given."""
+    if path.is_file() and not overwrite:
+        found = f"{path}, which already exists"
+        raise InputError(field, found, "a new file", "or pass --overwrite")
+
+
 def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
     """List what was skipped on stderr and exit with status 1 if there was any."""
     for failure in skipped:
@@ -124,7 +131,9 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
 _FULL_COVERAGE = 0.98
 """Share of a track below which the coverage by ground truth is reported as partial."""
 
-_EXPLAINED = ("ate_m", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis")
+_EXPLAINED = (
+    *("ate_m", "horizontal", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad", "nees", "nis"),
+)
 """Metrics explained below a table."""
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import collect_results, exit_if_skipped
-from stario.fusion.commands.options import ReadingOptions, expand_option_groups
+from stario.fusion.commands.common import check_new, collect_results, exit_if_skipped
+from stario.fusion.commands.options import OverwriteOption, ReadingOptions, expand_option_groups
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,11 +32,9 @@ def convert(
         str | None,
         typer.Option(help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing file.")
-    ] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Convert recordings without loss to a CSV, the EuRoC layout or an archive."""
+    """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""
     from stario.sequences.datasets.convert import convert as convert_sequence
     from stario.sequences.datasets.convert import convert_all, layout_of
 
@@ -65,10 +63,7 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
     read = {split_name(source)[0] for source in sources}
     if target.exists() and any(file.exists() and target.samefile(file) for file in read):
         raise InputError("OUT", f"{target}, which is also an input", "another file")
-    if target.is_file() and not overwrite:
-        raise InputError(
-            "OUT", f"{target}, which already exists", "a new file", "or pass --overwrite"
-        )
+    check_new("OUT", target, overwrite)
 
 
 def _only(files: list[Path], skipped: list[Skipped]) -> Path:

@@ -49,6 +49,7 @@ JobsOption = Annotated[
 ReportOption = Annotated[
     bool, typer.Option("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON on stdout.")]
 
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.common import print_result
-from stario.fusion.commands.options import JsonOption
+from stario.fusion.commands.common import check_new, print_result
+from stario.fusion.commands.options import JsonOption, OverwriteOption
 from stario.sequences.errors import InputError
 
 
@@ -28,6 +28,7 @@ def simulate(
         bool, typer.Option("--magnetometer", help="Also simulate a magnetometer inside a building.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write a simulated walk with its ground truth as a CSV recording."""
@@ -36,6 +37,7 @@ def simulate(
     from stario.sequences.simulation.magnetometer import INDOOR_FIELD
     from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 
+    check_new("path", path, overwrite)
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     if imu not in sensors:
         raise InputError("--imu", repr(imu), f"one of {', '.join(sensors)}")

@@ -61,6 +61,7 @@ METRIC_WORDS = {
     "seconds_network": "computing time of the network [s]",
     "seconds_filter": "computing time of everything except the network [s]",
     "alignment": "yaw and position of the first common pose; tilt is never aligned",
+    "horizontal": "position errors and paths are in x and y only, except in the NEES",
 }
 """Meaning of each figure in `metrics.json`."""
 

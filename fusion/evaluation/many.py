@@ -72,7 +72,11 @@ def compare_recordings(
 
 
 def distinct_name(name: str, taken: set[str]) -> str:
-    """Return the name, or the first of name-2, name-3, ... not in `taken`, and add it there."""
+    """Return the name, or the first of name-2, name-3, ... not in `taken`, and add it there.
+
+    It is also the name of a folder: an archive's `..` would be the one above.
+    """
+    name = name if name.strip(".") else "recording"
     names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
     found = next(name for name in names if name not in taken)
     taken.add(found)

@@ -70,6 +70,7 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     lines = aligned([["", *(title for _, _, title in _COLUMNS)], *rows])
     lines.append(f"ATE in m: {METRIC_WORDS['ate_m']};")
     lines.append(f"in parentheses {METRIC_WORDS['ate_fit_m']};")
+    lines.append(f"horizontal: {METRIC_WORDS['horizontal']};")
     lines.append(f"NIS: {METRIC_WORDS['nis']};")
     lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
     return "\n".join(lines)

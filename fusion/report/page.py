@@ -187,11 +187,14 @@ def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
         f"<li><b>{title.split()[0]}</b> {html.escape(words[key])}.</li>"
         for key, (title, _) in _COLUMNS.items()
     )
-    aligned = f"<li><b>Alignment</b> {html.escape(words['alignment'])}.</li>"
+    explanations += "".join(
+        f"<li><b>{key.capitalize()}</b> {html.escape(words[key])}.</li>"
+        for key in ("horizontal", "alignment")
+    )
     return (
         "<h2>Accuracy against ground truth</h2><div class='wide'><table>"
         f"<tr><th></th>{head}</tr>{''.join(rows)}</table></div>"
-        f"<ul class='words'>{explanations}{aligned}</ul>"
+        f"<ul class='words'>{explanations}</ul>"
     )
 
 

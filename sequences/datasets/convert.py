@@ -15,7 +15,8 @@ from stario.sequences.files import atomic_folder, atomic_write
 from stario.sequences.inspection.checks import MIN_SECONDS, check_units
 from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.readers.generic_csv import kind_of_positions
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     nanoseconds. CSV and EuRoC drop the truth's covariance and invalid poses, the device's own
     attitude, attributes, and positions alongside true poses; CSV also drops the truth's velocity,
     EuRoC all positions and the magnetometer. An archive only drops positions alongside true poses,
-    unless they are waypoints. A warning lists most losses.
+    unless they are waypoints. Warnings name all but the invalid poses.
 
     Args:
         sequence: the recording.
@@ -153,12 +154,26 @@ def _write_table(path: Path, header: str, stamps: NDArray[np.int64], values: Flo
         file.write("\n".join([header, *rows]) + "\n")
 
 
+def _lost_positions(positions: PositionTrack, beside_poses: bool) -> list[str]:
+    """Return what a CSV loses of known positions: its reader tells waypoints by their interval."""
+    kind, time = positions.kind, positions.time[positions.valid]
+    if beside_poses:
+        return [f"{kind} alongside true poses have no column in CSV"]
+    if len(time) < 2:
+        return [f"a CSV needs two {kind}: write .h5"]
+    if kind != (read_as := kind_of_positions(time)):
+        return [f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5"]
+    return []
+
+
 def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
     if layout == "archive":
         return
     truth, lost = sequence.truth, []
     if truth is not None and truth.velocity_W is not None and layout == "csv":
         lost.append("the truth's velocity has no column in CSV")
+    if sequence.positions is not None and layout == "csv":
+        lost += _lost_positions(sequence.positions, truth is not None)
     if truth is not None and truth.position_covariance_W is not None:
         lost.append("the truth's covariance has no column")
     if sequence.positions is not None and layout == "euroc":
@@ -168,5 +183,7 @@ def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
         lost.append("the magnetometer has no file in the EuRoC layout: write .csv or .h5")
     if sequence.device_attitude is not None:
         lost.append("the device's own attitude has no column: write .h5")
+    if sequence.attributes:
+        lost.append("its attributes have no place: write .h5")
     for words in lost:
         log.warning("%s: %s", sequence.name, words)

@@ -27,6 +27,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -260,6 +261,12 @@ def _per_second(path: Path, column: Column, time: FloatArray) -> int:
     return unit_factor(path, column, TIME_UNITS)
 
 
+def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
+    """Return what positions at two or more times (N,) [s] are: waypoints, or a track."""
+    sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
+    return "waypoints" if sparse else "positions"
+
+
 def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, or else the positions; None if fewer than two rows hold them."""
     names = [name for name in TRUTH if name in rows.table]
@@ -275,8 +282,7 @@ def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionT
         return None, None
     time, values = rows.time[kept], values[kept]
     if not has_attitude:
-        sparse = float(np.median(np.diff(time))) >= _MIN_WAYPOINT_INTERVAL
-        return None, PositionTrack(time, values, "waypoints" if sparse else "positions")
+        return None, PositionTrack(time, values, kind_of_positions(time))
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():

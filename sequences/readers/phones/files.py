@@ -70,7 +70,8 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     for file, words in sorted(named, key=lambda item: _preference(*item)):
         sensor = _sensor_of(words)
         table = sensor_table(file) if sensor else None
-        if sensor is None or table is None:
+        # A file with both sensors is a recording by itself, such as the first walk, `walk_a.csv`.
+        if sensor is None or table is None or is_complete(table.axes):
             continue
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))

@@ -17,6 +17,7 @@ def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_fig
     assert "<h1>walk</h1>" in text
     assert "factor graph" in text
     assert "Accuracy against ground truth" in text
+    assert "in x and y only" in text
 
 
 def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path, no_figures):

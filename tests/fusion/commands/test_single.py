@@ -123,11 +123,25 @@ def test_simulated_magnetometer_leaves_the_imu_as_it_is(stario, tmp_path: Path) 
     np.testing.assert_array_equal(without.gyro, with_field.gyro)
 
 
+def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path: Path) -> None:
+    own = tmp_path / "own.csv"
+    own.write_text("own")
+    refused = stario("simulate", "own.csv", "--seconds", 5)
+    assert refused.code == 1
+    assert "--overwrite" in refused.err
+    assert own.read_text() == "own"
+    assert stario("simulate", "own.csv", "--seconds", 5, "--overwrite").code == 0
+    assert len(read_generic_csv(own)) == 1001
+
+
 def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
     assert done.err == ""
-    for words in ("walk: 12.0 s", "ATE [m]", "samples used 1201", "updates", "8 files in out"):
+    for words in (
+        *("walk: 12.0 s", "ATE [m]", "in x and y only"),
+        *("samples used 1201", "updates", "8 files in out"),
+    ):
         assert words in done.out
     track = read_tum(tmp_path / "out" / "ekf.tum")
     assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)

@@ -246,6 +246,7 @@ def test_summary_has_median_and_mean_over_recordings(
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
     fitted = compared.metrics["ekf"]["ate_fit_m"]
     assert f"3.00 ({fitted:.2f})" in lines[4]
+    assert "in x and y only" in table
 
 
 def test_recordings_with_the_same_name_get_distinct_folders() -> None:
@@ -253,6 +254,7 @@ def test_recordings_with_the_same_name_get_distinct_folders() -> None:
     for name in ("walk", "walk", "walk-2", "walk"):
         taken.add(distinct_name(name, taken))
     assert taken == {"walk", "walk-2", "walk-2-2", "walk-3"}
+    assert distinct_name("..", taken) == "recording"
 
 
 def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() -> None:

@@ -11,7 +11,7 @@ from stario.sequences.datasets.convert import convert
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
@@ -110,6 +110,31 @@ def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(
     with caplog.at_level(logging.WARNING):
         convert(moving, tmp_path / "r.csv")
     assert "velocity has no column" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "interval", "count", "message"),
+    [
+        ("positions", 5.0, 2, "takes positions at such intervals for waypoints"),
+        ("waypoints", 1.0, 4, "takes waypoints at such intervals for positions"),
+        ("waypoints", 5.0, 1, "needs two waypoints"),
+        ("waypoints", 5.0, 2, ""),
+        ("positions", 1.0, 4, ""),
+    ],
+)
+def test_positions_that_a_csv_would_change_give_a_warning(
+    walk: ImuSequence, tmp_path: Path, caplog, kind, interval: float, count: int, message: str
+) -> None:
+    known = PositionTrack(interval * np.arange(count), np.ones((count, 2)), kind)
+    with caplog.at_level(logging.WARNING):
+        convert(replace(walk, truth=None, positions=known), tmp_path / "r.csv")
+    assert message in caplog.text
+    kept = read_recording(tmp_path / "r.csv").positions
+    assert bool(message) == (kept is None or kept.kind != kind)
+    caplog.clear()
+    convert(replace(walk, positions=known, attributes={"person": "x"}), tmp_path / "both.csv")
+    assert "alongside true poses" in caplog.text
+    assert "attributes have no place" in caplog.text
 
 
 def test_a_recording_without_truth_is_converted_without_truth(

@@ -371,3 +371,16 @@ def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
         assert not is_list(path)
     path.write_text("a000_1\n145820422949970\n")
     assert is_list(path)
+
+
+@pytest.mark.parametrize("stem", ["walk_{}", "{}", "{}_1"])
+def test_recordings_named_by_letters_are_not_the_sensors_of_one(
+    stem: str, walk: ImuSequence, tmp_path: Path
+) -> None:
+    """Letters a, b, g and m also name the accelerometer, magnetometer and gyroscope."""
+    for number, letter in enumerate("abgm"):
+        shorter = walk.slice(0.0, 10.0 + number)
+        write_csv(tmp_path / f"{stem.format(letter)}.csv", shorter)
+    found = [read_recording(path) for path in find_recordings(tmp_path)]
+    assert [round(one.duration) for one in found] == [10, 11, 12, 13]
+    assert all(one.source == "generic CSV" and one.magnetometer is None for one in found)
