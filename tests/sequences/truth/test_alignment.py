@@ -156,5 +156,5 @@ def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough() -> None:
     imu, truth = recorded("handheld", 12.0)
     imu = imu.slice(0.0, 9.995)
     valid = np.ones(len(truth), dtype=np.bool_)
-    with pytest.raises(InputError, match="found 9.99 s, expected at least 10 s"):
+    with pytest.raises(InputError, match=r"found 9\.99 s, expected at least 10 s"):
         align_tracked_body(imu.time, imu.gyro, imu.accel, truth.time, truth.attitude_WB, valid)
