@@ -31,6 +31,9 @@ NIS_RATIO = 2.0
 YAW_SIGMA = math.radians(15.0)
 """Standard deviation of yaw [rad] above which the track bends."""
 
+LOST_YAW_SIGMA = 1.5
+"""Yaw sigma beyond which the yaw is unknown [rad], not drifted: standing still does not help."""
+
 LONG_GAP = 1.0
 """Length of a gap [s] after which the heading is no longer known."""
 
@@ -204,9 +207,11 @@ def _direction(health: Health) -> Iterator[Finding]:
     yaw = health.final_sigma.get("yaw_rad", 0.0)
     if yaw > YAW_SIGMA:
         text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
-        advice = (
-            "Keep still for two seconds now and then, or supply a yaw fix or two position fixes."
-        )
+        advice = "A yaw fix or two position fixes determine it."
+        if health.longest_gap < LONG_GAP and yaw < LOST_YAW_SIGMA:
+            advice = (
+                "Keep still for two seconds now and then; a yaw fix or two position fixes help too."
+            )
         yield Finding("warning", text, advice)
 
 

@@ -79,6 +79,18 @@ def test_small_innovations_are_not_reported_as_small_errors() -> None:
     assert "safe side" not in line
 
 
+@pytest.mark.parametrize(
+    ("gap", "yaw_sigma", "helps"), [(0.0, 0.5, True), (4.0, 0.5, False), (0.0, 1.8, False)]
+)
+def test_standing_still_is_advised_only_where_the_yaw_drifts(
+    gap: float, yaw_sigma: float, helps: bool
+) -> None:
+    health = Health(mean_nis=3.0, longest_gap=gap, final_sigma={"yaw_rad": yaw_sigma})
+    advice = findings(health)[-1].advice
+    assert "yaw fix" in advice
+    assert ("still" in advice) == helps
+
+
 def test_a_large_share_of_gated_fixes_is_a_warning() -> None:
     assert "frame" in warnings_of(Health(fixes={"applied": 3, "gated": 1}))
     assert not warnings_of(Health(fixes={"applied": 30, "gated": 1}))
