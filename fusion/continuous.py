@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
 MAX_STEP = 0.01

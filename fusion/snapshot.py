@@ -45,7 +45,7 @@ fusion.filter.gyro_bias fusion.filter.initial fusion.filter.innovations fusion.f
 fusion.filter.map_frame fusion.filter.planar_alignment fusion.filter.zero_velocity fusion.fixes
 fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
 fusion.graph.keyframes fusion.graph.whitening fusion.imu.buffers fusion.imu.front_end
-fusion.imu.intervals fusion.imu.outliers fusion.imu.preintegration fusion.imu.stream_checks
+fusion.imu.faults fusion.imu.intervals fusion.imu.preintegration
 sequences.attitude.levelling sequences.noise
 """
 """Modules whose classes a snapshot may hold: plain data, rebuilt from their attributes."""

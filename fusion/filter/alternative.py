@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.state import changed
 
 GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""

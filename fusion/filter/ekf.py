@@ -16,7 +16,6 @@ import math
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
@@ -34,7 +33,7 @@ from stario.fusion.filter.jacobians import (
 )
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import exp_times, yaw_twist
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray

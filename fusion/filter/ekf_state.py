@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray

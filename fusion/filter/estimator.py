@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.accel_noise import AccelNoiseScale
 from stario.fusion.filter.displacements import DisplacementUpdates
@@ -34,13 +33,11 @@ from stario.fusion.filter.innovations import (
 )
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
 from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA, MapFrame, MapFrameState
-from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
+from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
-from stario.fusion.imu.cutting import split_at_fixes
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
-from stario.fusion.imu.stillness import StillnessDetector
-from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
+from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -210,7 +207,7 @@ class Estimator:
         if not self._stillness.is_still(interval):
             self._bias.note_refused_rest(0.0)
             return None
-        measured = zero_velocity(self._stillness)
+        measured = self._stillness.measurement()
         before = self.ekf.state, self._bias.prior, self._hypotheses.alternative
         self._bias.widen_for_rest()
         gate = chi2_quantile(self._config.filter.gate, 6)

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.changed import changed
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.sequence import FloatArray, Trajectory
 
 _E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])

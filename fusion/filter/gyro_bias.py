@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.alternative import HypothesisPair
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
 

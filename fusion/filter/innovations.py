@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.intervals import SampleCounts
-from stario.fusion.state import Health, Innovations, NavState
+from stario.fusion.state import Health, Innovations, NavState, changed
 
 
 @dataclass(frozen=True)

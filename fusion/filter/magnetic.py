@@ -24,12 +24,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.lie import yaw_twist
+from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray

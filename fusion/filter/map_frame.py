@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.linalg import norm
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
@@ -37,7 +36,7 @@ from stario.fusion.filter.planar_alignment import (
 )
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray

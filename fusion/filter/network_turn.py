@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray
 
 CORRELATION_SECONDS = 60.0

@@ -24,8 +24,7 @@ import gtsam
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.outliers import Flags
+from stario.fusion.imu.intervals import Flags, ImuInterval
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise

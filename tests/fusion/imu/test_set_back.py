@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, PriorPose
-from stario.fusion.imu.stream_checks import ClockSetBackDetector, ClockSetBackError
+from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError
 from stario.fusion.report.health import health_lines
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stario.fusion.imu.outliers import OutlierDetector
+from stario.fusion.imu.faults import OutlierDetector
 
 
 def table(gyro_x: np.ndarray) -> np.ndarray:
