@@ -93,7 +93,7 @@ class EkfState:
         P: (n, n) covariance of the error state; zero for an empty slot.
         clone_times: times of the clones [s]; None for an empty slot.
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`network_turn.py`).
+            zero until fixes determine the direction (`displacements.py`).
         field: the magnetic field; None before its first measurement.
     """
 

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.accel_noise import AccelNoiseScale
-from stario.fusion.filter.displacements import DisplacementUpdates
+from stario.fusion.filter.displacements import AccelNoiseScale, DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
@@ -21,16 +20,13 @@ from stario.fusion.filter.estimator_state import (
     EstimatorState,
     IntervalMeasurements,
     Step,
+    UpdateCounts,
+    innovation_row,
+    innovations_from_rows,
 )
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
-from stario.fusion.filter.innovations import (
-    UpdateCounts,
-    incremented,
-    innovation_row,
-    innovations_from_rows,
-)
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
 from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA, MapFrame, MapFrameState
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
@@ -163,10 +159,7 @@ class Estimator:
             self._release_clones()
         if interval.restart is not None:
             # Fixes within a long gap are useless: nothing links them to the track after it.
-            for _ in fixes:
-                self._counts = changed(
-                    self._counts, fixes=incremented(self._counts.fixes, "in a long gap")
-                )
+            self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
             reinitialise(self.ekf, interval, interval.restart, self._config)
             self._map_frame.lose_yaw(self.ekf)
             return None, []
@@ -200,7 +193,7 @@ class Estimator:
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self._map_frame.update(self.ekf, fix)
-        self._counts = self._counts.add_fix(result)
+        self._counts = self._counts.add("fixes", *result.outcomes)
         return Accepted(fix, result.scale) if result.accepted else None
 
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
@@ -212,7 +205,7 @@ class Estimator:
         self._bias.widen_for_rest()
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
-        self._counts = self._counts.add_zero_velocity(result)
+        self._counts = self._counts.add("zero_velocity", *result.outcomes)
         if not result.accepted:
             self.ekf.state, self._bias.prior, self._hypotheses.alternative = before
             self._bias.note_refused_rest(interval.stop - interval.start)
@@ -245,7 +238,7 @@ class Estimator:
         result = self._map_frame.update(self.ekf, fix)
         if not result.accepted:
             return []
-        self._counts = self._counts.add_north()
+        self._counts = self._counts.add("bearings", "north")
         self._hypotheses.alternative = None  # it is in the old frame
         return [Accepted(fix, result.scale)]
 
@@ -257,7 +250,7 @@ class Estimator:
         result, self._magnetic = self._hypotheses.apply_to_both(
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
-        self._counts = self._counts.add_bearing(result)
+        self._counts = self._counts.add("bearings", *result.outcomes)
         return (before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
-from stario.fusion.filter.alternative import HypothesisPair
+from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.state import changed

@@ -22,12 +22,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.linalg import norm
 
+from stario.fusion.filter.displacements import with_turn
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform
-from stario.fusion.filter.innovations import is_gated
-from stario.fusion.filter.network_turn import with_turn
 from stario.fusion.filter.planar_alignment import (
     PlanarAlignment,
     plane_sigma,
@@ -288,7 +287,7 @@ class MapFrame:
         self.state = changed(self.state, since_jump=self.state.since_jump + 1)
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
         residual = result.residual
-        if residual is None or not is_gated(result):
+        if residual is None or not result.gated:
             self.state = changed(self.state, outlier_residuals=())
             return result
         aligned = tuple(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
@@ -21,7 +22,6 @@ from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import gained_bias_information
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.network_turn import turn_estimate
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias

@@ -20,8 +20,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
+from stario.fusion.filter.displacements import TurnEstimate
 from stario.fusion.filter.jacobians import CORE, plain_covariance
-from stario.fusion.filter.network_turn import TurnEstimate
 from stario.fusion.graph.factors import Prior, Term, TurnProcess, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor

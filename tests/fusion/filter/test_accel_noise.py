@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.accel_noise import AccelNoiseScale
+from stario.fusion.filter.displacements import AccelNoiseScale
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
 from stario.sequences.sequence import ImuSequence
