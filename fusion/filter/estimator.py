@@ -24,11 +24,11 @@ from stario.fusion.filter.estimator_state import (
     innovation_row,
     innovations_from_rows,
 )
-from stario.fusion.filter.frame_transform import with_undirected
+from stario.fusion.filter.frame_transform import MapFrameState, with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
-from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA, MapFrame, MapFrameState
+from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
@@ -68,9 +68,7 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        oriented = prior is not None and prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
-        pivot, sigma = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
-        self._map_frame = MapFrame(pivot, sigma, oriented, f.gate, f.network_turn_sigma)
+        self._map_frame = MapFrame(prior, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )

@@ -12,9 +12,9 @@ import numpy as np
 from stario.fusion.filter.displacements import AccelNoiseScale, AlternativeHypothesis
 from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.magnetic import MagneticReference
-from stario.fusion.filter.map_frame import MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
