@@ -85,10 +85,8 @@ class MapFrame:
     def __init__(self, prior: PriorPose | None, gate: float, turn_sigma: float) -> None:
         self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
         if prior is not None:
-            oriented, variance = (
-                prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA,
-                2.0 * prior.position_sigma**2,
-            )
+            oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
+            variance = 2.0 * prior.position_sigma**2
             self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
         self._gate, self._turn_sigma = gate, turn_sigma
 
