@@ -24,10 +24,8 @@ from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_f
 from stario.fusion.imu.faults import ClockSetBackError, check_start
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.stateful import Predictor as Predictor
-from stario.fusion.imu.stateful import StatefulInference, displacements_of
-from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
-from stario.fusion.recording import Progress, preprocess
+from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
+from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track
 from stario.sequences.errors import InputError

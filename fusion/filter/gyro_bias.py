@@ -74,15 +74,6 @@ class GyroBiasPrior:
     evidence: float = 0.0
     refused_seconds: float = 0.0
 
-    @classmethod
-    def first(cls, sigma: float) -> GyroBiasPrior:
-        """Create the initial prior."""
-        return cls(sigma, sigma**2)
-
-    def before_levelling(self) -> GyroBiasPrior:
-        """Return the prior widened for the time before levelling has estimated the bias."""
-        return changed(self, variance=self.sigma**2 + (_SHARED_FRACTION * BIAS_SIGMA) ** 2)
-
     def updated(
         self,
         levelled: float,
@@ -141,12 +132,14 @@ class AdaptiveBiasPrior:
 
     def __init__(self, hypotheses: HypothesisPair, config: NavigatorConfig, start: float) -> None:
         self._hypotheses, self._config, self._start = hypotheses, config, start
-        self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA))
+        sigma = max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA)
+        self.prior = GyroBiasPrior(sigma, sigma**2)
 
     def begin(self) -> None:
         """Widen the prior for the time before gravity provides information."""
         if self._config.filter.adaptive:
-            self._replace_prior(self.prior.before_levelling())
+            variance = self.prior.sigma**2 + (_SHARED_FRACTION * BIAS_SIGMA) ** 2
+            self._replace_prior(changed(self.prior, variance=variance))
 
     def update(self, interval: ImuInterval) -> None:
         """Adapt the prior after an interval to what gravity and the data show about the bias."""

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain, repeat
 from typing import Any
 
 import gtsam
@@ -114,7 +113,7 @@ def segment_of(
     """
     if interval.gap:
         return gap_segment(interval.start, interval.stop, R_WB, b_g, b_a, config)
-    noise = _noise(interval, config)
+    noise = _widened_noise(config, interval.accel_factor, interval.flags)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
     )
@@ -173,33 +172,25 @@ def segment_of_all(
     def joined(name: str) -> FloatArray:  # without the samples that intervals share
         return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
 
-    noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in intervals)
+    noise = (
+        density
+        for e in intervals
+        for density in [_widened_noise(config, e.accel_factor, e.flags)] * (len(e.time) - 1)
+    )
     samples = joined("time"), joined("gyro"), joined("accel")
     return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
 
 
-def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
-    f = config.filter
-    return _widened_noise(
-        config.noise,
-        interval.accel_factor,
-        interval.flags,
-        f.gap_gyro_noise,
-        f.gap_accel_noise,
-    )
-
-
 @lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow
-def _widened_noise(
-    noise: ImuNoise, accel_factor: float, flags: Flags, gap_gyro: float, gap_accel: float
-) -> ImuNoise:
+def _widened_noise(config: NavigatorConfig, accel_factor: float, flags: Flags) -> ImuNoise:
     """Return the white noise, widened where a sensor was saturated or samples are missing."""
+    noise = config.noise
     gyro, accel = noise.gyro_noise, accel_factor * noise.accel_noise
     # What a saturated sensor missed is as unknown as the motion in a gap.
     if flags.gyro:
-        gyro = max(gyro, gap_gyro)
+        gyro = max(gyro, config.filter.gap_gyro_noise)
     if flags.accel:
-        accel = max(accel, gap_accel)
+        accel = max(accel, config.filter.gap_accel_noise)
     if flags.missing:
         gyro, accel = max(gyro, _MISSING_GYRO), max(accel, _MISSING_ACCEL)
     return replace(noise, gyro_noise=gyro, accel_noise=accel)
