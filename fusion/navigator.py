@@ -217,7 +217,7 @@ class Navigator:
         tree = unpack(data)
         for name, value in self._identity().items():
             check_same(name, tree[name], value)
-        network = self._new_inference()
+        network = StatefulInference(self.model, self.config.filter.window_updates)
         network.memory = tree["network"]
         front_end, prior = tree["front end"], tree["prior"]
         estimator: StreamEstimator | None = None
@@ -294,10 +294,7 @@ class Navigator:
         self._front_end = FrontEnd(self.config)
         self._estimator = None
         self._continuous = None
-        self._network = self._new_inference()
-
-    def _new_inference(self) -> StatefulInference:
-        return StatefulInference(self.model, self.config.filter.window_updates)
+        self._network = StatefulInference(self.model, self.config.filter.window_updates)
 
     def _advance(self, interval: ImuInterval) -> NavState:
         start = self._front_end.start

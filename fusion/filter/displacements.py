@@ -1,24 +1,9 @@
 """Updates with the network's displacements, including false ones, and what their innovations tell.
 
-README.md, "Gates", "Noise and the gyroscope's bias" and "Fixes".
-
-Alternative hypothesis: inflated displacements that keep pulling prevail in the end, right or wrong,
-and a filter that has followed false ones takes the correct ones after them for outliers. Therefore,
-from the first outlier on, a state without outliers is kept alongside the filter for a few seconds;
-if later displacements fit that state and no longer the filter, it replaces the filter's state.
-
-Noise of the accelerometer: the configured density is a prior, since errors of scale, tilt and
-saturation act like noise and differ between a phone held in front of the chest and one in a
-runner's pocket. The innovations determine a factor on it by stochastic approximation (Robbins and
-Monro 1951): it rises with each innovation that is larger than typical and falls with each smaller
-one, in steps of at most the gain. It therefore follows their median, and a few false displacements
-are not mistaken for a bad accelerometer.
-
-Turn of the network: how the device is carried turns all displacements that the network predicts by
-some degrees, and by a similar angle for about a minute. A filter that treats this as white noise
-becomes overconfident in the direction once fixes determine it. From the first fix that is applied
-with the direction known, the turn is therefore a Gauss-Markov state of its own. Without fixes, turn
-and yaw cannot be distinguished, and a track in its own frame gains nothing: there the turn is zero.
+README.md, "Gates" (the alternative hypothesis: a state without the outliers of the last seconds),
+"Noise and the gyroscope's bias" (the accelerometer's factor, by stochastic approximation: Robbins
+and Monro 1951) and "Fixes" (the network's turn, a Gauss-Markov state once fixes tell the direction;
+without them it cannot be distinguished from the yaw, and is zero).
 """
 
 from __future__ import annotations

@@ -2,12 +2,8 @@
 
 The state lies on SE_2(3) and SE(3) (`EkfState`): filterpy's `x` is the mean of the error, zero
 before each update and moved into the state by the group's exponential after it. An empty slot has
-zero covariance and zero columns in every Jacobian. Derivation: README.md, "Error state" to
-"Clones".
-
-Sources: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", 2017;
-S. Roumeliotis, J. Burdick, "Stochastic cloning", 2002; W. Liu et al., "TLIO", 2020 (displacements
-as measurements).
+zero covariance and zero columns in every Jacobian. Derivation and sources: README.md, "Error state"
+to "Displacement measurement".
 """
 
 from __future__ import annotations
@@ -131,7 +127,8 @@ class StateCloningEkf(ErrorStateEngine):
         P[:, first : first + CLONE] = rows.T
         rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
         rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
-        self.state = changed(s, X=X, P=P, clone_times=_with_time(s.clone_times, slot, s.time))
+        times = (*s.clone_times[:slot], s.time, *s.clone_times[slot + 1 :])
+        self.state = changed(s, X=X, P=P, clone_times=times)
         return slot
 
     def release(self, slot: int) -> None:
@@ -140,12 +137,13 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: the slot holds no clone.
         """
-        self.state.time_of_clone(slot)
         s = self.state
+        s.time_of_clone(slot)
+        times = (*s.clone_times[:slot], None, *s.clone_times[slot + 1 :])
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
         P[:, first : first + CLONE] = 0.0
-        self.state = changed(s, P=P, clone_times=_with_time(s.clone_times, slot, None))
+        self.state = changed(s, P=P, clone_times=times)
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -305,9 +303,3 @@ class StateCloningEkf(ErrorStateEngine):
         turn = s.network_turn + float(dx[s.turn_row])
         self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
-
-
-def _with_time(
-    times: tuple[float | None, ...], slot: int, time: float | None
-) -> tuple[float | None, ...]:
-    return (*times[:slot], time, *times[slot + 1 :])

@@ -1,7 +1,6 @@
 """The filter driven by successive IMU intervals: propagate, zero velocity, update, clone.
 
-README.md, "One interval". The displacement between clones follows TLIO (Liu et al. 2020), with the
-right-invariant error (Barrau and Bonnabel 2017).
+README.md, "One interval".
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Width of the gyroscope bias's prior, adapted to what is known about the bias.
 
 README.md, "Noise and the gyroscope's bias". Most devices correct their bias to 0.001 rad/s, some to
-0.005 rad/s and some not at all, and no single Gaussian fits all of them. The
-prior's width therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at
-which it could flip: wide while gravity has provided little information about the bias, narrow once
-the bias proves small, wide where it is large or where the data clearly put it outside the prior.
+0.005 rad/s and some not at all, and no single Gaussian fits all of them. The prior's width
+therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at which it could
+flip.
 """
 
 from __future__ import annotations

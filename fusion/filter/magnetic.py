@@ -4,17 +4,11 @@ README.md, "Magnetometer". The field's direction in the world is unknown, and in
 
     azimuth = c + g,   c constant and unknown at first, g Gauss-Markov over metres and seconds
 
-The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A common turn of yaw and
-azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the gyroscope's
-vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
-much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
+The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A field of unusual size
 or dip for the place has less weight, as does one that the device has extrapolated by its own
-gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. While
-the field does not rotate against the device as the gyroscope does (other axes, a magnet attached),
-it is not used. If a declination is given, and only then, the field determines north once, as a fix
-of yaw.
-
-The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
+gyroscope; one that contradicts the rest is an outlier like any other. If a declination is given,
+and only then, the field determines north once, as a fix of yaw. The field varies slowly and its
+errors are correlated over metres: two bearings a second suffice.
 """
 
 from __future__ import annotations

@@ -1,17 +1,10 @@
 """The map frame: shift and turn of the track's own frame to the frame of the fixes.
 
-A track that starts without a pose sets its first position and first yaw to zero. The first position
-fix shifts this frame so that the track passes through the fix; the covariance of the absolute
-position is then that of the fix. The first fix that determines the direction turns the frame about
-that point: a second position far enough away, several nearer ones together, a velocity, or a yaw.
-Neither is a small correction, so neither goes through the filter's linearisation: the frame is
-transformed exactly (and the right-invariant error with it), then the covariance is inflated as if
-this shift or turn were unknown, then the fix is an ordinary measurement (README.md, "Fixes").
-
-After a gap in which the direction was lost, the same applies to the track from there on: the next
-position places it, the next direction turns it, and the track before the gap stays where it is. If
-the direction of that part was never determined, it is unknown once the frame has a direction. A
-track that no fix has placed yet stays in one piece across the gap.
+README.md, "Fixes". A track that starts without a pose sets its first position and first yaw to
+zero. The fixes that place and orient it are no small corrections and do not go through the filter's
+linearisation: the frame is transformed exactly (and the right-invariant error with it), then the
+covariance is inflated as if this shift or turn were unknown, then the fix is an ordinary update.
+After a gap in which the direction was lost, the same applies to the track from there on.
 """
 
 from __future__ import annotations

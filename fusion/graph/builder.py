@@ -93,11 +93,6 @@ class GraphBuilder:
         """Whether the network's turn is a state."""
         return self._turn_sigma > 0.0
 
-    @property
-    def newest(self) -> Segment:
-        """Segment that ends now, after the last keyframe."""
-        return self.segments[self.graph.last][-1]
-
     def step(
         self,
         interval: ImuInterval,
@@ -125,10 +120,17 @@ class GraphBuilder:
             self.close()
             self._window_keyframes.clear()
         if interval.restart is not None and guess is not None:
-            self._begin_disconnected(guess)
+            # Continue from the filter's new start after a gap too long to be bridged.
+            self.count = 0
+            k = self.graph.add_disconnected(guess)
+            self.segments[k] = []
+            self._window_keyframes[0] = k
             return True
         self.count = 0 if interval.gap else self.count + 1
-        self._append(interval, segment)
+        if segment is None or interval.gap:
+            segment = self._segment_of(interval)
+        self.segments[self.graph.last].append(segment)
+        self._pending.append(interval.without_window())
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
@@ -191,19 +193,6 @@ class GraphBuilder:
                 return _pose_between((R, v, p), end, fraction, segment.duration)
             R, v, p = end
         return R, v, p
-
-    def _begin_disconnected(self, state: NavState) -> None:
-        """Continue from the filter's new start after a gap too long to be bridged."""
-        self.count = 0
-        k = self.graph.add_disconnected(state)
-        self.segments[k] = []
-        self._window_keyframes[0] = k
-
-    def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
-        if segment is None or interval.gap:
-            segment = self._segment_of(interval)
-        self.segments[self.graph.last].append(segment)
-        self._pending.append(interval.without_window())
 
     def _segment_of(self, interval: ImuInterval) -> Segment:
         """Preintegrate; a gap includes a pedestrian's turn, which the filter adds to its state."""

@@ -106,7 +106,7 @@ class FixedLagEstimator:
         ):
             self._solve()
         else:
-            self._ahead.propagate(self._builder.newest)
+            self._ahead.propagate(self._builder.segments[self._builder.graph.last][-1])
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Apply a fix at a time before now; as `Estimator.late_fix`."""
