@@ -1,20 +1,30 @@
-"""Which repeated values are those of a sensor at its limit."""
+"""Faulty samples: values at a sensor's limit, a clock that is set back, a sensor that stops."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
+from support import CONFIG, stream
 
-from stario.fusion.imu.faults import OutlierDetector
+from stario.fusion import Navigator, PriorPose
+from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
+from stario.fusion.report.health import health_lines
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.sequence import ImuSequence
+
+Make = Callable[..., Any]
 
 
-def table(gyro_x: np.ndarray) -> np.ndarray:
-    rows = np.zeros((len(gyro_x), 7))
-    rows[:, 0] = 0.01 * np.arange(len(gyro_x))
-    rows[:, 1] = gyro_x
-    return rows
+# --- saturation ------------------------------------------------------------------------------
 
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     """Number of samples flagged in a stream that is checked interval by interval."""
-    detector, rows = OutlierDetector(), table(gyro_x)
+    detector, rows = OutlierDetector(), np.zeros((len(gyro_x), 7))
+    rows[:, 0], rows[:, 1] = 0.01 * np.arange(len(gyro_x)), gyro_x
     found = [
         detector.detect(rows[k : k + size].copy()).saturated
         for k in range(0, len(rows) - 1, size - 1)
@@ -31,3 +41,132 @@ def test_a_clipped_sine_is_saturated_at_its_limit() -> None:
     clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
     stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
     assert stuck - 2 <= count_saturated(clipped) <= stuck
+
+
+# --- a clock that is set back ----------------------------------------------------------------
+
+
+def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
+    late = walk.time >= at
+    return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
+
+
+def test_a_stream_raises_an_error_and_restarts(make_walk: Make, still_model: Any) -> None:
+    walk = set_back(make_walk(3, 16.0), 100.0)
+    first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
+    navigator, states, errors = Navigator(still_model, prior=first), [], []
+    navigator.update_position(500.0, np.zeros(3), np.eye(3))
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        try:
+            states.append(navigator.push(*row))
+        except ClockSetBackError as error:
+            errors.append(error)
+    assert len(errors) == 1
+    assert errors[0].by == pytest.approx(100.0, abs=0.1)
+    times = [state.time for state in states if state is not None]
+    assert times[-1] == pytest.approx(walk.time[-1], abs=0.11)
+    # The prior pose and the waiting fix belonged to the other clock.
+    assert np.linalg.norm(navigator.state.p_W) < 10.0
+    assert navigator.health.fixes == {}
+
+
+@pytest.mark.parametrize("by", [7.0, 100.0])
+def test_a_recordings_track_ends_there_and_its_health_states_why(
+    make_walk: Make, still_model: Any, by: float
+) -> None:
+    walk = set_back(make_walk(3, 16.0), by)
+    track = Navigator(still_model).run(walk)
+    assert track.time[-1] == pytest.approx(8.0, abs=0.11)
+    (line,) = [line for line in health_lines(track.health) if "clock" in line]
+    assert line.startswith("! ")
+    assert "Split" in line
+    (problem,) = [p for p in inspect_recording(walk).problems if "clock" in p]
+    assert f"{by - 0.01:.3g} s at 8.0 s" in problem
+
+
+def test_late_samples_and_bursts_are_not_another_clock() -> None:
+    detector = ClockSetBackDetector()
+    for k in range(300):  # two sensors in turn, one half a second behind
+        detector.on_time()
+        detector.note_late(0.01 * k - 0.5, 0.01 * k)
+    for k in range(490):
+        detector.note_late(0.01 * k, 10.0)
+    detector.on_time()
+    for k in range(300):  # decreasing times
+        detector.note_late(9.0 - 0.01 * k, 10.0)
+
+
+def test_a_block_that_is_logged_twice_does_not_change_the_track(
+    make_walk: Make, still_model: Any
+) -> None:
+    walk = make_walk(3, 16.0).without_truth()
+    rows = np.r_[0:800, 600 : len(walk)]
+    twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
+    track, plain = Navigator(still_model).run(twice), Navigator(still_model).run(walk)
+    np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
+
+
+def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk: Make) -> None:
+    walk = make_walk(3, 16.0)
+    order = np.random.default_rng(0).permutation(len(walk))
+    shuffled = replace(
+        walk.without_truth(), time=walk.time[order], gyro=walk.gyro[order], accel=walk.accel[order]
+    )
+    problems = " ".join(inspect_recording(shuffled).problems)
+    assert "sort the rows" in problems
+    assert "ms" not in problems
+
+
+def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk: Make) -> None:
+    walk = make_walk(3, 16.0)
+    gyro = walk.gyro.copy()
+    gyro[::300] = 1e6
+    found = inspect_recording(replace(walk, gyro=gyro))
+    assert any("no sensor" in problem for problem in found.problems)
+    assert found.gyro_norm < 10.0
+
+
+def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk: Make, still_model: Any) -> None:
+    walk = make_walk(3, 16.0)
+    track = Navigator(still_model).run(set_back(walk, 3.0))
+    (message,) = (note for note in track.health.notes if "late" in note)
+    assert "for 3.0 s in a row" in message
+    assert not [note for note in Navigator(still_model).run(walk).health.notes if "late" in note]
+
+
+# --- a sensor that repeats one sample again and again has stopped -----------------------------
+
+
+@pytest.mark.parametrize("held", ["last", "zeros"])
+def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, held: str) -> None:
+    gyro, accel, time = walk.gyro.copy(), walk.accel.copy(), walk.time
+    dead = (time > time[0] + 8.0) & (time < time[0] + 11.0)
+    last = np.argmax(dead) - 1
+    gyro[dead], accel[dead] = (gyro[last], accel[last]) if held == "last" else (0.0, 0.0)
+    stopped = replace(walk, gyro=gyro, accel=accel)
+    track = Navigator(make_oracle(stopped, walk.truth, CONFIG)).run(stopped)
+    assert track.health.samples["frozen"] > 0.9 * dead.sum()
+    assert track.health.gap_count == 1
+    ((start, length),) = track.health.gaps
+    assert start == pytest.approx(time[dead][0], abs=0.15)
+    assert length == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
+    """Simulated without noise, or so coarse that its noise does not show."""
+    n = 1000
+    still = ImuSequence(
+        "still", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1))
+    )
+    health = Navigator(still_model).run(still).health
+    assert health.samples["frozen"] == 0
+
+
+@pytest.mark.parametrize("accel", [0.0, 1.0])
+def test_an_unchanging_stream_is_refused_for_its_force(still_model: Any, accel: float) -> None:
+    n = 300
+    silent = ImuSequence(
+        "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
+    )
+    with pytest.raises(InputError, match="accel"):
+        stream(Navigator(still_model), silent)
