@@ -165,15 +165,6 @@ class MagneticReference:
         """Sigma of the azimuth about its mean [rad], from the variation of size and dip."""
         return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
-    @property
-    def bearing_sigma(self) -> float:
-        """White noise of a bearing in a field of usual size and dip [rad]."""
-        return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
-
-    def is_held(self, measured: float) -> bool:
-        """Return whether a field of this size [uT] is the last one, extrapolated by the device."""
-        return abs(measured - self.measured) < HELD_CHANGE * measured
-
     def is_due(self, time: float) -> bool:
         """Return whether a bearing may be applied at a time [s]."""
         return time - self.time > PERIOD - 1e-6
@@ -277,12 +268,13 @@ def update_bearing(
     if reference.contradicts_gyro:
         reason = "contradicts the gyroscope"
         return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
-    extrapolated = reference.is_held(measured)
+    extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
     factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
-    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * factor
+    sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
+    variance = sigma**2 * (1.0 + unusual**2) * factor
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

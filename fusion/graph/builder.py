@@ -18,7 +18,6 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import (
     Segment,
-    gap_segment,
     gap_yaw_variance,
     segment_of,
     segment_of_all,
@@ -198,11 +197,11 @@ class GraphBuilder:
         """Preintegrate; a gap includes a pedestrian's turn, which the filter adds to its state."""
         last = self.graph.last
         R, _, _, b_g, b_a = self.graph.pose(last)
-        if not interval.gap:
-            return segment_of(interval, R, b_g, b_a, self._config)
-        self._gaps.append(last)
-        turned = gap_yaw_variance(interval.stop - interval.start)
-        return gap_segment(interval.start, interval.stop, R, b_g, b_a, self._config, turned)
+        turned = 0.0
+        if interval.gap:
+            self._gaps.append(last)
+            turned = gap_yaw_variance(interval.stop - interval.start)
+        return segment_of(interval, R, b_g, b_a, self._config, turned)
 
     def _add_displacement(
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray

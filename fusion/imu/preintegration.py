@@ -101,8 +101,11 @@ def segment_of(
     b_g: FloatArray,
     b_a: FloatArray,
     config: NavigatorConfig,
+    turned: float = 0.0,
 ) -> Segment:
     """Preintegrate an interval, or bridge it if it is a gap.
+
+    A gap is bridged by constant velocity and attitude, with noise wide enough for a pedestrian.
 
     Args:
         interval: samples, or a gap.
@@ -110,9 +113,12 @@ def segment_of(
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
+        turned: variance of a turn about the vertical within a gap [rad^2]; 0 for the filter, which
+            adds it itself and turns the velocity with it.
     """
     if interval.gap:
-        return gap_segment(interval.start, interval.stop, R_WB, b_g, b_a, config)
+        up_B = R_WB.T @ [0.0, 0.0, 1.0]
+        return _gap_segment(interval.start, interval.stop, up_B, b_g, b_a, config, turned)
     noise = _widened_noise(config, interval.accel_factor, interval.flags)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
@@ -124,31 +130,18 @@ def gap_yaw_variance(seconds: float) -> float:
     return min(GAP_YAW_RATE * seconds, UNKNOWN_YAW) ** 2
 
 
-def gap_segment(
+def _gap_segment(
     start: float,
     stop: float,
-    R_WB: FloatArray,
+    up_B: FloatArray,
     b_g: FloatArray,
     b_a: FloatArray,
     config: NavigatorConfig,
-    turned: float = 0.0,
+    turned: float,
 ) -> Segment:
-    """Bridge a gap by constant velocity and attitude, with noise wide enough for a pedestrian.
-
-    Args:
-        start: start of the gap [s].
-        stop: end of the gap [s].
-        R_WB: (3, 3) attitude at its start.
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        config: noise and gravity.
-        turned: variance of a turn about the vertical within the gap [rad^2]; 0 for the filter,
-            which adds it itself and turns the velocity with it.
-    """
     f, dt = config.filter, (stop - start) / _GAP_STEPS
     noise = replace(config.noise, gyro_noise=f.gap_gyro_noise, accel_noise=f.gap_accel_noise)
     params = _new_params(noise, config.gravity)
-    up_B = R_WB.T @ [0.0, 0.0, 1.0]
     density = turned / (stop - start) * np.outer(up_B, up_B)
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
