@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
+
+Vector = Sequence[float] | FloatArray
+"""Three numbers."""
 
 
 def check_type(name: str, value: object, kind: type, otherwise: str | None = "") -> None:
@@ -40,6 +44,23 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     if array.shape != shape:
         raise InputError(name, f"shape {array.shape}", f"{shape}")
     return array
+
+
+def seconds(time: float) -> float:
+    """Return a time [s] as a float; `InputError` if it is not a number."""
+    try:
+        return float(time)
+    except (TypeError, ValueError):
+        raise InputError("time", repr(time), "a number of seconds") from None
+
+
+def three(name: str, value: Vector) -> tuple[float, float, float]:
+    """Return the three numbers of a vector; `InputError` if it holds anything else."""
+    try:
+        x, y, z = map(float, value)
+    except (TypeError, ValueError):
+        raise InputError(name, repr(value), "three numbers in body axes") from None
+    return x, y, z
 
 
 def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -1,7 +1,5 @@
 """Continuous position next to the corrected one, for control and display (REP 105, map to odom).
 
-The corrected state steps at every update, as it should. The continuous position integrates the
-velocity only; its difference from the corrected one is kept as `correction_W` and bled in slowly.
 README.md, "Continuous output".
 """
 
@@ -12,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
 MAX_STEP = 0.01

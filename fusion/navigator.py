@@ -8,36 +8,28 @@ depend on the filter, both give the same track.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
-from stario.fusion.checked import check_type
+from stario.fusion.checked import Vector, check_type, seconds, three
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.continuous import ContinuousPose, advanced, copied
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
+from stario.fusion.imu.faults import ClockSetBackError, check_start
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.stateful import Predictor as Predictor
-from stario.fusion.imu.stateful import StatefulInference, displacements_of
-from stario.fusion.imu.stream_checks import ClockSetBackError
-from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
-from stario.fusion.recording import Progress, preprocess
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
+from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import MAX_RATE, MIN_RATE
-
-Vector = Sequence[float] | FloatArray
-"""Three numbers."""
-
-_START_FORCE = (5.0, 15.0)
-"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
+from stario.sequences.sequence import ImuSequence
 
 
 def _silent(share: float) -> None:
@@ -104,7 +96,7 @@ class Navigator:
                 up). After the last four the stream starts again; after a clock that was set back,
                 without prior and fixes.
         """
-        sample = (_seconds(time), *_three("gyro", gyro), *_three("accel", accel))
+        sample = (seconds(time), *three("gyro", gyro), *three("accel", accel))
         state = None
         try:
             intervals = self._front_end.push(sample)
@@ -114,7 +106,6 @@ class Navigator:
             self._begin_stream()
             raise
         for interval in intervals:
-            self._check_gyro(interval)
             state = self._advance(interval)
         return state
 
@@ -132,7 +123,7 @@ class Navigator:
         Raises:
             InputError: time is not a number, or field does not hold three numbers.
         """
-        self._front_end.push_field(_seconds(time), np.array(_three("field", field)))
+        self._front_end.push_field(seconds(time), np.array(three("field", field)))
 
     def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
         """Apply a position fix to the stream.
@@ -203,9 +194,7 @@ class Navigator:
         """
         return pack(
             {
-                "backend": self.backend,
-                "config": asdict(self.config),
-                "model": _fingerprint(self.model),
+                **self._identity(),
                 "prior": self.prior,
                 "front end": self._front_end,
                 "fixes": self._fixes,
@@ -226,10 +215,9 @@ class Navigator:
                 back end, configuration or model. The navigator is then unchanged.
         """
         tree = unpack(data)
-        check_same("backend", tree["backend"], self.backend)
-        check_same("config", tree["config"], asdict(self.config))
-        check_same("model", tree["model"], _fingerprint(self.model))
-        network = self._new_inference()
+        for name, value in self._identity().items():
+            check_same(name, tree[name], value)
+        network = StatefulInference(self.model, self.config.filter.window_updates)
         network.memory = tree["network"]
         front_end, prior = tree["front end"], tree["prior"]
         estimator: StreamEstimator | None = None
@@ -297,18 +285,28 @@ class Navigator:
         backend = BACKENDS[self.backend]
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 
+    def _identity(self) -> dict[str, Any]:
+        """Return what must be the same where a snapshot is restored."""
+        checksum = str(getattr(getattr(self.model, "card", None), "sha256", ""))
+        return {"backend": self.backend, "config": asdict(self.config), "model": checksum}
+
     def _begin_stream(self) -> None:
         self._front_end = FrontEnd(self.config)
         self._estimator = None
         self._continuous = None
-        self._network = self._new_inference()
-
-    def _new_inference(self) -> StatefulInference:
-        return StatefulInference(self.model, self.config.filter.window_updates)
+        self._network = StatefulInference(self.model, self.config.filter.window_updates)
 
     def _advance(self, interval: ImuInterval) -> NavState:
+        start = self._front_end.start
+        assert start is not None  # set before the first interval
+        try:
+            self._front_end.gyro_unit.check(interval)
+            if self._estimator is None:
+                check_start(start, self.config.gravity)
+        except InputError:
+            self._begin_stream()
+            raise
         if self._estimator is None:
-            start = self._checked_start()
             self._estimator = BACKENDS[self.backend].stream(self.config, start, self.prior)
             self._fixes.start(start.time)
         if interval.gap:
@@ -330,47 +328,3 @@ class Navigator:
             state = self._estimator.nav_state()
             if state.map_frame != self._continuous.map_frame:
                 self._continuous = advanced(self._continuous, state)
-
-    def _check_gyro(self, interval: ImuInterval) -> None:
-        try:
-            self._front_end.gyro_unit.check(interval)
-        except InputError:
-            self._begin_stream()
-            raise
-
-    def _checked_start(self) -> Start:
-        """Check the first second of a stream, which cannot be checked as a whole."""
-        start = self._front_end.start
-        assert start is not None  # set before the first interval
-        if not MIN_RATE <= start.rate <= MAX_RATE:
-            self._begin_stream()
-            raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
-        if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-            self._begin_stream()
-            raise InputError(
-                "accel",
-                f"an average of {start.force:.3g} over the first second",
-                f"about {self.config.gravity:.2f} m/s^2",
-                "give specific force in m/s^2 with gravity left in, and rates in rad/s",
-            )
-        return start
-
-
-def _fingerprint(model: Predictor) -> str:
-    """Return the checksum of a model's weights; empty if it has no card."""
-    return str(getattr(getattr(model, "card", None), "sha256", ""))
-
-
-def _seconds(time: float) -> float:
-    try:
-        return float(time)
-    except (TypeError, ValueError):
-        raise InputError("time", repr(time), "a number of seconds") from None
-
-
-def _three(name: str, value: Vector) -> tuple[float, float, float]:
-    try:
-        x, y, z = map(float, value)
-    except (TypeError, ValueError):
-        raise InputError(name, repr(value), "three numbers in body axes") from None
-    return x, y, z

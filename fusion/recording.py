@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
+import numpy as np
+
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import FrontEnd, cut_recording
+from stario.fusion.imu.faults import ClockSetBackError
+from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.fusion.imu.stateful import (
     Displacement,
@@ -17,8 +21,8 @@ from stario.fusion.imu.stateful import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SECONDS
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.windows import MAX_IMU_GAP, WINDOW_SECONDS
 
 _BATCH = 512
 """Number of windows per batch of the network."""
@@ -77,6 +81,31 @@ def preprocess(
         seconds_front_end=seconds_front_end,
         seconds_network=seconds_network,
     )
+
+
+def cut_recording(
+    sequence: ImuSequence, config: NavigatorConfig
+) -> tuple[list[ImuInterval], FrontEnd]:
+    """Cut a recording into intervals; return them and the front end with its counts and start.
+
+    Samples after the clock was set back are skipped, and the counts report it.
+    """
+    front_end = FrontEnd(config)
+    intervals: list[ImuInterval] = []
+    magnetometer, fields = sequence.magnetometer, deque[tuple[float, FloatArray]]()
+    if magnetometer is not None:
+        fields.extend(zip(magnetometer.time.tolist(), magnetometer.field, strict=True))
+    for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
+        # A wild timestamp must not release all later fields at once.
+        while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
+            front_end.push_field(*fields.popleft())
+        try:
+            intervals += front_end.push(tuple(sample))
+        except ClockSetBackError as error:
+            front_end.counts.set_back = error.by
+            break
+    front_end.finish()
+    return intervals, front_end
 
 
 def _displacements(

@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.changed import changed
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
+
+T = TypeVar("T")
+
+
+def changed(state: T, **attributes: Any) -> T:
+    """Return a copy of a frozen dataclass with some attributes replaced, the others shared.
+
+    Like `dataclasses.replace` in a quarter of its time, as the filter makes dozens per interval:
+    attributes are neither looked up nor checked again, so it is only for states without
+    `__post_init__`.
+    """
+    new = object.__new__(type(state))
+    vars(new).update(vars(state))
+    vars(new).update(attributes)
+    return new
 
 
 @dataclass(frozen=True, eq=False)

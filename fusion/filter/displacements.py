@@ -1,20 +1,28 @@
-"""Updates with the network's displacements, including false ones. README.md, "Gates"."""
+"""Updates with the network's displacements, including false ones, and what their innovations tell.
+
+README.md, "Gates" (the alternative hypothesis: a state without the outliers of the last seconds),
+"Noise and the gyroscope's bias" (the accelerometer's factor, by stochastic approximation: Robbins
+and Monro 1951) and "Fixes" (the network's turn, a Gauss-Markov state once fixes tell the direction;
+without them it cannot be distinguished from the yaw, and is zero).
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.accel_noise import AccelNoiseScale
-from stario.fusion.filter.alternative import GATE as ALTERNATIVE_GATE
-from stario.fusion.filter.alternative import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.engine import GateMode, UpdateResult
-from stario.fusion.filter.innovations import is_gated
-from stario.fusion.filter.network_turn import propagated_turn
+from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.lie import yaw_rotation
+from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
@@ -22,6 +30,132 @@ _RARE_SHARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 """While less than this share of the last seconds' displacements were outliers, they are attributed
 to the network and inflated by this power of NIS / gate; a filter that gates more of them may itself
 be wrong. This bridges about five seconds of false displacements."""
+
+_ALTERNATIVE_GATE = 0.95
+"""Probability of the chi-square test beyond which a displacement does not fit the alternative."""
+
+_FITS_TO_REPLACE = 2
+"""Displacements that must fit only the alternative before it replaces the filter's state."""
+
+_FITS_TO_DROP = 4
+"""Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
+
+_MAX_SECONDS = 6.0
+"""Maximum age of the alternative [s]: the IMU alone is not accurate for longer."""
+
+TARGET_NIS = 0.3
+"""Target for the median NIS per degree of freedom: the network's errors are correlated over
+seconds, so consistent innovations are smaller than single errors."""
+
+GAIN, FIRST_GAIN = 0.05, 0.2
+"""Step of the noise factor's logarithm per displacement: in the long run, and for the first one."""
+
+MAX_FACTOR = 30.0
+"""Maximum noise factor: the accelerometer then rules out little more than jumps."""
+
+_STEPS = 4
+"""Number of noise factors per doubling, so that few different noise models are created."""
+
+TURN_SECONDS = 60.0
+"""Correlation time of the network's turn [s]."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, eq=False)
+class AlternativeHypothesis:
+    """State of the filter if it had rejected the displacements that failed the gate.
+
+    Attributes:
+        ekf: state of the filter under this hypothesis.
+        start_time: time of the first outlier [s].
+        exclusive_fits: number of displacements that fitted only the alternative since the last one
+            that fitted only the filter.
+        shared_fits: number of latest displacements in a row that fitted both.
+    """
+
+    ekf: EkfState
+    start_time: float
+    exclusive_fits: int = 0
+    shared_fits: int = 0
+
+
+class HypothesisPair:
+    """A filter and its alternative hypothesis, if there is one.
+
+    Args:
+        ekf: the filter; its state is set aside while the alternative is updated.
+
+    Attributes:
+        ekf: the filter.
+        alternative: the alternative hypothesis; None while all displacements fit.
+    """
+
+    def __init__(self, ekf: StateCloningEkf) -> None:
+        self.ekf = ekf
+        self.alternative: AlternativeHypothesis | None = None
+
+    def apply_to_both(self, work: Callable[[], Result]) -> Result:
+        """Apply `work` to the filter and then to the alternative; return the filter's result."""
+        result = work()
+        if self.alternative is not None:
+            filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
+            work()
+            self.alternative = changed(self.alternative, ekf=self.ekf.state)
+            self.ekf.state = filter_state
+        return result
+
+    def compare(self, fits: Callable[[], bool], fits_filter: bool) -> None:
+        """Test the alternative with a displacement that the filter has applied; adopt or drop it.
+
+        Args:
+            fits: updates the filter's current state with the displacement if that fits, and returns
+                whether it does.
+            fits_filter: whether the displacement fitted the filter.
+        """
+        alternative = self.alternative
+        if alternative is None:
+            return
+        filter_state, self.ekf.state = self.ekf.state, alternative.ekf
+        fitted = fits()
+        exclusive = alternative.exclusive_fits + (fitted and not fits_filter)
+        if fits_filter and not fitted:
+            exclusive = 0
+        shared = alternative.shared_fits + 1 if fits_filter and fitted else 0
+        self.alternative = None
+        if exclusive >= _FITS_TO_REPLACE:
+            return
+        ekf, self.ekf.state = self.ekf.state, filter_state
+        if shared < _FITS_TO_DROP and ekf.time - alternative.start_time <= _MAX_SECONDS:
+            self.alternative = AlternativeHypothesis(ekf, alternative.start_time, exclusive, shared)
+
+
+@dataclass(frozen=True)
+class AccelNoiseScale:
+    """Factor by which the accelerometer is noisier than configured.
+
+    Attributes:
+        log_factor: natural logarithm of the factor on its noise density.
+        gain: step size for the next displacement.
+    """
+
+    log_factor: float = 0.0
+    gain: float = FIRST_GAIN
+
+    @property
+    def factor(self) -> float:
+        """Factor on the noise density, in steps."""
+        return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
+
+    def updated(self, result: UpdateResult) -> AccelNoiseScale:
+        """Return the scale after one displacement; unchanged if it has no innovation."""
+        if not math.isfinite(result.nis):
+            return self
+        ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2
+        excess = 1.0 - 2.0 / (ratio + 1.0)
+        log_factor = self.log_factor + self.gain * excess
+        gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
+        return AccelNoiseScale(min(max(log_factor, 0.0), math.log(MAX_FACTOR)), gain)
 
 
 class DisplacementUpdates:
@@ -58,15 +192,15 @@ class DisplacementUpdates:
         rare = self.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
-        gated = is_gated(result)
         gain = 1.0 / (f.update_rate * _SHARE_SECONDS)
-        self.outlier_share += gain * (gated - self.outlier_share)
+        self.outlier_share += gain * (result.gated - self.outlier_share)
         if f.adaptive:
             self.accel_noise = self.accel_noise.updated(result)
-        if self.hypotheses.alternative is None and rare and gated:
+        if self.hypotheses.alternative is None and rare and result.gated:
             self.hypotheses.alternative = AlternativeHypothesis(before, before.time)
         elif result.accepted:
-            self.hypotheses.compare(lambda: update(ALTERNATIVE_GATE, "reject").accepted, not gated)
+            fits = partial(update, _ALTERNATIVE_GATE, "reject")
+            self.hypotheses.compare(lambda: fits().accepted, not result.gated)
         return result
 
     def _update(
@@ -91,3 +225,40 @@ class DisplacementUpdates:
             return self._ekf.update_displacement(
                 slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
             )
+
+
+class TurnEstimate(NamedTuple):
+    """A filter's estimate of the network's turn, for a graph that starts from its state."""
+
+    turn: float
+    """The turn [rad]."""
+    covariance: FloatArray
+    """(16,) covariance with the plain errors of the state (order of `NavState.covariance`), then
+    the turn's variance."""
+
+
+def turn_estimate(s: EkfState) -> TurnEstimate | None:
+    """Return a filter's estimate of the network's turn; None while it is not estimated."""
+    if not s.has_turn:
+        return None
+    rows = [*range(CORE), s.turn_row]
+    P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
+    return TurnEstimate(s.network_turn, P[CORE])
+
+
+def with_turn(s: EkfState, sigma: float) -> EkfState:
+    """Return the state with the network's turn estimated from now on, with prior sigma [rad]."""
+    if s.has_turn or sigma == 0.0:
+        return s
+    P = s.P.copy()
+    P[s.turn_row, s.turn_row] = sigma**2
+    return changed(s, P=P)
+
+
+def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
+    """Return the state with the network's turn propagated over a time [s], if it has one."""
+    if not s.has_turn:
+        return s
+    correlation = math.exp(-seconds / TURN_SECONDS)
+    P = gauss_markov(s.P, s.turn_row, correlation, sigma)
+    return changed(s, P=P, network_turn=correlation * s.network_turn)

@@ -2,12 +2,8 @@
 
 The state lies on SE_2(3) and SE(3) (`EkfState`): filterpy's `x` is the mean of the error, zero
 before each update and moved into the state by the group's exponential after it. An empty slot has
-zero covariance and zero columns in every Jacobian. Derivation: README.md, "Error state" to
-"Clones".
-
-Sources: A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", 2017;
-S. Roumeliotis, J. Burdick, "Stochastic cloning", 2002; W. Liu et al., "TLIO", 2020 (displacements
-as measurements).
+zero covariance and zero columns in every Jacobian. Derivation and sources: README.md, "Error state"
+to "Displacement measurement".
 """
 
 from __future__ import annotations
@@ -16,7 +12,6 @@ import math
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
@@ -34,7 +29,7 @@ from stario.fusion.filter.jacobians import (
 )
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import exp_times, yaw_twist
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
@@ -132,7 +127,8 @@ class StateCloningEkf(ErrorStateEngine):
         P[:, first : first + CLONE] = rows.T
         rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
         rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
-        self.state = changed(s, X=X, P=P, clone_times=_with_time(s.clone_times, slot, s.time))
+        times = (*s.clone_times[:slot], s.time, *s.clone_times[slot + 1 :])
+        self.state = changed(s, X=X, P=P, clone_times=times)
         return slot
 
     def release(self, slot: int) -> None:
@@ -141,12 +137,13 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: the slot holds no clone.
         """
-        self.state.time_of_clone(slot)
         s = self.state
+        s.time_of_clone(slot)
+        times = (*s.clone_times[:slot], None, *s.clone_times[slot + 1 :])
         P, first = s.P.copy(), CORE + CLONE * slot
         P[first : first + CLONE] = 0.0
         P[:, first : first + CLONE] = 0.0
-        self.state = changed(s, P=P, clone_times=_with_time(s.clone_times, slot, None))
+        self.state = changed(s, P=P, clone_times=times)
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -162,11 +159,8 @@ class StateCloningEkf(ErrorStateEngine):
     ) -> UpdateResult:
         """Update with the displacement from clone i to clone j, in the estimated world.
 
-        `d_W` is expressed in the filter's estimated world: the network's input was rotated by the
-        estimated attitude, so the displacement contains the yaw error of clone i,
-        p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own yaw error (turn). No Euler
-        angles are used, so no attitude of the device is singular, and the Jacobian times the yaw
-        direction is exactly zero.
+        The network's input was rotated by the estimated attitude, so the displacement contains the
+        yaw error of clone i, p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own (turn).
 
         Args:
             slot_i: slot of the window's first pose.
@@ -188,11 +182,10 @@ class StateCloningEkf(ErrorStateEngine):
         X, turn_row = self.state.X, self.state.turn_row
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
-        residual = d_W - (p_j - p_i)
         if self.state.has_turn:
-            residual = exp_so3(np.array([0.0, 0.0, -self.state.network_turn])) @ d_W - (p_j - p_i)
+            d_W = exp_so3(np.array([0.0, 0.0, -self.state.network_turn])) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, turn_row))
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode, power)
+        return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode, power)
 
     def update_mean_velocity(
         self,
@@ -225,10 +218,7 @@ class StateCloningEkf(ErrorStateEngine):
         return self.update_linear(residual, blocks, covariance, gate, gate_mode)
 
     def update_position_W(
-        self,
-        p_W: FloatArray,
-        covariance: FloatArray,
-        gate: float | None = None,
+        self, p_W: FloatArray, covariance: FloatArray, gate: float | None = None
     ) -> UpdateResult:
         """Update with the current position (3,) [m], covariance (3, 3) [m^2]."""
         predicted = self.state.X[0, :, 4]
@@ -237,10 +227,7 @@ class StateCloningEkf(ErrorStateEngine):
         return self.update_linear(residual, blocks, covariance, gate)
 
     def update_velocity_W(
-        self,
-        v_W: FloatArray,
-        covariance: FloatArray,
-        gate: float | None = None,
+        self, v_W: FloatArray, covariance: FloatArray, gate: float | None = None
     ) -> UpdateResult:
         """Update with the current velocity (3,) [m/s] in the true W, covariance (3, 3)."""
         predicted = self.state.v_W
@@ -308,18 +295,11 @@ class StateCloningEkf(ErrorStateEngine):
         xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
         X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        field = None if s.field is None else _corrected_field(s.field, dx[s.first_field :])
+        field = s.field
+        if field is not None:
+            azimuth, wander, *_ = dx[s.first_field :].tolist()
+            hard_iron_B = field.hard_iron_B + dx[s.first_field + 2 :]
+            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
         turn = s.network_turn + float(dx[s.turn_row])
         self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
         self.x = np.zeros((len(dx), 1))
-
-
-def _with_time(
-    times: tuple[float | None, ...], slot: int, time: float | None
-) -> tuple[float | None, ...]:
-    return (*times[:slot], time, *times[slot + 1 :])
-
-
-def _corrected_field(field: FieldState, dx: FloatArray) -> FieldState:
-    azimuth, wander = field.azimuth + float(dx[0]), field.wander + float(dx[1])
-    return FieldState(azimuth, wander, field.hard_iron_B + dx[2:])

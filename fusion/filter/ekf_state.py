@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -94,7 +93,7 @@ class EkfState:
         P: (n, n) covariance of the error state; zero for an empty slot.
         clone_times: times of the clones [s]; None for an empty slot.
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`network_turn.py`).
+            zero until fixes determine the direction (`displacements.py`).
         field: the magnetic field; None before its first measurement.
     """
 
@@ -181,8 +180,9 @@ class EkfState:
 
     def estimate(self, in_gap: bool = False, map_frame: int = 0) -> Estimate:
         """Return the estimate of the current pose and biases."""
-        P = self.P[:CORE, :CORE]
-        return self._estimate(self.time, self.X[0], P, in_gap, map_frame)
+        # Copies: a view would keep the whole covariance alive for as long as the estimate.
+        X, P = self.X[0].copy(), self.P[:CORE, :CORE].copy()
+        return Estimate(self.time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
         """Return the current estimate of a clone.
@@ -191,9 +191,9 @@ class EkfState:
             InputError: the slot holds no clone.
         """
         time, first = self.time_of_clone(slot), CORE + CLONE * slot
-        rows = self.P[first : first + CLONE]
-        X, P = self.X[1 + slot][:, _CLONE_COLUMNS], rows[:, first : first + CLONE]
-        return self._estimate(time, X, P, False, map_frame)
+        X = self.X[1 + slot][:, _CLONE_COLUMNS].copy()
+        P = self.P[first : first + CLONE, first : first + CLONE].copy()
+        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, map_frame=map_frame)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
@@ -249,13 +249,6 @@ class EkfState:
             N[rho : rho + 3] = np.eye(3)
         return changed(self, P=self.P + sigma**2 * (N @ N.T))
 
-    def _estimate(
-        self, time: float, X: FloatArray, P: FloatArray, in_gap: bool, map_frame: int
-    ) -> Estimate:
-        # Copies: a view would keep the whole covariance alive for as long as the estimate.
-        X, P = X.copy(), P.copy()
-        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
-
     def _poses(self) -> list[tuple[int, int]]:
         """Return the first rows of theta and rho_p of the current pose and of every clone."""
         rows = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
@@ -286,25 +279,14 @@ def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
 
 def nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
     """Convert estimates of newest states to `NavState`, with plain errors."""
-    parts = range(0, len(estimates), _CHUNK)
-    return [state for k in parts for state in _nav_states(estimates[k : k + _CHUNK])]
-
-
-def _nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
-    return [
-        NavState(
-            e.time,
-            e.X[:, :3],
-            e.X[:, 3],
-            e.X[:, 4] + e.origin_W,
-            e.b_g.copy(),  # the filter's own arrays
-            e.b_a.copy(),
-            covariance,
-            e.in_gap,
-            e.map_frame,
-        )
-        for e, covariance in zip(estimates, plain_covariances(estimates), strict=True)
-    ]
+    states = []
+    for k in range(0, len(estimates), _CHUNK):
+        part = estimates[k : k + _CHUNK]
+        for e, covariance in zip(part, plain_covariances(part), strict=True):
+            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
+            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
+            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
+    return states
 
 
 def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:

@@ -48,6 +48,18 @@ class UpdateResult(NamedTuple):
     residual: FloatArray | None = None
     sigma: FloatArray | None = None
 
+    @property
+    def gated(self) -> bool:
+        """Whether it counts as an outlier, rejected or inflated."""
+        return self.reason == "gated" or self.scale > 1.0
+
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """What reports count: "applied", if inflated also "gated"; otherwise the reason."""
+        if not self.accepted:
+            return (self.reason,)
+        return ("applied", "gated") if self.gated else ("applied",)
+
 
 class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy is untyped
     """Covariance of an error state whose mean is zero between steps.

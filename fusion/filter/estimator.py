@@ -1,7 +1,6 @@
 """The filter driven by successive IMU intervals: propagate, zero velocity, update, clone.
 
-README.md, "One interval". The displacement between clones follows TLIO (Liu et al. 2020), with the
-right-invariant error (Barrau and Bonnabel 2017).
+README.md, "One interval".
 """
 
 from __future__ import annotations
@@ -11,9 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.accel_noise import AccelNoiseScale
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
@@ -22,25 +19,20 @@ from stario.fusion.filter.estimator_state import (
     EstimatorState,
     IntervalMeasurements,
     Step,
-)
-from stario.fusion.filter.frame_transform import with_undirected
-from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior, GyroBiasPrior
-from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
-from stario.fusion.filter.innovations import (
     UpdateCounts,
-    incremented,
     innovation_row,
     innovations_from_rows,
 )
+from stario.fusion.filter.frame_transform import with_undirected
+from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
+from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
-from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA, MapFrame, MapFrameState
-from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity, zero_velocity
+from stario.fusion.filter.map_frame import MapFrame
+from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
-from stario.fusion.imu.cutting import split_at_fixes
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
-from stario.fusion.imu.stillness import StillnessDetector
-from stario.fusion.state import Health, Innovations, NavState, SmoothedPose
+from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -61,6 +53,8 @@ class Estimator:
 
     Attributes:
         ekf: the filter.
+        frame: the map frame, with all transforms so far.
+        bias: the adaptive prior of the gyroscope's bias.
         released: newest pose that left the window, corrected by the whole window; None at first.
         in_gap: whether the last interval had no samples.
     """
@@ -75,16 +69,14 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        oriented = prior is not None and prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
-        pivot, sigma = (None, math.inf) if prior is None else (prior.p_W, prior.position_sigma)
-        self._map_frame = MapFrame(pivot, sigma, oriented, f.gate, f.network_turn_sigma)
+        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
         self._magnetic = MagneticReference()
         self._displacements = DisplacementUpdates(self.ekf, f)
         self._hypotheses = self._displacements.hypotheses
-        self._bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
+        self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
@@ -92,7 +84,7 @@ class Estimator:
         self._history: tuple[Step, ...] = ()
         self.released: Estimate | None = None
         initialise(self.ekf, start, prior, config)
-        self._bias.begin()
+        self.bias.begin()
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------
@@ -120,7 +112,7 @@ class Estimator:
         applied = None if offered is None else self._update_displacement(interval, *offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
-        self._bias.update(interval)
+        self.bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(interval, offered, applied, bearing, zupt, accepted, segment)
@@ -166,12 +158,9 @@ class Estimator:
             self._release_clones()
         if interval.restart is not None:
             # Fixes within a long gap are useless: nothing links them to the track after it.
-            for _ in fixes:
-                self._counts = changed(
-                    self._counts, fixes=incremented(self._counts.fixes, "in a long gap")
-                )
+            self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
             reinitialise(self.ekf, interval, interval.restart, self._config)
-            self._map_frame.lose_yaw(self.ekf)
+            self.frame.lose_yaw(self.ekf)
             return None, []
         if not fixes:
             return self._propagate_piece(interval, interval.start), []
@@ -184,43 +173,44 @@ class Estimator:
 
     def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:
         """Propagate through a piece of the interval that started at `interval_start` [s]."""
+
+        def propagate() -> Segment:
+            s = self.ekf.state
+            segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
+            self.ekf.propagate(segment)
+            return segment
+
         before = self.ekf.state.p_W
-        segment = self._hypotheses.apply_to_both(lambda: self._propagate_samples(interval))
+        segment = self._hypotheses.apply_to_both(propagate)
         if interval.gap:
             sigma = math.sqrt(
                 gap_yaw_variance(interval.stop - interval_start)
                 - gap_yaw_variance(interval.start - interval_start)
             )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
-            self._map_frame.lose_yaw(self.ekf)
-        return segment
-
-    def _propagate_samples(self, interval: ImuInterval) -> Segment:
-        s = self.ekf.state
-        segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
-        self.ekf.propagate(segment)
+            self.frame.lose_yaw(self.ekf)
         return segment
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
-        result = self._map_frame.update(self.ekf, fix)
-        self._counts = self._counts.add_fix(result)
+        result = self.frame.update(self.ekf, fix)
+        self._counts = self._counts.add("fixes", *result.outcomes)
         return Accepted(fix, result.scale) if result.accepted else None
 
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
         if not self._stillness.is_still(interval):
-            self._bias.note_refused_rest(0.0)
+            self.bias.note_refused_rest(0.0)
             return None
-        measured = zero_velocity(self._stillness)
-        before = self.ekf.state, self._bias.prior, self._hypotheses.alternative
-        self._bias.widen_for_rest()
+        measured = self._stillness.measurement()
+        before = self.ekf.state, self.bias.prior, self._hypotheses.alternative
+        self.bias.widen_for_rest()
         gate = chi2_quantile(self._config.filter.gate, 6)
         result = update_zero_velocity(self.ekf, measured, gate)
-        self._counts = self._counts.add_zero_velocity(result)
+        self._counts = self._counts.add("zero_velocity", *result.outcomes)
         if not result.accepted:
-            self.ekf.state, self._bias.prior, self._hypotheses.alternative = before
-            self._bias.note_refused_rest(interval.stop - interval.start)
+            self.ekf.state, self.bias.prior, self._hypotheses.alternative = before
+            self.bias.note_refused_rest(interval.stop - interval.start)
             return None
-        self._bias.note_refused_rest(0.0)
+        self.bias.note_refused_rest(0.0)
         self._hypotheses.alternative = None
         return measured
 
@@ -240,15 +230,15 @@ class Estimator:
     def _update_north(self) -> list[Accepted]:
         """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""
         declination = self._config.filter.declination
-        if declination is None or self._map_frame.state.oriented:
+        if declination is None or self.frame.state.oriented:
             return []
         fix = north_fix(self.ekf.state, self._magnetic, declination)
         if fix is None:
             return []
-        result = self._map_frame.update(self.ekf, fix)
+        result = self.frame.update(self.ekf, fix)
         if not result.accepted:
             return []
-        self._counts = self._counts.add_north()
+        self._counts = self._counts.add("bearings", "north")
         self._hypotheses.alternative = None  # it is in the old frame
         return [Accepted(fix, result.scale)]
 
@@ -260,7 +250,7 @@ class Estimator:
         result, self._magnetic = self._hypotheses.apply_to_both(
             lambda: update_bearing(self.ekf, self._magnetic, field_B)
         )
-        self._counts = self._counts.add_bearing(result)
+        self._counts = self._counts.add("bearings", *result.outcomes)
         return (before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:
@@ -268,7 +258,7 @@ class Estimator:
             self._clones = (*self._clones, self._hypotheses.apply_to_both(self.ekf.clone))
             return
         slot, *later = self._clones
-        self.released = self.ekf.state.clone_estimate(slot, self.map_frame)
+        self.released = self.ekf.state.clone_estimate(slot, len(self.frame.state.transforms))
         self._clones = (
             *later,
             self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
@@ -288,11 +278,11 @@ class Estimator:
         return EstimatorState(
             self.ekf.state,
             self._clones,
-            self._map_frame.state,
+            self.frame.state,
             self._stillness.window,
             self._magnetic,
             self._displacements.outlier_share,
-            self._bias.prior,
+            self.bias.prior,
             self._displacements.accel_noise,
             self._hypotheses.alternative,
             self._counts,
@@ -304,37 +294,17 @@ class Estimator:
     @state.setter
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
-        self._map_frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._magnetic, self._bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
+        self.frame.state, self._stillness.window = s.map_frame, s.stillness
+        self._magnetic, self.bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
         self._displacements.outlier_share = s.outlier_share
         self._displacements.accel_noise = s.accel_noise
         self._hypotheses.alternative = s.alternative
         self.in_gap, self.released, self._history = s.in_gap, s.released, s.history
 
     @property
-    def accel_noise(self) -> AccelNoiseScale:
-        """Scale of the accelerometer's noise, estimated from the innovations."""
-        return self._displacements.accel_noise
-
-    @property
-    def bias_prior(self) -> GyroBiasPrior:
-        """Prior of the gyroscope's bias, as currently applied in the filter."""
-        return self._bias.prior
-
-    @property
     def time(self) -> float:
         """Time of the newest state [s]."""
         return self.ekf.state.time
-
-    @property
-    def map_frame(self) -> int:
-        """Number of frame transforms so far."""
-        return len(self._map_frame.state.transforms)
-
-    @property
-    def map_frame_state(self) -> MapFrameState:
-        """What is known about the map frame, including all transforms so far."""
-        return self._map_frame.state
 
     @property
     def gating_counts(self) -> object:
@@ -348,11 +318,11 @@ class Estimator:
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
-        return self.ekf.state.estimate(self.in_gap, self.map_frame)
+        return self.ekf.state.estimate(self.in_gap, len(self.frame.state.transforms))
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
-        return with_undirected(nav_states([self.estimate()]), self._map_frame.state.undirected)[0]
+        return with_undirected(nav_states([self.estimate()]), self.frame.state.undirected)[0]
 
     def innovations(self) -> Innovations:
         """Return every innovation so far."""
@@ -361,7 +331,7 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
-        if self._config.filter.declination is not None and not self._map_frame.state.oriented:
-            note = "north could not be determined: the track starts with yaw zero"
-            health = changed(health, notes=[*health.notes, note])
-        return changed(health, accel_noise_factor=self._displacements.accel_noise.factor)
+        health.accel_noise_factor = self._displacements.accel_noise.factor
+        if self._config.filter.declination is not None and not self.frame.state.oriented:
+            health.notes.append("north could not be determined: the track starts with yaw zero")
+        return health

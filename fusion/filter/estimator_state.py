@@ -1,23 +1,26 @@
-"""Input, output and complete state of an estimator's step."""
+"""Input and output of an estimator's step, counts of its updates, and its complete state."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from stario.fusion.filter.accel_noise import AccelNoiseScale
-from stario.fusion.filter.alternative import AlternativeHypothesis
+import numpy as np
+
+from stario.fusion.filter.displacements import AccelNoiseScale, AlternativeHypothesis
 from stario.fusion.filter.ekf_state import EkfState, Estimate
+from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
-from stario.fusion.filter.innovations import UpdateCounts
 from stario.fusion.filter.magnetic import MagneticReference
-from stario.fusion.filter.map_frame import MapFrameState
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import ImuInterval, SampleCounts
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import Displacement as Displacement
+from stario.fusion.state import Health, Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
 
 
@@ -38,6 +41,93 @@ class IntervalMeasurements(NamedTuple):
     """Fixes applied, in order."""
     segment: Segment | None
     """The preintegrated samples; None if fixes split them."""
+
+
+@dataclass(frozen=True)
+class UpdateCounts:
+    """Counts of updates by outcome; never modified in place.
+
+    Attributes:
+        offered: number of network measurements.
+        gated: number of these that were outliers, rejected or inflated.
+        refused: numbers of these that were invalid, by reason.
+        fixes: numbers of fixes applied (of these gated), and refused by reason.
+        zero_velocity: numbers of measurements at rest applied, and refused by reason.
+        bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        nis_sum: sum of the NIS of all valid network measurements.
+        nis_count: number of valid network measurements.
+    """
+
+    offered: int = 0
+    gated: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    fixes: Mapping[str, int] = field(default_factory=dict)
+    zero_velocity: Mapping[str, int] = field(default_factory=dict)
+    bearings: Mapping[str, int] = field(default_factory=dict)
+    nis_sum: float = 0.0
+    nis_count: int = 0
+
+    def add_displacement(self, result: UpdateResult) -> UpdateCounts:
+        """Return the counts with one more network measurement."""
+        counts = changed(self, offered=self.offered + 1)
+        if result.residual is None:
+            return counts.add("refused", result.reason)
+        return changed(
+            counts,
+            gated=self.gated + result.gated,
+            nis_sum=self.nis_sum + result.nis,
+            nis_count=self.nis_count + 1,
+        )
+
+    def add(self, kind: str, *outcomes: str) -> UpdateCounts:
+        """Return the counts with one more of each outcome in the attribute named `kind`."""
+        counts = dict(getattr(self, kind))
+        for outcome in outcomes:
+            counts[outcome] = counts.get(outcome, 0) + 1
+        return changed(self, **{kind: counts})
+
+    def health(self, counts: SampleCounts, state: NavState) -> Health:
+        """Return the health report: outcomes of samples and updates, and the state's sigmas."""
+        sigma = np.sqrt(np.diag(state.covariance))
+        groups = {
+            "tilt_rad": sigma[0:2],
+            "yaw_rad": sigma[2:3],
+            "velocity_m_s": sigma[3:6],
+            "position_m": sigma[6:8],
+            "height_m": sigma[8:9],
+            "gyro_bias_rad_s": sigma[9:12],
+            "accel_bias_m_s2": sigma[12:15],
+        }
+        return changed(
+            counts.health(),
+            updates=self.offered,
+            gated=self.gated,
+            refused=dict(self.refused),
+            mean_nis=self.nis_sum / self.nis_count if self.nis_count else math.nan,
+            fixes=dict(self.fixes),
+            zero_velocity=dict(self.zero_velocity),
+            bearings=dict(self.bearings),
+            final_sigma={name: float(np.max(values)) for name, values in groups.items()},
+        )
+
+
+def innovation_row(time: float, result: UpdateResult) -> tuple[float, ...] | None:
+    """Return a row for `innovations_from_rows`; None for an invalid measurement."""
+    if result.residual is None or result.sigma is None:
+        return None
+    return time, *result.residual, *result.sigma, result.nis, float(result.gated)
+
+
+def innovations_from_rows(rows: list[tuple[float, ...]]) -> Innovations:
+    """Return innovations from their rows."""
+    table = np.array(rows).reshape(-1, 9)
+    return Innovations(
+        time=table[:, 0],
+        residual_W=table[:, 1:4],
+        sigma=table[:, 4:7],
+        nis=table[:, 7],
+        gated=table[:, 8] > 0.5,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Frame transforms: shift and turn from a track's own frame to the frame of the fixes.
+"""Frame transforms: shift and turn from a track's own frame to that of the fixes; the map's state.
 
 In the terms of ROS REP 105, the track starts in an `odom` frame of its own and a transform takes it
 to `map`. The uncertainty of a transform is added to the covariance of the states before it as if
@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.changed import changed
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.filter.planar_alignment import PlanarAlignment
+from stario.fusion.lie import UNKNOWN_YAW
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.sequence import FloatArray, Trajectory
 
 _E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -106,6 +107,63 @@ class FrameTransform:
             covariance=covariance,
             map_frame=state.map_frame + 1,
         )
+
+
+def unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
+    """Return a transform that keeps a stretch in place but makes its yaw about a pivot unknown."""
+    zero = np.zeros(3)
+    return FrameTransform(
+        math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MapFrameState:
+    """State of the map frame.
+
+    Attributes:
+        placed: whether the track's position in it is known.
+        oriented: whether the track's yaw in it is known.
+        transforms: frame transforms so far, which bring earlier states to the current frame.
+        pivot: (3,) point about which the track may be turned [m].
+        since: time before which the next transforms leave the track as it is [s].
+        pivot_variance: variance of the position that placed it, summed over x and y [m^2].
+        alignment: positions since it was placed, relative to the pivot, while its yaw is unknown.
+        distance_mismatches: number of latest positions in a row whose distance from the pivot
+            differs from the track's.
+        outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
+        unoriented: yaw uncertainty of stretches that were placed before a gap and never oriented,
+            applied once the frame is oriented.
+        jumps: number of times that the track, not the positions, proved to be wrong.
+        yaw_variance: variance of the track's own yaw when it was placed [rad^2].
+        since_jump: number of positions since the last jump.
+        arbitrary_yaw: whether the track's covariance does not know that its yaw is not the map's:
+            that of the start, zero without a pose, or one that has proved to be wrong.
+    """
+
+    placed: bool
+    oriented: bool
+    transforms: tuple[FrameTransform, ...] = ()
+    pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
+    since: float = -math.inf
+    pivot_variance: float = math.inf
+    alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
+    distance_mismatches: int = 0
+    outlier_residuals: tuple[FloatArray, ...] = ()
+    unoriented: tuple[FrameTransform, ...] = ()
+    jumps: int = 0
+    yaw_variance: float = 0.0
+    arbitrary_yaw: bool = False
+    since_jump: float = math.inf
+
+    @property
+    def undirected(self) -> tuple[FrameTransform, ...]:
+        """Yaw uncertainty in the map of stretches that were placed and not yet oriented."""
+        if self.oriented:
+            return ()
+        if not (self.placed and self.arbitrary_yaw):
+            return self.unoriented
+        return (*self.unoriented, unoriented_stretch(self.pivot, self.since, math.inf))
 
 
 def _turn_moments(variance: float) -> tuple[float, float, float]:

@@ -1,10 +1,9 @@
 """Width of the gyroscope bias's prior, adapted to what is known about the bias.
 
 README.md, "Noise and the gyroscope's bias". Most devices correct their bias to 0.001 rad/s, some to
-0.005 rad/s and some not at all, and no single Gaussian fits all of them. The
-prior's width therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at
-which it could flip: wide while gravity has provided little information about the bias, narrow once
-the bias proves small, wide where it is large or where the data clearly put it outside the prior.
+0.005 rad/s and some not at all, and no single Gaussian fits all of them. The prior's width
+therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at which it could
+flip.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
-from stario.fusion.filter.alternative import HypothesisPair
+from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
 from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
 
@@ -73,15 +72,6 @@ class GyroBiasPrior:
     uncorrected: float = 0.0
     evidence: float = 0.0
     refused_seconds: float = 0.0
-
-    @classmethod
-    def first(cls, sigma: float) -> GyroBiasPrior:
-        """Create the initial prior."""
-        return cls(sigma, sigma**2)
-
-    def before_levelling(self) -> GyroBiasPrior:
-        """Return the prior widened for the time before levelling has estimated the bias."""
-        return changed(self, variance=self.sigma**2 + (_SHARED_FRACTION * BIAS_SIGMA) ** 2)
 
     def updated(
         self,
@@ -141,12 +131,14 @@ class AdaptiveBiasPrior:
 
     def __init__(self, hypotheses: HypothesisPair, config: NavigatorConfig, start: float) -> None:
         self._hypotheses, self._config, self._start = hypotheses, config, start
-        self.prior = GyroBiasPrior.first(max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA))
+        sigma = max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA)
+        self.prior = GyroBiasPrior(sigma, sigma**2)
 
     def begin(self) -> None:
         """Widen the prior for the time before gravity provides information."""
         if self._config.filter.adaptive:
-            self._replace_prior(self.prior.before_levelling())
+            variance = self.prior.sigma**2 + (_SHARED_FRACTION * BIAS_SIGMA) ** 2
+            self._replace_prior(changed(self.prior, variance=variance))
 
     def update(self, interval: ImuInterval) -> None:
         """Adapt the prior after an interval to what gravity and the data show about the bias."""

@@ -4,17 +4,11 @@ README.md, "Magnetometer". The field's direction in the world is unknown, and in
 
     azimuth = c + g,   c constant and unknown at first, g Gauss-Markov over metres and seconds
 
-The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A common turn of yaw and
-azimuth is unobservable, so yaw remains as unobservable as it was; its rate, the gyroscope's
-vertical bias, becomes observable. Steel that turns the field changes its size and dip as well: how
-much these vary along the path indicates how far the azimuth wanders there. A field of unusual size
+The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A field of unusual size
 or dip for the place has less weight, as does one that the device has extrapolated by its own
-gyroscope instead of measuring it; one that contradicts the rest is an outlier like any other. While
-the field does not rotate against the device as the gyroscope does (other axes, a magnet attached),
-it is not used. If a declination is given, and only then, the field determines north once, as a fix
-of yaw.
-
-The field varies slowly and its errors are correlated over metres: two bearings a second suffice.
+gyroscope; one that contradicts the rest is an outlier like any other. If a declination is given,
+and only then, the field determines north once, as a fix of yaw. The field varies slowly and its
+errors are correlated over metres: two bearings a second suffice.
 """
 
 from __future__ import annotations
@@ -24,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.lie import yaw_twist
+from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
@@ -171,15 +165,6 @@ class MagneticReference:
         """Sigma of the azimuth about its mean [rad], from the variation of size and dip."""
         return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
-    @property
-    def bearing_sigma(self) -> float:
-        """White noise of a bearing in a field of usual size and dip [rad]."""
-        return BEARING_SIGMA * self.wander_sigma / WANDER_SIGMA
-
-    def is_held(self, measured: float) -> bool:
-        """Return whether a field of this size [uT] is the last one, extrapolated by the device."""
-        return abs(measured - self.measured) < HELD_CHANGE * measured
-
     def is_due(self, time: float) -> bool:
         """Return whether a bearing may be applied at a time [s]."""
         return time - self.time > PERIOD - 1e-6
@@ -283,12 +268,13 @@ def update_bearing(
     if reference.contradicts_gyro:
         reason = "contradicts the gyroscope"
         return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
-    extrapolated = reference.is_held(measured)
+    extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     unusual = math.hypot(
         (size / reference.size - 1.0) / _SIZE_TOLERANCE, (dip - reference.dip) / _DIP_TOLERANCE
     )
     factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
-    variance = reference.bearing_sigma**2 * (1.0 + unusual**2) * factor
+    sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
+    variance = sigma**2 * (1.0 + unusual**2) * factor
     return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -1,34 +1,25 @@
 """The map frame: shift and turn of the track's own frame to the frame of the fixes.
 
-A track that starts without a pose sets its first position and first yaw to zero. The first position
-fix shifts this frame so that the track passes through the fix; the covariance of the absolute
-position is then that of the fix. The first fix that determines the direction turns the frame about
-that point: a second position far enough away, several nearer ones together, a velocity, or a yaw.
-Neither is a small correction, so neither goes through the filter's linearisation: the frame is
-transformed exactly (and the right-invariant error with it), then the covariance is inflated as if
-this shift or turn were unknown, then the fix is an ordinary measurement (README.md, "Fixes").
-
-After a gap in which the direction was lost, the same applies to the track from there on: the next
-position places it, the next direction turns it, and the track before the gap stays where it is. If
-the direction of that part was never determined, it is unknown once the frame has a direction. A
-track that no fix has placed yet stays in one piece across the gap.
+README.md, "Fixes". A track that starts without a pose sets its first position and first yaw to
+zero. The fixes that place and orient it are no small corrections and do not go through the filter's
+linearisation: the frame is transformed exactly (and the right-invariant error with it), then the
+covariance is inflated as if this shift or turn were unknown, then the fix is an ordinary update.
+After a gap in which the direction was lost, the same applies to the track from there on.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.linalg import norm
 
-from stario.fusion.changed import changed
+from stario.fusion.filter.displacements import with_turn
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.frame_transform import FrameTransform
-from stario.fusion.filter.innovations import is_gated
-from stario.fusion.filter.network_turn import with_turn
+from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
+from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.planar_alignment import (
     PlanarAlignment,
     plane_sigma,
@@ -37,10 +28,9 @@ from stario.fusion.filter.planar_alignment import (
 )
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW
-from stario.fusion.state import NavState
+from stario.fusion.state import NavState, changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.sequence import FloatArray
 
 MAX_PRIOR_YAW_SIGMA = 0.5
 """A first yaw with a sigma up to this [rad] is kept; a coarser one is replaced by the fixes'."""
@@ -73,62 +63,11 @@ _INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
 more than this [m], beyond which the covariance keeps no digits for the fix."""
 
 
-@dataclass(frozen=True, eq=False)
-class MapFrameState:
-    """State of the map frame.
-
-    Attributes:
-        placed: whether the track's position in it is known.
-        oriented: whether the track's yaw in it is known.
-        transforms: frame transforms so far, which bring earlier states to the current frame.
-        pivot: (3,) point about which the track may be turned [m].
-        since: time before which the next transforms leave the track as it is [s].
-        pivot_variance: variance of the position that placed it, summed over x and y [m^2].
-        alignment: positions since it was placed, relative to the pivot, while its yaw is unknown.
-        distance_mismatches: number of latest positions in a row whose distance from the pivot
-            differs from the track's.
-        outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
-        unoriented: yaw uncertainty of stretches that were placed before a gap and never oriented,
-            applied once the frame is oriented.
-        jumps: number of times that the track, not the positions, proved to be wrong.
-        yaw_variance: variance of the track's own yaw when it was placed [rad^2].
-        since_jump: number of positions since the last jump.
-        arbitrary_yaw: whether the track's covariance does not know that its yaw is not the map's:
-            that of the start, zero without a pose, or one that has proved to be wrong.
-    """
-
-    placed: bool
-    oriented: bool
-    transforms: tuple[FrameTransform, ...] = ()
-    pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
-    since: float = -math.inf
-    pivot_variance: float = math.inf
-    alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
-    distance_mismatches: int = 0
-    outlier_residuals: tuple[FloatArray, ...] = ()
-    unoriented: tuple[FrameTransform, ...] = ()
-    jumps: int = 0
-    yaw_variance: float = 0.0
-    arbitrary_yaw: bool = False
-    since_jump: float = math.inf
-
-    @property
-    def undirected(self) -> tuple[FrameTransform, ...]:
-        """Yaw uncertainty in the map of stretches that were placed and not yet oriented."""
-        if self.oriented:
-            return ()
-        if not (self.placed and self.arbitrary_yaw):
-            return self.unoriented
-        return (*self.unoriented, _unoriented_stretch(self.pivot, self.since, math.inf))
-
-
 class MapFrame:
     """Fix updates of a filter, with the transforms of its frame that they require.
 
     Args:
-        pivot: (3,) first position [m]; None if not given.
-        pivot_sigma: standard deviation of the first position, per axis [m].
-        oriented: whether the first yaw was given.
+        prior: prior on the first pose; None if the track starts without one.
         gate: probability of the chi-square test.
         turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
 
@@ -136,19 +75,12 @@ class MapFrame:
         state: state of the map frame.
     """
 
-    def __init__(
-        self,
-        pivot: FloatArray | None,
-        pivot_sigma: float,
-        oriented: bool,
-        gate: float,
-        turn_sigma: float,
-    ) -> None:
-        self.state = (
-            MapFrameState(False, oriented, arbitrary_yaw=not oriented)
-            if pivot is None
-            else MapFrameState(True, oriented, pivot=pivot, pivot_variance=2.0 * pivot_sigma**2)
-        )
+    def __init__(self, prior: PriorPose | None, gate: float, turn_sigma: float) -> None:
+        self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
+        if prior is not None:
+            oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
+            variance = 2.0 * prior.position_sigma**2
+            self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
         self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
@@ -177,7 +109,7 @@ class MapFrame:
         since = now.time if s.placed else s.since  # an unplaced track stays in one piece
         unoriented = s.unoriented
         if not s.oriented:
-            unoriented = (*unoriented, _unoriented_stretch(s.pivot, s.since, now.time))
+            unoriented = (*unoriented, unoriented_stretch(s.pivot, s.since, now.time))
         self.state = MapFrameState(
             False, False, s.transforms, now.p_W, since, unoriented=unoriented, jumps=s.jumps
         )
@@ -289,7 +221,7 @@ class MapFrame:
         self.state = changed(self.state, since_jump=self.state.since_jump + 1)
         result = ekf.update_position_W(fix.value, fix.covariance, gate)
         residual = result.residual
-        if residual is None or not is_gated(result):
+        if residual is None or not result.gated:
             self.state = changed(self.state, outlier_residuals=())
             return result
         aligned = tuple(
@@ -316,14 +248,6 @@ class MapFrame:
             self.state, oriented=False, since=fix.time, arbitrary_yaw=True, since_jump=math.inf
         )
         self._begin_alignment(ekf, fix)
-
-
-def _unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
-    """Return a transform that keeps a stretch in place but makes its yaw about a pivot unknown."""
-    zero = np.zeros(3)
-    return FrameTransform(
-        math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
-    )
 
 
 def _nav_state(ekf: StateCloningEkf) -> NavState:

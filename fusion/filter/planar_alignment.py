@@ -1,12 +1,7 @@
 """Direction of a track from one fix, or from several position fixes together.
 
 A single position far enough from the first determines the direction. In a room none is, but several
-suffice: with track t_k and fixes f_k as complex numbers, each of variance s_k^2 per axis (that of
-the fix and of the track's drift since),
-
-    C = sum conj(t_k - t_mean) (f_k - f_mean) / s_k^2      turn = arg C      sigma^2 = 1 / |C|
-
-the weighted fit of a turn and a shift in the plane (README.md, "Fixes").
+suffice, by the weighted fit of a turn and a shift in the plane (README.md, "Fixes").
 """
 
 from __future__ import annotations

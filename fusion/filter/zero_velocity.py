@@ -1,10 +1,14 @@
-"""Zero-velocity and zero-rate update (ZUPT, ZARU) of a device at rest.
+"""Zero-velocity and zero-rate update (ZUPT, ZARU) of a device at rest; detection of rest.
 
-README.md, "Zero velocity". Zero velocity is measured in the estimated axes, so it contains no
-information about yaw. The mean rate in the middle of the still second measures the gyroscope's
-bias; both halves of the second are at rest, so the onset of motion is not mistaken for bias. A turn
-too slow to be distinguished from bias makes the means of the second's parts differ; their variance
-is taken as that of the measurement, for the whole second.
+README.md, "Zero velocity". A hand's tremor or a trolley's wheels exceed the bound of a still second
+(`stario.sequences.inspection.stillness`). A smooth glide looks still as well and is left to the
+update's own chi-square test.
+
+Zero velocity is measured in the estimated axes, so it contains no information about yaw. The mean
+rate in the middle of the still second measures the gyroscope's bias; both halves of the second are
+at rest, so the onset of motion is not mistaken for bias. A turn too slow to be distinguished from
+bias makes the means of the second's parts differ; their variance is taken as that of the
+measurement, for the whole second.
 """
 
 from __future__ import annotations
@@ -15,7 +19,8 @@ import numpy as np
 
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.imu.stillness import StillnessDetector
+from stario.fusion.imu.intervals import ImuInterval
+from stario.sequences.inspection.stillness import looks_still, scatter_bound
 from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -37,18 +42,71 @@ class ZeroVelocity(NamedTuple):
     measurement of the whole last second."""
 
 
-def zero_velocity(stillness: StillnessDetector) -> ZeroVelocity:
-    """Return the measurement of a still second.
+class StillnessDetector:
+    """Detects whether the device was still over the last second.
 
-    The velocity's uncertainty is what white noise of a phone's accelerometer can hide over the
-    second: nothing moves, so the filter's own density, which covers motion, does not apply here.
+    Args:
+        intervals: number of intervals per second.
+        scale: factor on the noise densities of a phone's IMU; 0 never detects.
+
+    Attributes:
+        window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
+            and accel, sums of their squares; None if it moves more than a still second may.
     """
-    rates = stillness.mean_rates()
-    n = len(rates)
-    hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
-    white_variance = PHONE_NOISE.gyro_noise**2 / stillness.mean_seconds()
-    rate_variance = np.maximum(rates.var(axis=0), white_variance)
-    return ZeroVelocity(rates[n // 2], np.diag([*[n * hidden_variance] * 3, *(n * rate_variance)]))
+
+    def __init__(self, intervals: int, scale: float) -> None:
+        self._intervals, self._scale = intervals, scale
+        self.window: tuple[FloatArray | None, ...] = ()
+
+    def is_still(self, interval: ImuInterval) -> bool:
+        """Add an interval; return whether the device was still over the second ending with it."""
+        if self._scale == 0.0:
+            return False
+        if interval.gap:
+            self.window = ()
+            return False
+        sums = None if self._moves(interval) else _sums_of(interval)
+        self.window = (*self.window, sums)[-self._intervals :]
+        calm = [sums for sums in self.window if sums is not None]
+        return len(calm) == self._intervals and self._is_quiet(np.sum(calm, axis=0))
+
+    def measurement(self) -> ZeroVelocity:
+        """Return the measurement of a still second.
+
+        The velocity's uncertainty is what white noise of a phone's accelerometer can hide over the
+        second: nothing moves, so the filter's own density, which covers motion, does not apply.
+        """
+        table = np.array(self.window)
+        rates = table[:, 2:5] / table[:, :1]
+        n = len(rates)
+        hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
+        white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
+        rate_variance = np.maximum(rates.var(axis=0), white_variance)
+        variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
+        return ZeroVelocity(rates[n // 2], np.diag(variances))
+
+    def _moves(self, interval: ImuInterval) -> bool:
+        """Return whether an interval's specific force scatters more than a still second's may."""
+        accel = interval.accel[1:]
+        count = len(accel)
+        total = accel.sum(axis=0)
+        scatter = float(np.vdot(accel, accel) - total @ total / count)
+        seconds = (interval.stop - interval.start) * self._intervals
+        bound = scatter_bound(count * self._intervals, seconds, self._scale)
+        return not looks_still(0.0, scatter, bound)
+
+    def _is_quiet(self, sums: FloatArray) -> bool:
+        """Return whether a second with these sums scatters no more than a still one may."""
+        count = float(sums[0])
+        scatter = sums[8:14] - np.square(sums[2:8]) / count
+        bound = scatter_bound(count, float(sums[1]), self._scale)
+        return looks_still(float(scatter[:3].sum()), float(scatter[3:].sum()), bound)
+
+
+def _sums_of(interval: ImuInterval) -> FloatArray:
+    rows = np.hstack([interval.gyro[1:], interval.accel[1:]])
+    totals = np.ones(len(rows)) @ rows, np.einsum("ni,ni->i", rows, rows)
+    return np.concatenate([(len(rows), interval.stop - interval.start), *totals])
 
 
 def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: float) -> UpdateResult:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,21 +24,6 @@ _UNKNOWN_POSITION = 1e4
 """Standard deviation of a position determined by fixes alone [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """A smoothed track.
-
-    Attributes:
-        states: one for each filtered state, at the same times.
-        note: one-line summary for the health report.
-        fell_back: whether the optimisation failed and the states are the filter's.
-    """
-
-    states: list[NavState]
-    note: str
-    fell_back: bool = False
-
-
 def smooth(
     filtered: Sequence[NavState],
     prior: NavState,
@@ -47,7 +32,7 @@ def smooth(
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
     turn_sigma: float = 0.0,
-) -> Smoothed:
+) -> tuple[list[NavState], str]:
     """Optimise a filtered track as a whole.
 
     Args:
@@ -61,8 +46,8 @@ def smooth(
         turn_sigma: standard deviation of the network's turn [rad]; 0 if the filter estimates none.
 
     Returns:
-        The graph's states with their marginal covariances; the filtered ones if the graph does
-        not determine a state.
+        The graph's states, one for each filtered one, with their marginal covariances; the filtered
+        ones if the graph does not determine a state. And a one-line summary for the health report.
     """
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
@@ -77,7 +62,7 @@ def smooth(
     try:
         solution = builder.graph.solve()
     except IndeterminateError as error:
-        return Smoothed(list(filtered), f"graph fell back to the filter's track: {error}", True)
+        return list(filtered), f"graph fell back to the filter's track: {error}"
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
     states = [
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
@@ -87,7 +72,7 @@ def smooth(
         f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
         f"{solution.down_weighted} measurements down-weighted"
     )
-    return Smoothed(states, note)
+    return states, note
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.displacements import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.estimator_state import Displacement as Measured
-from stario.fusion.filter.network_turn import CORRELATION_SECONDS as TURN_SECONDS
-from stario.fusion.filter.network_turn import TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
@@ -19,7 +18,6 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import (
     Segment,
-    gap_segment,
     gap_yaw_variance,
     segment_of,
     segment_of_all,
@@ -94,11 +92,6 @@ class GraphBuilder:
         """Whether the network's turn is a state."""
         return self._turn_sigma > 0.0
 
-    @property
-    def newest(self) -> Segment:
-        """Segment that ends now, after the last keyframe."""
-        return self.segments[self.graph.last][-1]
-
     def step(
         self,
         interval: ImuInterval,
@@ -126,10 +119,17 @@ class GraphBuilder:
             self.close()
             self._window_keyframes.clear()
         if interval.restart is not None and guess is not None:
-            self._begin_disconnected(guess)
+            # Continue from the filter's new start after a gap too long to be bridged.
+            self.count = 0
+            k = self.graph.add_disconnected(guess)
+            self.segments[k] = []
+            self._window_keyframes[0] = k
             return True
         self.count = 0 if interval.gap else self.count + 1
-        self._append(interval, segment)
+        if segment is None or interval.gap:
+            segment = self._segment_of(interval)
+        self.segments[self.graph.last].append(segment)
+        self._pending.append(interval.without_window())
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
@@ -193,28 +193,15 @@ class GraphBuilder:
             R, v, p = end
         return R, v, p
 
-    def _begin_disconnected(self, state: NavState) -> None:
-        """Continue from the filter's new start after a gap too long to be bridged."""
-        self.count = 0
-        k = self.graph.add_disconnected(state)
-        self.segments[k] = []
-        self._window_keyframes[0] = k
-
-    def _append(self, interval: ImuInterval, segment: Segment | None = None) -> None:
-        if segment is None or interval.gap:
-            segment = self._segment_of(interval)
-        self.segments[self.graph.last].append(segment)
-        self._pending.append(interval.without_window())
-
     def _segment_of(self, interval: ImuInterval) -> Segment:
         """Preintegrate; a gap includes a pedestrian's turn, which the filter adds to its state."""
         last = self.graph.last
         R, _, _, b_g, b_a = self.graph.pose(last)
-        if not interval.gap:
-            return segment_of(interval, R, b_g, b_a, self._config)
-        self._gaps.append(last)
-        turned = gap_yaw_variance(interval.stop - interval.start)
-        return gap_segment(interval.start, interval.stop, R, b_g, b_a, self._config, turned)
+        turned = 0.0
+        if interval.gap:
+            self._gaps.append(last)
+            turned = gap_yaw_variance(interval.stop - interval.start)
+        return segment_of(interval, R, b_g, b_a, self._config, turned)
 
     def _add_displacement(
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray

@@ -14,25 +14,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.displacements import TurnEstimate
+from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.lie import twist, yaw_rotation
+from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
 _EYE = np.eye(3)
 
+_MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
+"""Lower bounds of a prior's variances and of its correlations' eigenvalues: less is rounding."""
 
-class Linearised(NamedTuple):
-    """Residual (m,) of a term and the Jacobian blocks (key, (m, width)) of its prediction."""
 
-    residual: FloatArray
-    blocks: list[tuple[int, FloatArray]]
+Linearised = tuple[FloatArray, list[tuple[int, FloatArray]]]
+"""Residual (m,) of a term and the Jacobian blocks (key, (m, width)) of its prediction."""
 
 
 class Term(Protocol):
@@ -41,16 +43,38 @@ class Term(Protocol):
     @property
     def keyframes(self) -> tuple[int, ...]:
         """Numbers of the measured keyframes, in order."""
-        ...
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance (m, m), in the axes of the residual."""
-        ...
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise at gtsam `Values`."""
-        ...
+
+
+@dataclass(frozen=True, eq=False)
+class AtKeyframe:
+    """Base of the measurements of one keyframe `k`, the last one at or before the measurement."""
+
+    k: int
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """The measured keyframe."""
+        return (self.k,)
+
+
+@dataclass(frozen=True, eq=False)
+class Between:
+    """Base of the measurements of two keyframes, `i` and the later `j`."""
+
+    i: int
+    j: int
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Both keyframes."""
+        return self.i, self.j
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +100,19 @@ class Prior:
     offset: FloatArray
     turns: tuple[tuple[int, float], ...] = ()
 
+    @classmethod
+    def of(cls, k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
+        """Return the prior of keyframe k from a state and the network's turn, if estimated."""
+        reference = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
+        covariance: FloatArray = state.covariance
+        turns: tuple[tuple[int, float], ...] = ()
+        if turn is not None:
+            cross = turn.covariance[:CORE, None]
+            covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
+            turns = ((k, turn.turn),)
+        root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
+        return cls(k, (reference,), root, np.zeros(len(root)), turns)
+
     @property
     def keyframes(self) -> tuple[int, ...]:
         """All keyframes of the prior."""
@@ -98,11 +135,11 @@ class Prior:
         for n, (k, turn) in enumerate(self.turns, CORE * len(self.reference)):
             residual = residual - self.root[:, n] * (turn_at(values, k) - turn)
             blocks.append((T(k), self.root[:, n : n + 1]))
-        return Linearised(residual, blocks)
+        return residual, blocks
 
 
 @dataclass(frozen=True, eq=False)
-class Displacement:
+class Displacement(Between):
     """The network's displacement from keyframe i to keyframe j.
 
     The network is given the window in a levelled frame N, whose yaw psi relative to W is that of
@@ -111,8 +148,6 @@ class Displacement:
     tilt from it, which on some recordings doubles the error.
 
     Attributes:
-        i: keyframe at the window's start.
-        j: keyframe at its end.
         d_N: (3,) displacement [m].
         R_NB: (3, 3) levelled attitude at the window's start.
         covariance: (3, 3) [m^2] in N.
@@ -120,17 +155,10 @@ class Displacement:
             d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md, "Fixes").
     """
 
-    i: int
-    j: int
     d_N: FloatArray
     R_NB: FloatArray
     covariance: FloatArray
     turned: bool = False
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """Start and end of the window."""
-        return self.i, self.j
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the axes of N."""
@@ -147,29 +175,20 @@ class Displacement:
         predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
         if self.turned:
             blocks.append((T(self.j), np.array([[-predicted[1]], [predicted[0]], [0.0]])))
-        return Linearised(self.d_N - predicted, blocks)
+        return self.d_N - predicted, blocks
 
 
 @dataclass(frozen=True, eq=False)
-class TurnProcess:
+class TurnProcess(Between):
     """Gauss-Markov model of the network's turn: tau_j = correlation tau_i + n.
 
     Attributes:
-        i: keyframe of the previous turn.
-        j: keyframe of this turn.
         correlation: correlation of the two turns; 0 for the first turn, where i is j.
         covariance: (1, 1) covariance of n [rad^2].
     """
 
-    i: int
-    j: int
     correlation: float
     covariance: FloatArray
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """Keyframes of both turns."""
-        return self.i, self.j
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise about the vertical."""
@@ -177,31 +196,24 @@ class TurnProcess:
         blocks = [(T(self.j), np.eye(1))]
         if self.i != self.j:
             blocks.append((T(self.i), -self.correlation * np.eye(1)))
-        return Linearised(np.array([self.correlation * before - now]), blocks)
+        return np.array([self.correlation * before - now]), blocks
 
 
 @dataclass(frozen=True, eq=False)
-class Position:
+class Position(AtKeyframe):
     """A position some time after a keyframe: p_k + dt v_k + dp_W.
 
     Attributes:
-        k: keyframe before the measurement.
         p_W: (3,) position [m].
         covariance: (3, 3) [m^2].
         dt: time since the keyframe [s].
         dp_W: (3,) displacement beyond p_k + dt v_k until then, by the IMU [m].
     """
 
-    k: int
     p_W: FloatArray
     covariance: FloatArray
     dt: float
     dp_W: FloatArray
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """The preceding keyframe."""
-        return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in W."""
@@ -209,55 +221,41 @@ class Position:
         predicted = p + self.dt * values.atVector(V(self.k)) + self.dp_W
         H = np.zeros((3, 6))
         H[:, 3:] = R
-        return Linearised(self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)])
+        return self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)]
 
 
 @dataclass(frozen=True, eq=False)
-class Velocity:
+class Velocity(AtKeyframe):
     """A velocity some time after a keyframe: v_k + dv_W.
 
     Attributes:
-        k: keyframe before the measurement.
         v_W: (3,) velocity [m/s].
         covariance: (3, 3) [m^2/s^2].
         dv_W: (3,) change of velocity until then, by the IMU [m/s].
     """
 
-    k: int
     v_W: FloatArray
     covariance: FloatArray
     dv_W: FloatArray
 
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """The preceding keyframe."""
-        return (self.k,)
-
     def linearise(self, values: Any) -> Linearised:
         """Linearise in W."""
         predicted = values.atVector(V(self.k)) + self.dv_W
-        return Linearised(self.v_W - predicted, [(V(self.k), _EYE)])
+        return self.v_W - predicted, [(V(self.k), _EYE)]
 
 
 @dataclass(frozen=True, eq=False)
-class Yaw:
+class Yaw(AtKeyframe):
     """A yaw some time after a keyframe, at any attitude of the device.
 
     Attributes:
-        k: keyframe before the measurement.
         R_WB: (3, 3) attitude of the keyframe that explains the measurement: the estimate turned
             about the vertical by measured minus estimated yaw.
         covariance: (1, 1) [rad^2].
     """
 
-    k: int
     R_WB: FloatArray
     covariance: FloatArray
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """The preceding keyframe."""
-        return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise about the vertical."""
@@ -265,32 +263,33 @@ class Yaw:
         residual = math.atan2(*twist(self.R_WB @ R.T))
         H = np.zeros((1, 6))
         H[0, :3] = R[2]
-        return Linearised(np.array([residual]), [(X(self.k), H)])
+        return np.array([residual]), [(X(self.k), H)]
 
 
 @dataclass(frozen=True, eq=False)
-class GyroBias:
+class GyroBias(AtKeyframe):
     """The gyroscope's bias, measured at rest, by a prior or by the magnetic field.
 
     Attributes:
-        k: keyframe.
         b_g: (3,) bias [rad/s].
         covariance: (3, 3) [rad^2/s^2].
     """
 
-    k: int
     b_g: FloatArray
     covariance: FloatArray
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """The measured keyframe."""
-        return (self.k,)
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
-        return Linearised(residual, [(B(self.k), np.eye(3, 6, k=3))])
+        return residual, [(B(self.k), np.eye(3, 6, k=3))]
+
+
+def _root_information(covariance: FloatArray) -> FloatArray:
+    """Return a square root of the inverse, with eigenvalues bounded below against rounding."""
+    scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    values = np.maximum(values, _MIN_EIGENVALUE)
+    return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
 def turn_at(values: Any, k: int) -> float:

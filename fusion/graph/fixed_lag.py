@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
@@ -21,7 +22,6 @@ from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import gained_bias_information
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.network_turn import turn_estimate
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
@@ -106,7 +106,7 @@ class FixedLagEstimator:
         ):
             self._solve()
         else:
-            self._ahead.propagate(self._builder.newest)
+            self._ahead.propagate(self._builder.segments[self._builder.graph.last][-1])
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Apply a fix at a time before now; as `Estimator.late_fix`."""
@@ -151,7 +151,7 @@ class FixedLagEstimator:
         """Return the newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
         states = [nav_states([ahead])[0].shifted(self._origin_W)]
-        return with_undirected(states, self._filter.map_frame_state.undirected)[0]
+        return with_undirected(states, self._filter.frame.state.undirected)[0]
 
     def health(self, counts: SampleCounts) -> Health:
         """Return the filter's report with the graph's sigmas and the number of fallbacks."""
@@ -165,14 +165,15 @@ class FixedLagEstimator:
     @property
     def _stale(self) -> bool:
         """Whether the filter has since changed the state from which the graph began."""
-        wider = self._filter.bias_prior.variance > _WIDER * self._bias_prior
+        wider = self._filter.bias.prior.variance > _WIDER * self._bias_prior
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
-        jumped = self._filter.map_frame_state.jumps != self._jumps
-        return wider or turned or jumped or self._filter.map_frame != self._map_frame
+        frame = self._filter.frame.state
+        jumped = frame.jumps != self._jumps
+        return wider or turned or jumped or len(frame.transforms) != self._map_frame
 
     def _narrow_bias_prior(self) -> None:
         """Narrow the prior as the filter did: add its information as a measurement of zero."""
-        variance = self._filter.bias_prior.variance
+        variance = self._filter.bias.prior.variance
         if variance < _NARROWER * self._bias_prior:
             pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
             self._add_bias_information(np.zeros(3), pseudo_variance * np.eye(3))
@@ -190,13 +191,13 @@ class FixedLagEstimator:
         """Begin a new graph from the filter's state."""
         first = nav_states([self._filter.estimate()])[0]
         self._map_frame, self._origin_W = first.map_frame, first.p_W
-        self._jumps = self._filter.map_frame_state.jumps
-        self._bias_prior = self._filter.bias_prior.variance
+        self._jumps = self._filter.frame.state.jumps
+        self._bias_prior = self._filter.bias.prior.variance
         first = first.shifted(-self._origin_W)
         turn = turn_estimate(self._filter.ekf.state)
         sigma = 0.0 if turn is None else self._config.filter.network_turn_sigma
         self._builder = GraphBuilder(self._config, first, count, sigma, turn, streaming=True)
-        self._restart_from(first)
+        self._ahead.initialise(first)
 
     def _solve(self) -> None:
         builder = self._builder
@@ -209,9 +210,6 @@ class FixedLagEstimator:
             self._fallbacks = (self._fallbacks[0] + 1, str(error))
             self._begin(builder.count)
             return
-        self._restart_from(newest)
+        self._ahead.initialise(newest)
         for segment in builder.segments[graph.last]:
             self._ahead.propagate(segment)
-
-    def _restart_from(self, s: NavState) -> None:
-        self._ahead.initialise(s)

@@ -20,8 +20,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
-from stario.fusion.filter.jacobians import CORE, plain_covariance
-from stario.fusion.filter.network_turn import TurnEstimate
+from stario.fusion.filter.displacements import TurnEstimate
 from stario.fusion.graph.factors import Prior, Term, TurnProcess, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
@@ -35,9 +34,6 @@ _CONVERGED = 1e-3
 
 _UNDETERMINED_SIGMA = 1e5
 """A state this uncertain [m, m/s, rad, ...] is undetermined: no walk is so far, fast or biased."""
-
-_MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
-"""Lower bounds of a prior's variances and of its correlations' eigenvalues: less is rounding."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
@@ -78,7 +74,7 @@ class KeyframeGraph:
         self._insert(first)
         if turn is not None:
             self._turns[0] = turn.turn
-        self.add(_prior(0, first, turn), gated=False)
+        self.add(Prior.of(0, first, turn), gated=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the solution: after restoring, call `solve` before `state`."""
@@ -102,7 +98,7 @@ class KeyframeGraph:
     def add_disconnected(self, state: NavState) -> int:
         """Add a disconnected keyframe with its covariance as prior; return its number."""
         self._insert(state)
-        self.add(_prior(self.last, state), gated=False)
+        self.add(Prior.of(self.last, state), gated=False)
         return self.last
 
     def add(self, term: Term, gated: bool = True) -> None:
@@ -278,27 +274,6 @@ class KeyframeGraph:
         if match is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"
-
-
-def _prior(k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
-    """Return the prior of a keyframe from a state's covariance and that of the network's turn."""
-    reference = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-    covariance: FloatArray = state.covariance
-    turns: tuple[tuple[int, float], ...] = ()
-    if turn is not None:
-        cross = turn.covariance[:CORE, None]
-        covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
-        turns = ((k, turn.turn),)
-    root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
-    return Prior(k, (reference,), root, np.zeros(len(root)), turns)
-
-
-def _root_information(covariance: FloatArray) -> FloatArray:
-    """Return a square root of the inverse, with eigenvalues bounded below against rounding."""
-    scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    values = np.maximum(values, _MIN_EIGENVALUE)
-    return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
 def _uninformative_factor(k: int, has_turn: bool) -> Any:

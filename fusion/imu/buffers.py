@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.state import changed
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
@@ -36,16 +38,6 @@ class Block:
     flagged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Window:
-    """The last second; `ImuInterval` documents the values."""
-
-    imu_N: NDArray[np.float32]
-    R_NB: FloatArray
-    heading: float
-    flagged: bool
-
-
 _TAIL_SAMPLES = 4
 """Samples kept from the previous interval: half a step of the window's grid at the fastest rate."""
 
@@ -67,35 +59,33 @@ class WindowBuffer:
         self._blocks.clear()
         self._tail = None
 
-    def add(
-        self,
-        time: FloatArray,
-        gyro: FloatArray,
-        accel: FloatArray,
-        attitudes: FloatArray,
-        flagged: bool,
-    ) -> None:
-        """Add the next interval: its samples and the levelled attitudes R_NB at them."""
-        rows = np.empty((len(time), 7))
-        rows[:, 0] = time
-        rows[:, 1:4] = (attitudes @ gyro[:, :, None])[:, :, 0]
-        rows[:, 4:] = (attitudes @ accel[:, :, None])[:, :, 0]
+    def add(self, interval: ImuInterval) -> None:
+        """Add the samples of the next interval."""
+        attitudes, flags = interval.attitudes, interval.flags
+        rows = np.empty((len(interval.time), 7))
+        rows[:, 0] = interval.time
+        rows[:, 1:4] = (attitudes @ interval.gyro[:, :, None])[:, :, 0]
+        rows[:, 4:] = (attitudes @ interval.accel[:, :, None])[:, :, 0]
         tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
-        start = float(time[0])
         # The first average reaches half a grid step back, into the tail.
         samples = rows if tail is None else np.concatenate([tail, rows])
-        imu_N = resample(samples[:, 0], samples[:, 1:], start + self._grid).astype(np.float32).T
+        imu_N = resample(samples[:, 0], samples[:, 1:], interval.start + self._grid)
         R_NB = attitudes[0]
-        self._blocks.append(Block(imu_N, R_NB, facing(R_NB), flagged))
+        flagged = flags.gyro or flags.accel or flags.missing
+        self._blocks.append(Block(imu_N.astype(np.float32).T, R_NB, facing(R_NB), flagged))
 
-    def window(self) -> Window | None:
-        """Return the second that ends with the newest interval; None if it is not complete yet."""
+    def with_window(self, interval: ImuInterval) -> ImuInterval:
+        """Return the newest interval with the second that ends there, once that is complete."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
-            return None
-        imu_N = np.concatenate([block.imu_N for block in blocks], axis=1)
-        heading = float(mean_heading(np.array([block.facing_N for block in blocks])))
-        return Window(imu_N, blocks[0].R_NB, heading, any(block.flagged for block in blocks))
+            return interval
+        return changed(
+            interval,
+            window=np.concatenate([block.imu_N for block in blocks], axis=1),
+            R_NB_window=blocks[0].R_NB,
+            heading=float(mean_heading(np.array([block.facing_N for block in blocks]))),
+            window_flagged=any(block.flagged for block in blocks),
+        )
 
 
 _MAX_FIELDS = 1000

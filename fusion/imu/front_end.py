@@ -16,25 +16,23 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import deque
 from typing import Any
 
 import numpy as np
 
-from stario.fusion.changed import changed
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.buffers import FieldBuffer, WindowBuffer
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.imu.outliers import Flags, OutlierDetector
-from stario.fusion.imu.stream_checks import (
+from stario.fusion.imu.faults import (
     ClockSetBackDetector,
-    ClockSetBackError,
     FrozenSensorDetector,
     GyroUnitCheck,
+    OutlierDetector,
 )
+from stario.fusion.imu.intervals import Flags, ImuInterval, SampleCounts, Start
+from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray, ImuSequence
+from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
 from stario.sequences.windows import MAX_IMU_GAP
 
@@ -257,47 +255,8 @@ class FrontEnd:
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._fields.at(table[-1, 0])
         interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
-        flagged = flags.gyro or flags.accel or flags.missing
-        self._window.add(interval.time, interval.gyro, interval.accel, interval.attitudes, flagged)
-        window = self._window.window() if update else None
-        if window is None:
-            return interval
-        return changed(
-            interval,
-            window=window.imu_N,
-            R_NB_window=window.R_NB,
-            heading=window.heading,
-            window_flagged=window.flagged,
-        )
-
-
-def cut_recording(
-    sequence: ImuSequence, config: NavigatorConfig
-) -> tuple[list[ImuInterval], FrontEnd]:
-    """Cut a recording into intervals; return them and the front end with its counts and start.
-
-    Samples after the clock was set back are skipped, and the counts report it.
-    """
-    front_end = FrontEnd(config)
-    intervals: list[ImuInterval] = []
-    fields = (
-        deque()
-        if sequence.magnetometer is None
-        else deque(
-            zip(sequence.magnetometer.time.tolist(), sequence.magnetometer.field, strict=True)
-        )
-    )
-    for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
-        # A wild timestamp must not release all later fields at once.
-        while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
-            front_end.push_field(*fields.popleft())
-        try:
-            intervals += front_end.push(tuple(sample))
-        except ClockSetBackError as error:
-            front_end.counts.set_back = error.by
-            break
-    front_end.finish()
-    return intervals, front_end
+        self._window.add(interval)
+        return self._window.with_window(interval) if update else interval
 
 
 def _interval(

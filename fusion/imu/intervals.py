@@ -1,15 +1,16 @@
-"""Output of the front end: IMU intervals, the start from gravity, and sample counts."""
+"""Output of the front end: IMU intervals, split at fixes, the start from gravity, sample counts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.fusion.changed import changed
-from stario.fusion.imu.outliers import NO_FLAGS, Flags
-from stario.fusion.state import Health
+from stario.fusion.fixes import Fix
+from stario.fusion.state import Health, changed
 from stario.sequences.sequence import FloatArray
 
 
@@ -30,6 +31,28 @@ class Start:
     still: bool
     force: float
     rate: float
+
+
+class Flags(NamedTuple):
+    """Faults in a stretch of samples.
+
+    Attributes:
+        gyro: whether a sample of the gyroscope is saturated or was a spike.
+        accel: the same for the accelerometer.
+        spikes: number of samples replaced.
+        saturated: number of samples at the limit.
+        missing: whether samples are missing and were interpolated from those around them.
+    """
+
+    gyro: bool = False
+    accel: bool = False
+    spikes: int = 0
+    saturated: int = 0
+    missing: bool = False
+
+
+NO_FLAGS = Flags()
+"""No faults."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +113,55 @@ class ImuInterval:
 
 
 _NO_ATTITUDES = np.empty((0, 3, 3))
+
+_SAME_TIME = 1e-6
+"""A fix within this time of an interval's start or end [s] counts as at it."""
+
+
+def split_at_fixes(
+    interval: ImuInterval, fixes: Sequence[Fix]
+) -> list[tuple[ImuInterval | None, list[Fix]]]:
+    """Split an interval at the times of its fixes; return each piece with the fixes at its end.
+
+    Fixes at the start of the interval come first, with None as their piece.
+
+    Args:
+        interval: the interval.
+        fixes: fixes with start <= time <= stop, in order.
+    """
+    pieces: list[tuple[ImuInterval | None, list[Fix]]] = []
+    rest = interval
+    for fix in fixes:
+        if fix.time <= rest.start + _SAME_TIME:
+            if not pieces:
+                pieces.append((None, []))
+        elif fix.time < rest.stop - _SAME_TIME:
+            before, rest = split_at(rest, fix.time)
+            pieces.append((before, []))
+        else:
+            break
+        pieces[-1][1].append(fix)
+    count = sum(len(due) for _, due in pieces)
+    return [*pieces, (rest, list(fixes[count:]))]
+
+
+def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
+    """Split an interval at a time [s] inside it; the second part keeps window and update."""
+    k = int(np.searchsorted(interval.time, time))
+    weight = (time - interval.time[k - 1]) / (interval.time[k] - interval.time[k - 1])
+    first: dict[str, Any] = {"time": np.append(interval.time[:k], time)}
+    second: dict[str, Any] = {"time": np.append(time, interval.time[k:])}
+    if second["time"][1] - time < 1e-9:
+        second["time"] = np.append(time, interval.time[k + 1 :])
+    for name in ("gyro", "accel"):
+        values = getattr(interval, name)
+        boundary = (1.0 - weight) * values[k - 1] + weight * values[k]
+        first[name] = np.vstack([values[:k], boundary])
+        second[name] = np.vstack([boundary, values[len(values) - len(second["time"]) + 1 :]])
+    return changed(interval, **first, update=False, window=None, R_NB_window=None), changed(
+        interval, **second
+    )
+
 
 GAPS_LISTED = 100
 """Maximum number of gaps listed one by one; an endless stream may have any number."""

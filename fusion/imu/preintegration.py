@@ -17,15 +17,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain, repeat
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.outliers import Flags
+from stario.fusion.imu.intervals import Flags, ImuInterval
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
@@ -103,8 +101,11 @@ def segment_of(
     b_g: FloatArray,
     b_a: FloatArray,
     config: NavigatorConfig,
+    turned: float = 0.0,
 ) -> Segment:
     """Preintegrate an interval, or bridge it if it is a gap.
+
+    A gap is bridged by constant velocity and attitude, with noise wide enough for a pedestrian.
 
     Args:
         interval: samples, or a gap.
@@ -112,10 +113,13 @@ def segment_of(
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
+        turned: variance of a turn about the vertical within a gap [rad^2]; 0 for the filter, which
+            adds it itself and turns the velocity with it.
     """
     if interval.gap:
-        return gap_segment(interval.start, interval.stop, R_WB, b_g, b_a, config)
-    noise = _noise(interval, config)
+        up_B = R_WB.T @ [0.0, 0.0, 1.0]
+        return _gap_segment(interval.start, interval.stop, up_B, b_g, b_a, config, turned)
+    noise = _widened_noise(config, interval.accel_factor, interval.flags)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
     )
@@ -126,31 +130,18 @@ def gap_yaw_variance(seconds: float) -> float:
     return min(GAP_YAW_RATE * seconds, UNKNOWN_YAW) ** 2
 
 
-def gap_segment(
+def _gap_segment(
     start: float,
     stop: float,
-    R_WB: FloatArray,
+    up_B: FloatArray,
     b_g: FloatArray,
     b_a: FloatArray,
     config: NavigatorConfig,
-    turned: float = 0.0,
+    turned: float,
 ) -> Segment:
-    """Bridge a gap by constant velocity and attitude, with noise wide enough for a pedestrian.
-
-    Args:
-        start: start of the gap [s].
-        stop: end of the gap [s].
-        R_WB: (3, 3) attitude at its start.
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        config: noise and gravity.
-        turned: variance of a turn about the vertical within the gap [rad^2]; 0 for the filter,
-            which adds it itself and turns the velocity with it.
-    """
     f, dt = config.filter, (stop - start) / _GAP_STEPS
     noise = replace(config.noise, gyro_noise=f.gap_gyro_noise, accel_noise=f.gap_accel_noise)
     params = _new_params(noise, config.gravity)
-    up_B = R_WB.T @ [0.0, 0.0, 1.0]
     density = turned / (stop - start) * np.outer(up_B, up_B)
     params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
@@ -174,33 +165,25 @@ def segment_of_all(
     def joined(name: str) -> FloatArray:  # without the samples that intervals share
         return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
 
-    noise = chain.from_iterable(repeat(_noise(e, config), len(e.time) - 1) for e in intervals)
+    noise = (
+        density
+        for e in intervals
+        for density in [_widened_noise(config, e.accel_factor, e.flags)] * (len(e.time) - 1)
+    )
     samples = joined("time"), joined("gyro"), joined("accel")
     return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
 
 
-def _noise(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
-    f = config.filter
-    return _widened_noise(
-        config.noise,
-        interval.accel_factor,
-        interval.flags,
-        f.gap_gyro_noise,
-        f.gap_accel_noise,
-    )
-
-
 @lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow
-def _widened_noise(
-    noise: ImuNoise, accel_factor: float, flags: Flags, gap_gyro: float, gap_accel: float
-) -> ImuNoise:
+def _widened_noise(config: NavigatorConfig, accel_factor: float, flags: Flags) -> ImuNoise:
     """Return the white noise, widened where a sensor was saturated or samples are missing."""
+    noise = config.noise
     gyro, accel = noise.gyro_noise, accel_factor * noise.accel_noise
     # What a saturated sensor missed is as unknown as the motion in a gap.
     if flags.gyro:
-        gyro = max(gyro, gap_gyro)
+        gyro = max(gyro, config.filter.gap_gyro_noise)
     if flags.accel:
-        accel = max(accel, gap_accel)
+        accel = max(accel, config.filter.gap_accel_noise)
     if flags.missing:
         gyro, accel = max(gyro, _MISSING_GYRO), max(accel, _MISSING_ACCEL)
     return replace(noise, gyro_noise=gyro, accel_noise=accel)

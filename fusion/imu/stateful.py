@@ -117,7 +117,8 @@ def displacements_of(
 
     Also count the windows, and those that move unlike anything the weights were trained on.
     """
-    windows_N = np.stack([_window(interval) for interval in intervals])
+    # Callers pass only intervals with a window.
+    windows_N = np.stack([i.window for i in intervals if i.window is not None])
     counts.windows += len(windows_N)
     counts.unfamiliar += network.unfamiliar(windows_N)
     heading = np.array([interval.heading for interval in intervals])
@@ -130,8 +131,3 @@ def displacements_of(
         (d_N, floored(C, MIN_DISPLACEMENT_SIGMA))
         for d_N, C in zip(mean_N, covariance_N, strict=True)
     ]
-
-
-def _window(interval: ImuInterval) -> NDArray[np.float32]:
-    assert interval.window is not None  # callers pass only intervals that have one
-    return interval.window

@@ -86,7 +86,7 @@ def _stuck_problems(sequence: ImuSequence) -> list[str]:
 def _limit_problems(sequence: ImuSequence) -> list[str]:
     """Report a sensor at its limit, from values that repeat at the largest magnitude of an axis.
 
-    The rule is that of streams (`fusion.imu.outliers`), applied to the whole recording.
+    The rule is that of streams (`fusion.imu.faults`), applied to the whole recording.
     """
     problems = []
     given = usable(sequence)

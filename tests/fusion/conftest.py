@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import CONFIG, FILTER, NOISE, Broken, ate, stream, stream_deviation
 
-from stario.fusion import Navigator, Track
+from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.sequences.accuracy.metrics import align
 from stario.sequences.errors import InputError
@@ -19,11 +19,6 @@ from stario.sequences.simulation.walks import CARRYING_MODES
 Make = Callable[..., Any]
 
 both_backends = pytest.mark.parametrize("backend", ["ekf", "graph"])
-
-
-@pytest.fixture(scope="module")
-def track(walk: ImuSequence, make_oracle: Make) -> Track:
-    return Navigator(make_oracle(walk, walk.truth, CONFIG)).run(walk)
 
 
 def test_health_counts_bad_samples_gaps_and_updates(walk: ImuSequence, make_oracle: Make) -> None:

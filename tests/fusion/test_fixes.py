@@ -18,9 +18,9 @@ from stario.fusion.filter.jacobians import (
     yaw_jacobian,
 )
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
-from stario.fusion.imu.cutting import split_at
-from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.imu.intervals import split_at
 from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
+from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from recorded import DATA
+from support import stream
 
-from stario.fusion import Navigator, NavState
+from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import compare
 from stario.network import DisplacementModel, load_model
@@ -53,19 +54,10 @@ def test_recordings_of_every_format_run_with_a_bounded_error(
     assert result.metrics["ekf"]["ate_m"] < worst_m
 
 
-@pytest.mark.parametrize("name", [OXIOD, TUMVI])
-def test_the_track_is_identical_without_ground_truth(model: DisplacementModel, name: str) -> None:
-    recording = stretch(name, 15.0)
-    full, blind = (Navigator(model).run(r) for r in (recording, recording.without_truth()))
-    for key, values in full.arrays().items():
-        np.testing.assert_array_equal(blind.arrays()[key], values, err_msg=key)
-
-
 def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> None:
     recording = stretch(TUMVI, 40.0)
     track, navigator = Navigator(model).run(recording), Navigator(model)
-    rows = zip(recording.time, recording.gyro, recording.accel, strict=True)
-    states: list[NavState] = [s for row in rows if (s := navigator.push(*row)) is not None]
+    states = stream(navigator, recording)
     assert len(states) == len(track.time) - navigator.config.filter.output_rate
     at = np.searchsorted(track.time, [s.time for s in states])
     off = track.trajectory.position_W[at] - np.array([s.p_W for s in states])

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import stream
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.config import FilterConfig
@@ -24,9 +25,7 @@ Make = Callable[..., Any]
 
 
 def push(navigator: Navigator, walk: ImuSequence, start: float, stop: float) -> list[NavState]:
-    part = walk.slice(start, stop - 1e-9)
-    rows = zip(part.time, part.gyro, part.accel, strict=True)
-    return [state for row in rows if (state := navigator.push(*row)) is not None]
+    return stream(navigator, walk.slice(start, stop - 1e-9))
 
 
 def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
@@ -115,8 +114,7 @@ def test_another_process_can_continue_a_stream(tmp_path: Path, still_model: Any)
         subprocess.run([sys.executable, "-c", SCRIPT, *arguments], check=True, timeout=60)
     navigator = Navigator(still_model)
     walk = simulate_imu(generate_walk(0, 6.0), 100.0)
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
-        navigator.push(*row)
+    stream(navigator, walk)
     expected = np.hstack([navigator.state.p_W, navigator.state.covariance.ravel()])
     np.testing.assert_allclose(np.load(result), expected, atol=1e-9)
 

@@ -6,7 +6,7 @@ from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory

@@ -17,7 +17,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.filter.innovations import innovations_from_rows
+from stario.fusion.filter.estimator_state import innovations_from_rows
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator

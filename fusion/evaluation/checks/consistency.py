@@ -21,9 +21,9 @@ from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.imu.front_end import cut_recording
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import log_se23, yaw_rotation
+from stario.fusion.recording import cut_recording
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError

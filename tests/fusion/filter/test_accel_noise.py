@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.accel_noise import AccelNoiseScale
+from stario.fusion.filter.displacements import AccelNoiseScale
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
 from stario.sequences.sequence import ImuSequence
@@ -29,7 +29,7 @@ def final_factor(
         if measured is not None and k in false:
             measured = (measured[0] + [1.0, 0.0, 0.0], measured[1])
         estimator.step(shaken, measured)
-    return estimator.accel_noise.factor
+    return estimator.state.accel_noise.factor
 
 
 def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(

@@ -67,7 +67,7 @@ def test_vague_or_consistent_data_leave_the_prior_unchanged(b: float, e: float) 
 
 
 def test_the_prior_is_wide_until_levelled_and_stays_wide_for_raw_rates() -> None:
-    first = GyroBiasPrior.first(1e-3)
+    first = GyroBiasPrior(1e-3, 1e-6)
     nothing = np.zeros(3), first.variance * np.eye(3), 0.0
     early = first.updated(0.0, 1e-2, *nothing)
     late = early.updated(0.0, 1e-3, *nothing)

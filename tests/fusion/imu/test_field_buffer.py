@@ -8,7 +8,7 @@ import pytest
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.buffers import FieldBuffer
-from stario.fusion.imu.front_end import cut_recording
+from stario.fusion.recording import cut_recording
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.sequence import ImuSequence, Magnetometer
 

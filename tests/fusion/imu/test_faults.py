@@ -1,4 +1,4 @@
-"""A clock that is set back starts another recording, and the user is informed."""
+"""Faulty samples: values at a sensor's limit, a clock that is set back, a sensor that stops."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,14 +6,44 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import CONFIG, stream
 
 from stario.fusion import Navigator, PriorPose
-from stario.fusion.imu.stream_checks import ClockSetBackDetector, ClockSetBackError
+from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
 from stario.fusion.report.health import health_lines
+from stario.sequences.errors import InputError
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
+
+
+# --- saturation ------------------------------------------------------------------------------
+
+
+def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
+    """Number of samples flagged in a stream that is checked interval by interval."""
+    detector, rows = OutlierDetector(), np.zeros((len(gyro_x), 7))
+    rows[:, 0], rows[:, 1] = 0.01 * np.arange(len(gyro_x)), gyro_x
+    found = [
+        detector.detect(rows[k : k + size].copy()).saturated
+        for k in range(0, len(rows) - 1, size - 1)
+    ]
+    return sum(found)
+
+
+def test_coarse_values_that_repeat_while_rising_are_not_saturated() -> None:
+    rising = 0.1 * np.round(np.arange(0.0, 200.0) / 2.0)  # each value twice
+    assert count_saturated(rising) == 0
+
+
+def test_a_clipped_sine_is_saturated_at_its_limit() -> None:
+    clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
+    stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
+    assert stuck - 2 <= count_saturated(clipped) <= stuck
+
+
+# --- a clock that is set back ----------------------------------------------------------------
 
 
 def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
@@ -102,3 +132,41 @@ def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk: Make, still_mo
     (message,) = (note for note in track.health.notes if "late" in note)
     assert "for 3.0 s in a row" in message
     assert not [note for note in Navigator(still_model).run(walk).health.notes if "late" in note]
+
+
+# --- a sensor that repeats one sample again and again has stopped -----------------------------
+
+
+@pytest.mark.parametrize("held", ["last", "zeros"])
+def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, held: str) -> None:
+    gyro, accel, time = walk.gyro.copy(), walk.accel.copy(), walk.time
+    dead = (time > time[0] + 8.0) & (time < time[0] + 11.0)
+    last = np.argmax(dead) - 1
+    gyro[dead], accel[dead] = (gyro[last], accel[last]) if held == "last" else (0.0, 0.0)
+    stopped = replace(walk, gyro=gyro, accel=accel)
+    track = Navigator(make_oracle(stopped, walk.truth, CONFIG)).run(stopped)
+    assert track.health.samples["frozen"] > 0.9 * dead.sum()
+    assert track.health.gap_count == 1
+    ((start, length),) = track.health.gaps
+    assert start == pytest.approx(time[dead][0], abs=0.15)
+    assert length == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
+    """Simulated without noise, or so coarse that its noise does not show."""
+    n = 1000
+    still = ImuSequence(
+        "still", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1))
+    )
+    health = Navigator(still_model).run(still).health
+    assert health.samples["frozen"] == 0
+
+
+@pytest.mark.parametrize("accel", [0.0, 1.0])
+def test_an_unchanging_stream_is_refused_for_its_force(still_model: Any, accel: float) -> None:
+    n = 300
+    silent = ImuSequence(
+        "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
+    )
+    with pytest.raises(InputError, match="accel"):
+        stream(Navigator(still_model), silent)

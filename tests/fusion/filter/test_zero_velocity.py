@@ -13,8 +13,8 @@ from recorded import DATA
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.imu.front_end import cut_recording
-from stario.fusion.imu.stillness import StillnessDetector
+from stario.fusion.filter.zero_velocity import StillnessDetector
+from stario.fusion.recording import cut_recording
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.attitude.so3 import exp_so3

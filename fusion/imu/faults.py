@@ -1,4 +1,4 @@
-"""Faults that only a running stream shows: a clock set back, a frozen sensor, gyro in deg/s.
+"""Faults of samples: a clock set back, a frozen sensor, spikes and saturation, gyro in deg/s.
 
 Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
 advance among themselves for seconds come from another clock, and how much time has passed between
@@ -8,10 +8,16 @@ Frozen sensor: no real sensor measures the same six numbers for long, since its 
 last digits. One that does has stopped, and its samples are treated as a gap. Values that have never
 changed are left to the checks of a stream's first second; they may be simulated without noise.
 
-Unit of the gyroscope: it cannot be determined at rest. A recording is checked as a whole before it
-runs (`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece
-may fail because the device is thrown or dropped, so several, with no calm one in between, are
-needed to refuse the stream.
+Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
+can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
+exactly and more than once at the largest magnitude measured so far; two that are equal by chance,
+at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only
+flagged.
+
+Units of a stream: that of the accelerometer shows in the first second, that of the gyroscope not at
+rest. A recording is checked as a whole before it runs (`sequences.inspection.checks`), a stream
+piece by piece by the same physics. A single piece may fail because the device is thrown or dropped,
+so several, with no calm one in between, are needed to refuse the stream.
 """
 
 from __future__ import annotations
@@ -20,10 +26,11 @@ import math
 
 import numpy as np
 
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import NO_FLAGS, Flags, ImuInterval, Start
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches
@@ -109,6 +116,97 @@ class FrozenSensorDetector:
         gyro, accel = self._values[:3], self._values[3:]
         off = abs(math.hypot(*accel) - self._gravity)
         return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
+
+
+SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
+"""A sample that differs from both neighbours by more than this is a spike [rad/s], [m/s^2]; heel
+strikes stay below half of it at 50 Hz."""
+
+_MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+_LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
+"""An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
+
+_MIN_REPEATS = 2.0
+"""Minimum number of repetitions at the same limit that cannot be chance."""
+
+_NO_AXES = np.zeros(6)
+
+
+class OutlierDetector:
+    """Detects outliers in the samples of one stream, interval by interval."""
+
+    def __init__(self) -> None:
+        self.largest = np.zeros(6)
+        self._repeats = np.zeros(6)  # of each axis at its current largest magnitude
+
+    def detect(self, table: FloatArray) -> Flags:
+        """Replace spikes in place and return the faults.
+
+        Args:
+            table: (n, 7) samples: time, gyroscope, accelerometer; the first was checked before.
+        """
+        values = table[:, 1:]
+        steps = values[1:] - values[:-1]
+        candidates = np.abs(steps).max(axis=0) > SPIKE
+        spikes = self._replace_spikes(values) if candidates.any() else _NO_AXES
+        largest = np.maximum(self.largest, np.abs(values).max(axis=0))
+        self._repeats = np.where(largest > self.largest, 0.0, self._repeats)
+        self.largest = largest
+        saturated = _NO_AXES
+        if not steps.all():
+            saturated = self._count_saturated(values)
+        bad = (spikes + saturated) > 0
+        if not bad.any():
+            return NO_FLAGS
+        return Flags(
+            bool(bad[:3].any()), bool(bad[3:].any()), int(spikes.max()), int(saturated.max())
+        )
+
+    @staticmethod
+    def _replace_spikes(values: FloatArray) -> FloatArray:
+        """Replace spikes by the mean of their neighbours; return their number per axis (6,)."""
+        found = np.zeros(6)
+        n = len(values)
+        for k in range(1, n):
+            before = values[k - 1]
+            # The last sample has no successor yet: it is compared with the two before it.
+            after = values[k + 1] if k + 1 < n else values[max(k - 2, 0)]
+            off = np.minimum(np.abs(values[k] - before), np.abs(values[k] - after)) > SPIKE
+            if off.any():
+                mean = 0.5 * (before + after) if k + 1 < n else before
+                values[k, off] = mean[off]
+                found += off
+        return found
+
+    def _count_saturated(self, values: FloatArray) -> FloatArray:
+        """Return the number of samples per axis (6,) that repeat at the axis's limit."""
+        size = np.abs(values)
+        moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
+        repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
+        count = repeated.sum(axis=0)
+        self._repeats = self._repeats + count
+        return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))
+
+
+_START_FORCE = (5.0, 15.0)
+"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
+
+
+def check_start(start: Start, gravity: float) -> None:
+    """Check the first second of a stream, which cannot be checked as a whole.
+
+    Raises:
+        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
+    """
+    if not MIN_RATE <= start.rate <= MAX_RATE:
+        raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
+    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
+        raise InputError(
+            "accel",
+            f"an average of {start.force:.3g} over the first second",
+            f"about {gravity:.2f} m/s^2",
+            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
+        )
 
 
 _PIECE_SECONDS = 4.0
