@@ -153,7 +153,7 @@ def _level(
 def _check_length(what: str, time: FloatArray) -> None:
     length = float(time[-1] - time[0]) if len(time) else 0.0
     if length < _MIN_FIT_S:
-        raise InputError(what, f"{length:.1f} s", f"at least {_MIN_FIT_S:.0f} s to find the mount")
+        raise InputError(what, f"{length:.4g} s", f"at least {_MIN_FIT_S:.0f} s to find the mount")
 
 
 class _GyroIntegral:

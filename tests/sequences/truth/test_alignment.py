@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -149,3 +150,11 @@ def test_rotation_during_an_imu_gap_is_not_a_flip(gap: tuple[float, float], flip
     assert np.degrees(np.median(error[truth.time[seen] > gap[1]])) < 1.5
     assert np.degrees(np.median(error[truth.time[seen] < gap[0]])) < 1.5
     assert aligned.correlation > 0.95
+
+
+def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough() -> None:
+    imu, truth = recorded("handheld", 12.0)
+    imu = imu.slice(0.0, 9.995)
+    valid = np.ones(len(truth), dtype=np.bool_)
+    with pytest.raises(InputError, match=r"found 9\.99 s, expected at least 10 s"):
+        align_tracked_body(imu.time, imu.gyro, imu.accel, truth.time, truth.attitude_WB, valid)
