@@ -88,6 +88,11 @@ def evaluate(
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
     if by is None and against is not None:
         raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
+    if by is None and ekf:
+        raise InputError("--ekf", "use without --by", "a grouping", "add --by set")
+    if by is not None and models is not None:
+        fix = "name two networks by --model and --against"
+        raise InputError("--models", f"{models} with --by", "one of the two", fix)
     if by is None and models is None and convention is not None:
         raise InputError(
             "--convention", f"{convention} without --models", "networks", "name them with --models"

@@ -224,6 +224,10 @@ class TrainingRun:
         errors = [e if math.isfinite(e := r.validation_error) else math.inf for r in counted]
         return len(errors) - 1 - int(np.argmin(errors))
 
+    def best_report(self) -> EpochReport:
+        """Return the report of the epoch whose weights are kept."""
+        return self.history[-1 - self.epochs_since_best()]
+
     def should_stop(self) -> bool:
         """Return whether validation has stopped improving; False until sigma is learned."""
         learned = len(self.history) >= self._first_with_sigma

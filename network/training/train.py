@@ -79,19 +79,23 @@ def train(
         run = TrainingRun(
             config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
         )
-        if start_from is not None:
-            run.start_from(start_from)
-        run.resume()
-        if run.step >= config.steps:
-            log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
         recurrent = run.network.is_recurrent
         held_out = ValidationSet(
             validation, run.device, config, validation_legs, chosen_by_legs, recurrent
         )
+        before: dict[str, float] = {}
+        if start_from is not None:
+            run.start_from(start_from)
+            before = held_out.errors(run.averaged) if processes.is_leader else {}
+        run.resume()
+        if run.step >= config.steps:
+            log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
         while run.step < config.steps and not run.should_stop():
             report = run.validate(run.epoch(on_step), held_out)
             if processes.is_leader:
                 on_epoch(report)
+        if before and (words := held_out.worse(before, run.best_report().validation_by_recording)):
+            log.warning("%s: %s", folder, words)
         return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
 
 

@@ -141,9 +141,27 @@ class ValidationSet:
 
     def selection_error(self, errors: Mapping[str, float]) -> float:
         """Return the mean of the `errors` that select the weights; 0 if there are none."""
-        by_legs = [errors[kind] for kind in self.legs if kind in errors]
-        chosen = by_legs if self._chosen_by_legs and by_legs else list(errors.values())
-        return float(np.mean(chosen or [0.0]))
+        return float(np.mean(list(self._selecting(errors).values()) or [0.0]))
+
+    def _selecting(self, errors: Mapping[str, float]) -> Mapping[str, float]:
+        by_legs = {kind: errors[kind] for kind in self.legs if kind in errors}
+        return by_legs if self._chosen_by_legs and by_legs else errors
+
+    def worse(self, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+        """Return in words that the errors that select the weights grew; empty if they did not.
+
+        The geometric mean gives a precise kind of truth the same voice as a noisy one.
+        """
+        known = self._selecting(before)
+        logs = {name: np.log(max(after[name], 1e-12) / max(known[name], 1e-12)) for name in known}
+        if not logs or not (mean := float(np.mean(list(logs.values())))) > 0.0:
+            return ""
+        worst = max(logs, key=lambda name: logs[name])
+        return (
+            f"errors in validation are {np.exp(mean):.3g} times those of the initial weights "
+            f"({worst}: {after[worst]:.3g} instead of {known[worst]:.3g}); "
+            "keep these, or train with more recordings or a smaller `rate`"
+        )
 
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:

@@ -351,6 +351,16 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
     return build_network(config.architecture)
 
 
+def test_training_that_spoils_its_initial_weights_gives_a_warning(
+    model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run(tmp_path / "spoilt", replace(TINY, epochs=1, rate=0.1), start_from=load_model(model))
+    assert "times those of the initial weights" in caplog.text
+    held_out = ValidationSet(VALIDATION, torch.device("cpu"), TINY)
+    assert not held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 1.5})
+    assert "(d: 4 instead of 1)" in held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 4.0})
+
+
 def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     model: Path, tmp_path: Path
 ) -> None:
