@@ -36,11 +36,11 @@ def walk_with_waypoints(seed: int) -> ImuSequence:
 
 
 def main(folder: Path, epochs: int = 1) -> DisplacementModel:
-    """Train a few steps on three walks; simulated ones with full truth limit forgetting."""
+    """Train a few steps on three walks; most of the result is the initial weights'."""
     legs = [stream for seed in range(3) for stream in leg_streams(walk_with_waypoints(seed))]
     full = [world_streams(simulate_imu(generate_walk(seed, 30.0), seed=seed)) for seed in (7, 8)]
     config = TrainingConfig(
-        epochs=epochs, epoch_windows=64, batch=32, rate=2e-4, likelihood_from=0.0,
+        epochs=epochs, epoch_windows=64, batch=32, rate=1e-4, learned=0.3, likelihood_from=0.0,
         waypoint_stretches=2, waypoint_seconds=12,
     )  # fmt: skip
     before = load_model("default")

@@ -87,7 +87,10 @@ def train(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
     start_from: Annotated[
         str | None,
-        typer.Option(help="Weights to start from: default, another name, or a safetensors file."),
+        typer.Option(
+            help="Weights to fine-tune: default, another name, or a safetensors file. Without "
+            "--config they are changed only a little."
+        ),
     ] = None,
     last_stage: Annotated[
         str | None,
@@ -176,9 +179,11 @@ def train(
 def _recipe(
     path: Path | None, first: DisplacementModel | None, **over: int | str | None
 ) -> TrainingConfig:
-    from stario.network.training.config import training_config
+    from stario.network.training.config import FINE_TUNING, training_config
 
-    values = {} if first is None else {"architecture": first.card.architecture}
+    values: dict[str, object] = {}
+    if first is not None:
+        values = {"architecture": first.card.architecture} | (FINE_TUNING if path is None else {})
     values |= {} if path is None else recipe_values(path)
     recipe = training_config(values | {k: v for k, v in over.items() if v is not None})
     if first is not None and first.card.architecture != recipe.architecture:

@@ -78,7 +78,7 @@ def read_checkpoint(
 def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
     expected = json.loads(json.dumps(asdict(config)))
     # Checkpoints older than these settings come from runs without them.
-    found = {"successive": 1, "attitude": "true", **found}
+    found = {"successive": 1, "attitude": "true", "learned": 1.0, **found}
     for name in expected:
         if found.get(name) != expected[name]:
             raise ConfigError(

@@ -34,6 +34,22 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
 SIMULATED = "simulated"
 """Name of the simulated walks in a recipe's shares."""
 
+FINE_TUNING: dict[str, object] = {
+    "epochs": 2,
+    "epoch_windows": 40_000,
+    "batch": 160,
+    "rate": 1e-4,
+    "learned": 0.3,
+    "likelihood_from": 0.0,
+    "shares": {SIMULATED: 0.05},
+    "augmentation": {
+        "replayed": 0.2, "swung": 0.1, "yaw": 0.05, "any_yaw": 0.0, "tilt": 0.01,
+        "gyro_bias": 0.005, "accel_bias": 0.05, "gyro_noise": 0.002, "accel_noise": 0.02,
+    },
+}  # fmt: skip
+"""Settings for weights that know walking already: those of the default weights' last stage, but
+slower, and mixed with the initial weights. A few walks otherwise make a network forget the rest."""
+
 SIGMA_WEIGHT = 0.05
 """Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
 
@@ -59,6 +75,7 @@ _RANGES = (
     ("likelihood_from", 0.0, 1.0),
     ("clip", 1e-6, 1e6),
     ("average", 0.0, 1.0),
+    ("learned", 0.0, 1.0),
 )
 
 
@@ -78,6 +95,8 @@ class TrainingConfig:
         likelihood_from: share of the steps after which sigma is learned too.
         clip: maximum norm of the gradient.
         average: decay per step of the running average of the weights.
+        learned: share of this average in the result; initial weights, if there are any, make up the
+            rest (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         patience: epochs without a better validation error after which training stops.
         precision: "float32" or "bfloat16" (mixed; nearly twice as fast where supported).
         device: "auto", "cpu" or "cuda".
@@ -115,6 +134,7 @@ class TrainingConfig:
     likelihood_from: float = 0.6
     clip: float = 1.0
     average: float = 0.998
+    learned: float = 1.0
     patience: int = 20
     precision: str = "float32"
     device: str = "auto"

@@ -89,7 +89,8 @@ class TrainingRun:
                     module.p = config.dropout
         self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self.averaged.load_state_dict(self.network.state_dict())
-        self._keep_averaged()
+        self._initial: dict[str, Tensor] | None = None
+        self._keep(self.averaged)
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.rate, weight_decay=config.weight_decay
         )
@@ -116,10 +117,26 @@ class TrainingRun:
         state = model.training_form.state_dict()
         self.network.load_state_dict(state)
         self.averaged.load_state_dict(state)
-        self._keep_averaged()
+        self._initial = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+        self._keep(self.averaged)
 
-    def _keep_averaged(self) -> None:
-        self.best = {k: v.clone() for k, v in self.averaged.state_dict().items()}
+    def _keep(self, network: DisplacementNetwork) -> None:
+        self.best = {k: v.clone() for k, v in network.state_dict().items()}
+
+    def _candidate(self) -> DisplacementNetwork:
+        """Return the network with averaged weights, mixed with the initial ones."""
+        if self._initial is None or self.config.learned == 1.0:
+            return self.averaged
+        mixed = DisplacementNetwork(build_network(self.config.architecture)).to(self.device)
+        mixed.load_state_dict(
+            {
+                name: self._initial[name].lerp(value, self.config.learned)
+                if value.is_floating_point()
+                else value
+                for name, value in self.averaged.state_dict().items()
+            }
+        )
+        return mixed
 
     def epoch(self, on_step: Callable[[int, float], None]) -> float:
         """Train for one epoch; return the mean squared error on its (augmented) windows."""
@@ -244,7 +261,8 @@ class TrainingRun:
 
         The weights are kept if they are the best so far; checkpoint and log are written.
         """
-        errors = held_out.errors(self.averaged) if self.workers.is_leader else {}
+        candidate = self._candidate()
+        errors = held_out.errors(candidate) if self.workers.is_leader else {}
         report = EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
             training_error=training_error,
@@ -255,7 +273,7 @@ class TrainingRun:
         )
         self.history.append(report)
         if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
-            self._keep_averaged()
+            self._keep(candidate)
         if self.workers.is_leader:
             history = [asdict(r) for r in self.history]
             path, config = self._checkpoint, self.config

@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stario.fusion.commands.train import _recipe
+from stario.network import load_model
+from stario.network.training.config import FINE_TUNING, training_config
 from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
@@ -229,6 +232,15 @@ def test_weights_to_start_from_set_the_network(
     card = json.loads((tmp_path / "second/model.json").read_text())
     assert card["architecture"] == "R-ResNet"
     stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", "R-ResNet")
+
+
+def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny: Path) -> None:
+    first = load_model("default")
+    assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
+    gentle = _recipe(None, first, epochs=5)
+    assert gentle == replace(training_config(FINE_TUNING), epochs=5)
+    assert gentle.learned < 0.5
+    assert gentle.rate < _recipe(None, None).rate
 
 
 def test_training_can_use_recordings_alone(

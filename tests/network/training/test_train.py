@@ -361,6 +361,28 @@ def test_training_that_spoils_its_initial_weights_gives_a_warning(
     assert "(d: 4 instead of 1)" in held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 4.0})
 
 
+def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(
+    model: Path, tmp_path: Path
+) -> None:
+    first, once = load_model(model), replace(TINY, epochs=1)
+    initial, none, half, all_learned = (
+        dict(weights.training_form.named_parameters())
+        for weights in (
+            first,
+            *(
+                load_model(
+                    run(tmp_path / str(share), replace(once, learned=share), start_from=first)
+                )
+                for share in (0.0, 0.5, 1.0)
+            ),
+        )
+    )
+    for name, before in initial.items():
+        torch.testing.assert_close(none[name], before, atol=0.0, rtol=0.0)
+        torch.testing.assert_close(half[name], 0.5 * (before + all_learned[name]))
+    assert any(not torch.equal(all_learned[name], before) for name, before in initial.items())
+
+
 def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     model: Path, tmp_path: Path
 ) -> None:
