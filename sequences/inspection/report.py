@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import (
     MagneticFindings,
     assess_magnetometer,
@@ -92,6 +93,7 @@ class Inspection:
         device_attitude: number of attitudes logged by the device's own sensor fusion.
         magnetic: findings about the magnetometer; None without one or with too few samples.
         yaw: drift of the gyroscope's yaw from the true one; None if it cannot be determined.
+        axes: agreement of the gyroscope with gravity; None if units are wrong.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Inspection:
     magnetic: MagneticFindings | None
     device_attitude: int
     yaw: YawDrift | None
+    axes: GyroAxes | None
 
     def as_dict(self) -> dict[str, object]:
         """Return the findings as plain values, with units in their names."""
@@ -124,6 +127,7 @@ class Inspection:
                 "accel_norm_m_s2": rest.accel_norm,
                 "accel_noise_m_s2_sqrt_hz": rest.accel_noise,
             },
+            "gyro_axes": self.axes and asdict(self.axes),
             "truth": self.coverage and asdict(self.coverage),
             "truth_against_gyroscope": self.fit and fit_as_dict(self.fit, self.yaw),
             "device_attitudes": self.device_attitude,
@@ -143,8 +147,13 @@ class Inspection:
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
             *(f"! {problem}" for problem in self.problems),
-            *([] if self.problems else ["units, signs and axes: no problems found"]),
+            *([] if self.problems else [self._good_line()]),
         ]
+
+    def _good_line(self) -> str:
+        if self.fit or (self.axes and self.axes.compared):
+            return "units, signs and axes: no problems found"
+        return "units: no problems found; the device tilts too seldom to compare the sensors' axes"
 
     def _timing_lines(self) -> list[str]:
         t = self.timing
@@ -203,9 +212,11 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     given = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
-    problems = sample_problems(sequence)
+    problems, axes = sample_problems(sequence), None
     try:
         check_units(sequence)
+        axes = compare_gyro_axes(sequence)
+        problems += axes.problems(sequence.name)
     except InputError as error:
         problems.append(str(error))
     coverage = fit = yaw = None
@@ -239,6 +250,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
         yaw=yaw,
+        axes=axes,
     )
 
 

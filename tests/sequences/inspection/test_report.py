@@ -14,7 +14,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -29,6 +29,32 @@ def problem(sequence: ImuSequence) -> str:
     (text,) = found.problems
     assert text in "\n".join(found.lines())
     return text
+
+
+SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("axes", [SWAPPED, -np.eye(3), np.roll(np.eye(3), 1, axis=0)])
+def test_a_gyroscope_with_other_axes_or_signs_contradicts_gravity(axes: np.ndarray) -> None:
+    time = np.arange(0.0, 60.0, 0.01)
+    angles = [0.8 * np.sin(0.5 * time), 0.8 * np.sin(0.37 * time + 1.0), 0.3 * time]
+    attitude_WB = Rotation.from_euler("xyz", np.column_stack(angles))
+    tilting = Trajectory(time, np.zeros((len(time), 3)), attitude_WB)
+    right = replace(simulate_imu(tilting, 100.0, seed=2), truth=None)
+    found = inspect_recording(right)
+    assert found.problems == ()
+    assert found.axes is not None
+    assert found.axes.compared
+    assert "axes: no problems found" in found.lines()[-1]
+    wrong = inspect_recording(replace(right, gyro=right.gyro @ axes.T))
+    assert "axes and signs the accelerometer's?" in wrong.problems[-1]
+
+
+def test_axes_are_not_called_right_where_the_device_hardly_tilts(walk: ImuSequence) -> None:
+    still = replace(walk, gyro=0.0 * walk.gyro + 1e-3, accel=0.0 * walk.accel + [0.0, 0.0, 9.8])
+    assert (
+        "axes: no problems found" not in inspect_recording(replace(still, truth=None)).lines()[-1]
+    )
 
 
 def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:

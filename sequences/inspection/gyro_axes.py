@@ -1,0 +1,97 @@
+"""Comparison of the gyroscope's axes and signs with the accelerometer's, without ground truth.
+
+Averaged over a second, the specific force of a carried device is close to gravity. When the device
+tilts, gravity turns in its axes as the gyroscope says. Rotated by it into a frame that does not
+turn, the averages of successive seconds agree; with other axes or signs they differ by about as
+much as they do in the device's axes. A wrong sign of the whole accelerometer changes neither.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
+from stario.sequences.windows import clean_samples, unbroken
+
+_MIN_TILT = 0.2
+"""Change of gravity between successive seconds in the device's axes that counts, relative to it."""
+
+_MAX_FORCE = 1.15
+"""Mean magnitude of the force, relative to gravity, above which a runner hides it."""
+
+_MIN_SECONDS = 2.5
+"""Minimum length of an unbroken stretch [s]: two averages and a margin."""
+
+_MIN_TILTS = 5
+"""Number of such changes needed for a verdict."""
+
+_MAX_UNEXPLAINED = 0.65
+"""Share of the squared changes left unexplained above which the axes differ. Of 46 recordings of
+all sets one exceeds it (median 0.1); with two axes swapped or all signs changed, nine in ten do,
+with one sign changed two in three."""
+
+
+@dataclass(frozen=True)
+class GyroAxes:
+    """Agreement of the gyroscope with gravity, named as in `Inspection.as_dict`.
+
+    Attributes:
+        tilts: number of changes of gravity in the device's axes.
+        unexplained: share of them that the gyroscope leaves unexplained, by sums of squares; NaN
+            without any.
+    """
+
+    tilts: int
+    unexplained: float
+
+    @property
+    def compared(self) -> bool:
+        """Whether the device tilted often enough for a verdict."""
+        return self.tilts >= _MIN_TILTS
+
+    def problems(self, name: str) -> list[str]:
+        """Return a line if the axes differ, for the recording of this name."""
+        if not self.compared or self.unexplained <= _MAX_UNEXPLAINED:
+            return []
+        return [
+            f"{name}: gyroscope: leaves {self.unexplained:.0%} of gravity's changes in "
+            f"{self.tilts} tilts unexplained, expected less than half: are its axes and signs the "
+            "accelerometer's? (On rides, accelerations look like tilts.)"
+        ]
+
+
+def compare_gyro_axes(sequence: ImuSequence) -> GyroAxes:
+    """Compare how gravity turns in the device's axes with the gyroscope."""
+    time, gyro, accel = clean_samples(sequence)
+    rows = [
+        _changes(time[start:stop], gyro[start:stop], accel[start:stop])
+        for start, stop in unbroken(time)
+        if time[stop - 1] - time[start] > _MIN_SECONDS
+    ]
+    changes = np.concatenate([np.empty((0, 2)), *rows])
+    unexplained, total = changes.sum(axis=0)
+    return GyroAxes(len(changes), float(unexplained / total) if len(changes) else math.nan)
+
+
+def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+    """Return unexplained and all squared changes (M, 2) of successive mean forces that count."""
+    size = max(1, round(1.0 / float(np.median(np.diff(time)))))
+    count = len(time) // size
+    dt = np.diff(time)[:, None]
+    R_0B = Rotation.from_quat(
+        cumulative_rotations(Rotation.from_rotvec(0.5 * dt * (gyro[1:] + gyro[:-1])))
+    )
+    whole = slice(0, count * size)
+    force_0 = R_0B.apply(accel)[whole].reshape(count, size, 3).mean(axis=1)
+    magnitude = np.linalg.norm(accel[whole], axis=1).reshape(count, size).mean(axis=1)
+    middle = R_0B[size // 2 : count * size : size]
+    change_0 = np.linalg.norm(np.diff(force_0, axis=0), axis=1)
+    change_B = np.linalg.norm(np.diff(middle.inv().apply(force_0), axis=0), axis=1)
+    calm = magnitude < _MAX_FORCE * STANDARD_GRAVITY
+    counts = calm[1:] & calm[:-1] & (change_B > _MIN_TILT * STANDARD_GRAVITY)
+    return np.square(np.column_stack([change_0, change_B])[counts])
