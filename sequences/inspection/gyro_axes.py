@@ -94,4 +94,5 @@ def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArra
     change_B = np.linalg.norm(np.diff(middle.inv().apply(force_0), axis=0), axis=1)
     calm = magnitude < _MAX_FORCE * STANDARD_GRAVITY
     counts = calm[1:] & calm[:-1] & (change_B > _MIN_TILT * STANDARD_GRAVITY)
-    return np.square(np.column_stack([change_0, change_B])[counts])
+    changes: FloatArray = np.square(np.column_stack([change_0, change_B])[counts])
+    return changes
