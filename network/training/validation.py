@@ -44,6 +44,9 @@ _BATCH = 256
 _STRETCHES = 48
 """Number of stretches for each kind of weak truth."""
 
+_NOTICEABLE = 0.02
+"""Logarithm of a ratio of errors in validation that is worth a warning."""
+
 
 class ValidationSet:
     """Held-out windows, cut again for each evaluation because all of them would fill the memory.
@@ -154,7 +157,7 @@ class ValidationSet:
         """
         known = self._selecting(before)
         logs = {name: np.log(max(after[name], 1e-12) / max(known[name], 1e-12)) for name in known}
-        if not logs or not (mean := float(np.mean(list(logs.values())))) > 0.0:
+        if not logs or not (mean := float(np.mean(list(logs.values())))) > _NOTICEABLE:
             return ""
         worst = max(logs, key=lambda name: logs[name])
         return (
