@@ -85,6 +85,16 @@ class KnownMotion:
         """Return factors (B,) on the variance of predictions: 1 inside, rising outside."""
         return np.asarray(np.clip(2.0 * self.novelty(windows) - 1.0, 1.0, OUTSIDE_VARIANCE))
 
+    def extended(self, other: KnownMotion | None) -> KnownMotion:
+        """Return this motion and another, with this limit: that of weights that keep both."""
+        if other is None:
+            return self
+        both = dict(self.ranges)
+        for key, (low, high) in other.ranges.items():
+            known_low, known_high = both.get(key, (low, high))
+            both[key] = min(low, known_low), max(high, known_high)
+        return KnownMotion((*self.centres, *other.centres), self.limit, both)
+
     def as_dict(self) -> dict[str, object]:
         """Return plain values for the card; each centre is a line of numbers."""
         lines = [" ".join(f"{x:g}" for x in row) for row in self.centres]

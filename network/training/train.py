@@ -96,7 +96,10 @@ def train(
                 on_epoch(report)
         if before and (words := held_out.worse(before, run.best_report().validation_by_recording)):
             log.warning("%s: %s", folder, words)
-        return run.finish(held_out, list(trained_on), calibration, known_motion(streams, legs))
+        known = known_motion(streams, legs)
+        if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
+            known = start_from.card.known_motion.extended(known)
+        return run.finish(held_out, list(trained_on), calibration, known)
 
 
 def _material(

@@ -82,6 +82,17 @@ def test_another_gait_lies_outside_and_widens_the_variance(
     assert factors.max() <= OUTSIDE_VARIANCE
 
 
+def test_weights_that_keep_an_earlier_motion_know_both() -> None:
+    slow, fast = walking_stream(1, seconds=80.0), walking_stream(2, 2.6, 3.0, seconds=80.0)
+    both = known_motion_of(slow).extended(known_motion_of(fast))
+    for stream in (slow, fast):
+        assert both.is_unfamiliar(windows(stream)).mean() < 0.2
+    assert known_motion_of(slow).is_unfamiliar(windows(fast)).mean() > 0.8
+    low, high = both.ranges["step_rate"]
+    assert low < 1.9
+    assert high > 2.5
+
+
 def test_novelty_does_not_depend_on_the_yaw_of_windows(known: KnownMotion) -> None:
     original = windows(walking_stream(3, size=1.5))
     yaw = 1.1
