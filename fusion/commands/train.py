@@ -181,10 +181,11 @@ def _recipe(
 ) -> TrainingConfig:
     from stario.network.training.config import FINE_TUNING, training_config
 
-    values: dict[str, object] = {}
+    values = {} if first is None else FINE_TUNING
+    if path is not None:
+        values = recipe_values(path)
     if first is not None:
-        values = {"architecture": first.card.architecture} | (FINE_TUNING if path is None else {})
-    values |= {} if path is None else recipe_values(path)
+        values = {"architecture": first.card.architecture, **values}
     recipe = training_config(values | {k: v for k, v in over.items() if v is not None})
     if first is not None and first.card.architecture != recipe.architecture:
         raise InputError(

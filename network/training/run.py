@@ -5,6 +5,7 @@ The running average of the weights is what is evaluated and saved.
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import math
@@ -117,8 +118,8 @@ class TrainingRun:
         state = model.training_form.state_dict()
         self.network.load_state_dict(state)
         self.averaged.load_state_dict(state)
-        self._initial = {k: v.clone() for k, v in self.averaged.state_dict().items()}
         self._keep(self.averaged)
+        self._initial = self.best
 
     def _keep(self, network: DisplacementNetwork) -> None:
         self.best = {k: v.clone() for k, v in network.state_dict().items()}
@@ -127,15 +128,10 @@ class TrainingRun:
         """Return the network with averaged weights, mixed with the initial ones."""
         if self._initial is None or self.config.learned == 1.0:
             return self.averaged
-        mixed = DisplacementNetwork(build_network(self.config.architecture)).to(self.device)
-        mixed.load_state_dict(
-            {
-                name: self._initial[name].lerp(value, self.config.learned)
-                if value.is_floating_point()
-                else value
-                for name, value in self.averaged.state_dict().items()
-            }
-        )
+        mixed = copy.deepcopy(self.averaged)
+        for name, value in mixed.state_dict().items():
+            if value.is_floating_point():
+                value.lerp_(self._initial[name], 1.0 - self.config.learned)
         return mixed
 
     def epoch(self, on_step: Callable[[int, float], None]) -> float:

@@ -49,6 +49,17 @@ def cumulative_rotations(steps: Rotation) -> FloatArray:
     return np.asarray(products / np.linalg.norm(products, axis=1)[:, None], dtype=np.float64)
 
 
+def integrated_gyro(time: FloatArray, gyro: FloatArray) -> Rotation:
+    """Return the attitudes R_0B (N,) relative to the first sample, by the trapezoidal rule.
+
+    Args:
+        time: (N,) without gaps [s].
+        gyro: (N, 3) [rad/s].
+    """
+    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
+    return Rotation.from_quat(cumulative_rotations(Rotation.from_rotvec(steps)))
+
+
 def _product(p: FloatArray, q: FloatArray) -> FloatArray:
     """Multiply quaternions (..., 4), xyzw; SciPy's composition is far slower."""
     a, b = p[..., :3], q[..., :3]

@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import dead_gyro, disorder
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
@@ -265,8 +264,6 @@ def _average_force(
     """
     sizes = []
     for piece in pieces:
-        dt = np.diff(time[piece])[:, None]
-        turns = Rotation.from_rotvec(0.5 * dt * (gyro[piece][1:] + gyro[piece][:-1]))
-        R_0B = Rotation.from_quat(cumulative_rotations(turns))
+        R_0B = integrated_gyro(time[piece], gyro[piece])
         sizes.append(np.linalg.norm(R_0B.apply(accel[piece]).mean(axis=0)))
     return float(np.median(sizes))

@@ -12,9 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, unbroken
 
@@ -82,10 +81,7 @@ def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArra
     """Return unexplained and all squared changes (M, 2) of successive mean forces that count."""
     size = max(1, round(1.0 / float(np.median(np.diff(time)))))
     count = len(time) // size
-    dt = np.diff(time)[:, None]
-    R_0B = Rotation.from_quat(
-        cumulative_rotations(Rotation.from_rotvec(0.5 * dt * (gyro[1:] + gyro[:-1])))
-    )
+    R_0B = integrated_gyro(time, gyro)
     whole = slice(0, count * size)
     force_0 = R_0B.apply(accel)[whole].reshape(count, size, 3).mean(axis=1)
     magnitude = np.linalg.norm(accel[whole], axis=1).reshape(count, size).mean(axis=1)

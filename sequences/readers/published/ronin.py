@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import (
     checked,
@@ -124,9 +124,7 @@ def _device_attitude(
     elif name == "ekf":
         source = rotations(file, _EKF, fields[_EKF], first_row=0)
     else:
-        steps = np.diff(fields["synced/time"])[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
-        turned = Rotation.from_quat(cumulative_rotations(Rotation.from_rotvec(steps)))
-        source = game_rv[0] * turned
+        source = game_rv[0] * integrated_gyro(fields["synced/time"], gyro)
     first = rotations(file, "pose/tango_ori", fields["pose/tango_ori"][:1], first_row=0)[0]
     calibration = info.array("start_calibration", 4)[None]
     R_TB = rotations(info.path, "start_calibration", calibration, first_row=0)[0]
