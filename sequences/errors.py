@@ -35,6 +35,10 @@ class InputError(StarioError, ValueError):
         super().__init__(f"{text}; {fix}" if fix else text)
 
 
+class MissingPackageError(InputError):
+    """Optional package that is not installed: it concerns all recordings that need it."""
+
+
 class ReadError(InputError):
     """Unreadable or invalid file; names the file in addition to field, found and expected."""
 

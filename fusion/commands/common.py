@@ -97,11 +97,16 @@ def check_new(field: str, path: Path, overwrite: bool) -> None:
         raise InputError(field, found, "a new file", "or pass --overwrite")
 
 
-def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
-    """List what was skipped on stderr and exit with status 1 if there was any."""
+def list_skipped(skipped: Sequence[Skipped]) -> None:
+    """List what was skipped on stderr."""
     for failure in skipped:
         where = "" if failure.item in failure.reason else f"{failure.item}: "
         typer.echo(f"stario: skipped: {where}{failure.reason}", err=True)
+
+
+def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
+    """List what was skipped on stderr and exit with status 1 if there was any."""
+    list_skipped(skipped)
     if skipped:
         raise typer.Exit(1)
 

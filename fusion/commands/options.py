@@ -100,7 +100,7 @@ class ReadingOptions:
 
     def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
         """Return the recordings at the paths, in folders or list files, and the skipped paths."""
-        from stario.sequences.datasets.batch import Skipped
+        from stario.sequences.datasets.batch import skipped
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a named format applies to the path itself
@@ -113,7 +113,7 @@ class ReadingOptions:
                 files += find_recordings(path, errors.append, chosen)
             except StarioError as error:
                 errors.append(error)
-        return files, [Skipped("", str(error)) for error in errors]
+        return files, [skipped("", error) for error in errors]
 
     def read(self, path: Path) -> ImuSequence:
         """Read a recording in rad/s, m/s^2 of specific force and the axes of its ground truth."""

@@ -11,6 +11,7 @@ import typer
 
 from stario.fusion.commands.common import (
     exit_if_skipped,
+    list_skipped,
     progress_bar,
     with_bar,
 )
@@ -147,6 +148,7 @@ def train(
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = validation_data.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
     if is_leader():
+        list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
     with progress_bar("train", total=recipe.steps, shown=is_leader()) as progress:
@@ -173,7 +175,8 @@ def train(
         )
     if is_leader():
         typer.echo(str(path))
-        exit_if_skipped(skipped)
+        if skipped:
+            raise typer.Exit(1)
 
 
 def _recipe(

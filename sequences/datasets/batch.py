@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
-from stario.sequences.errors import StarioError
+from stario.sequences.errors import MissingPackageError, StarioError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,13 +29,24 @@ class Skipped:
     reason: str
 
 
+def skipped(item: object, error: StarioError) -> Skipped:
+    """Return an item that is skipped because of an error.
+
+    Raises:
+        MissingPackageError: that is the error, which no other recording of its kind would escape.
+    """
+    if isinstance(error, MissingPackageError):
+        raise error
+    return Skipped(str(item), str(error))
+
+
 def each(
     work: Callable[[Item], Result], items: Iterable[Item], jobs: int | None = None
 ) -> Iterator[Result | Skipped]:
     """Yield the result of `work` for each item, in order and as soon as it is ready.
 
     With Ray all results come at the end. An item for which `work` raises a `StarioError` comes back
-    as `Skipped`; any other exception is a bug and ends the batch.
+    as `Skipped`; a missing package or any other exception ends the batch.
 
     Args:
         work: function to apply; it must be picklable if there is more than one process.
@@ -55,4 +66,4 @@ def _attempt(work: Callable[[Item], Result], item: Item) -> Result | Skipped:
     try:
         return work(item)
     except StarioError as error:
-        return Skipped(str(item), str(error))
+        return skipped(item, error)

@@ -29,7 +29,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.datasets.batch import Skipped, each, skipped
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
@@ -86,7 +86,7 @@ def recorded(
             try:
                 streams = _streams(read(path), attitude)
             except StarioError as error:
-                streams = Skipped(str(path), str(error))
+                streams = skipped(path, error)
         yield streams
 
 

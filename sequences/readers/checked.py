@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
-from stario.sequences.errors import InputError, ReadError
+from stario.sequences.errors import MissingPackageError, ReadError
 from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import increasing_mask
 
@@ -91,11 +91,12 @@ def optional_package(name: str, extra: str) -> Any:
     """Import and return an optional package.
 
     Raises:
-        InputError: the package is not installed; the error names the extra that installs it.
+        MissingPackageError: the error names the extra that installs the package.
     """
     try:
         return importlib.import_module(name)
     except ImportError:
         package = name.split(".")[0]
         fix = f'pip install "stario[{extra}]"'
-        raise InputError(package, "not installed", f"the package {package}", fix) from None
+        expected = f"the package {package}"
+        raise MissingPackageError(package, "not installed", expected, fix) from None

@@ -214,6 +214,7 @@ def test_training_continues_after_failures_and_caches_its_windows(
     assert len(lines) == 2
     assert "nosuch.csv" in lines[0]
     assert "blind: truth" in lines[1]
+    assert done.err.index(lines[1]) < done.err.index("epoch 1:")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
     assert len(kept) == 2  # the recording's and the generated walk's
     assert stario(*call, "--out", "b", "--cache", "kept").code == 1

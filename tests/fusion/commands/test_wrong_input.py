@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 
@@ -157,3 +159,15 @@ def test_a_declination_without_a_source_of_north_is_reported(stario, recording: 
     assert done.code == 0
     assert "north" in done.out
     assert "nothing to do" not in done.out
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+@pytest.mark.parametrize("where", ["all.h5", "list.txt"])
+def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
+    stario, recording: Path, tmp_path: Path, monkeypatch, command: str, where: str
+) -> None:
+    write_archive(tmp_path / "all.h5", [read_generic_csv(recording)])
+    (tmp_path / "list.txt").write_text("all.h5:walk\n")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    done = stario(command, recording, where, "--out", "out")
+    done.assert_one_line_error("h5py", "not installed", "stario[readers]")
