@@ -39,6 +39,9 @@ def _silent(share: float) -> None:
 class Navigator:
     """Inertial navigation with a displacement network.
 
+    Threads may share a model but not a navigator: use a lock if fixes come from another thread.
+    If the model raises an error in `push`, the stream continues with the next sample.
+
     Args:
         model: a `DisplacementModel`, or any object with its `predict`.
         config: noise, filter, gravity; the defaults are for handheld devices.
@@ -312,9 +315,12 @@ class Navigator:
         if interval.gap:
             self._network.restart()
         displacement = None
-        if interval.window is not None:
-            (displacement,) = displacements_of(self._network, [interval], self._front_end.counts)
-        self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
+        try:
+            if interval.window is not None:
+                counts = self._front_end.counts
+                (displacement,) = displacements_of(self._network, [interval], counts)
+        finally:  # if the network fails, the IMU's motion must not be lost
+            self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         state = self._estimator.nav_state()
         self._continuous = copied(advanced(self._continuous, state))  # `state` is writable
         return state

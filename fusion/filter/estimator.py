@@ -127,7 +127,7 @@ class Estimator:
             All fixes applied since then, in order.
         """
         steps = self._history
-        oldest = max(self._start, self.time - WINDOW_SECONDS)
+        oldest = max(self._start, self.time - WINDOW_SECONDS - _TIME_TOLERANCE)
         if fix.time < oldest or not steps or fix.time < steps[0].interval.start:
             return None
         stops = [step.interval.stop for step in steps[:-1]]

@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.displacements import HypothesisPair
-from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
+from stario.fusion.filter.ekf_state import GYRO_BIAS
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
@@ -50,9 +50,6 @@ gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly f
 
 _TIME_TOLERANCE = 1e-6
 """Tolerance when comparing times [s]."""
-
-_MIN_GAIN, _VAGUE_SIGMA = 1e-6, 1.0
-"""Minimum relative gain of information by an update; sigma of axes without information [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -181,24 +178,3 @@ class AdaptiveBiasPrior:
         """Variance by which the bias may have changed since the start."""
         seconds = max(0.0, self._hypotheses.ekf.state.time - self._start)
         return float(self._config.noise.gyro_walk**2 * seconds)
-
-
-def gained_bias_information(
-    before: EkfState, after: EkfState
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the information about the gyroscope's bias that an update of any kind has gained.
-
-    For the bias alone this is E^-1 = P+^-1 - P-^-1 with the mean E (P+^-1 b+ - P-^-1 b-), along the
-    axis with the largest gain.
-
-    Returns:
-        Bias (3,) [rad/s] and covariance (3, 3); None if nothing was gained.
-    """
-    prior, posterior = (np.linalg.inv(s.P[GYRO_BIAS, GYRO_BIAS]) for s in (before, after))
-    eigenvalues, axes = np.linalg.eigh(posterior - prior)
-    gain, axis = float(eigenvalues[-1]), axes[:, -1]
-    if gain < _MIN_GAIN * float(np.trace(prior)):
-        return None
-    value = float(axis @ (posterior @ after.b_g - prior @ before.b_g)) / gain
-    covariance = np.outer(axis, axis) / gain + _VAGUE_SIGMA**2 * (np.eye(3) - np.outer(axis, axis))
-    return value * axis, covariance

@@ -1,7 +1,7 @@
 """The fixed-lag graph for streams: optimise the last seconds again at every keyframe.
 
 Keyframes that leave the lag are marginalised. The filter runs alongside: it gates the measurements
-for both (`GraphBuilder`) and provides the information of the magnetic field on the gyroscope bias.
+for both (`GraphBuilder`) and provides the information of the magnetic field (`bearing`).
 The graph restarts from the filter's state where it does not determine its own, or where a late fix
 has changed the filter's gating.
 """
@@ -20,9 +20,9 @@ from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
-from stario.fusion.filter.gyro_bias import gained_bias_information
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Accepted, Fix
+from stario.fusion.graph.bearing import Bearing, gained_information
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
@@ -98,12 +98,13 @@ class FixedLagEstimator:
         if self._stale or interval.restart is not None:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
-        if applied.bearing and (bias := gained_bias_information(*applied.bearing)):
-            self._add_bias_information(*bias)
         local_fixes = [self._in_graph_frame(accepted) for accepted in applied.fixes]
-        if self._builder.step(
+        new_keyframe = self._builder.step(
             applied.interval, applied.displacement, local_fixes, applied.zero_velocity
-        ):
+        )
+        if applied.bearing is not None:
+            self._add_bearing(*applied.bearing)
+        if new_keyframe:
             self._solve()
         else:
             self._ahead.propagate(self._builder.segments[self._builder.graph.last][-1])
@@ -176,12 +177,22 @@ class FixedLagEstimator:
         variance = self._filter.bias.prior.variance
         if variance < _NARROWER * self._bias_prior:
             pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
-            self._add_bias_information(np.zeros(3), pseudo_variance * np.eye(3))
+            graph = self._builder.graph
+            graph.add(GyroBias(graph.last, np.zeros(3), pseudo_variance * np.eye(3)), gated=False)
             self._bias_prior = variance
 
-    def _add_bias_information(self, b_g: FloatArray, covariance: FloatArray) -> None:
+    def _add_bearing(self, before: EkfState, after: EkfState) -> None:
+        """Add what a magnetic bearing has just told the filter about attitude and bias."""
+        gained = gained_information(before, after)
+        if gained is None:
+            return
         graph = self._builder.graph
-        graph.add(GyroBias(graph.last, b_g, covariance), gated=False)
+        k = graph.last
+        R, _, _ = self._builder.dead_reckoned(k)
+        R_k = after.R_WB @ R.T @ graph.pose(k).R_WB
+        weights, value, variance = gained
+        term = Bearing(k, R_k, after.b_g, weights, value, np.array([[variance]]))
+        graph.add(term, gated=False)
 
     def _in_graph_frame(self, accepted: Accepted) -> Fix:
         """Return a fix as inflated by the filter, relative to the graph's origin."""

@@ -162,6 +162,17 @@ def test_fixes_that_are_too_old_are_refused_and_counted(walk: ImuSequence, model
     assert track.health.fixes == {"before the start": 1, "after the end": 1}
 
 
+def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk: ImuSequence, model: Any) -> None:
+    navigator, given = Navigator(model, CONFIG), 0
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        state = navigator.push(*row)
+        if state is not None and state.time > walk.time[0] + 1.05:
+            navigator.update_velocity(round(state.time - 1.0, 6), np.zeros(3), 1e6 * EYE)
+            given += 1
+    assert given > 100
+    assert "too late" not in navigator.health.fixes
+
+
 def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None:
     navigator = Navigator(model, CONFIG)
     for fix in reversed(fixes_of(walk)):

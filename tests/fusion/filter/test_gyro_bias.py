@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.gyro_bias import GyroBiasPrior, gained_bias_information
+from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.state import NavState
 
 
@@ -75,24 +75,3 @@ def test_the_prior_is_wide_until_levelled_and_stays_wide_for_raw_rates() -> None
     assert np.sqrt(late.variance) < 1.2e-3
     uncorrected = late.updated(0.05, 1e-3, *nothing).updated(0.02, 1e-3, *nothing)
     assert np.sqrt(uncorrected.variance) > 0.03
-
-
-def test_the_information_gained_from_a_bias_measurement_is_that_measurement() -> None:
-    ekf = ekf_with_measured_bias(1e-3)
-    before, axis, sigma = ekf.state, np.array([[0.6, 0.0, 0.8]]), 3e-4
-    off = np.array([5e-3]) - axis @ before.b_g
-    ekf.update_linear(off, [(9, axis)], np.array([[sigma**2]]))
-    gained = gained_bias_information(before, ekf.state)
-    assert gained is not None
-    mean, covariance = gained
-    np.testing.assert_allclose(mean, 5e-3 * axis[0], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(axis @ covariance @ axis.T, sigma**2, rtol=1e-6)
-
-
-def test_an_update_that_does_not_involve_the_bias_gains_no_information() -> None:
-    ekf = StateCloningEkf(slots=0)
-    zero = np.zeros(3)
-    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))
-    before = ekf.state
-    ekf.update_position_W(np.ones(3), 0.01 * np.eye(3))
-    assert gained_bias_information(before, ekf.state) is None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, T, V, X
 
+from stario.fusion.graph.bearing import Bearing
 from stario.fusion.graph.factors import (
     Displacement,
     GyroBias,
@@ -57,10 +58,11 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         TurnProcess(0, 1, 0.6, np.eye(1)),
         TurnProcess(1, 1, 0.0, np.eye(1)),
         Prior(0, (state,), rng.normal(size=(9, 16)), rng.normal(size=9), ((0, 0.2),)),
+        Bearing(0, state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7, np.eye(1)),
     ]
 
 
-@pytest.mark.parametrize("which", range(10))
+@pytest.mark.parametrize("which", range(11))
 def test_jacobians_agree_with_finite_differences(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)

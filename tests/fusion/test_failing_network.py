@@ -1,0 +1,47 @@
+"""A network that raises an error: the caller sees it, and the stream goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support import GRAPH as CONFIG
+from support import stream
+
+from stario.fusion import Navigator
+from stario.fusion.backends import BackendName
+from stario.sequences.sequence import ImuSequence
+
+
+class Failing:
+    """Raises an error instead of some predictions."""
+
+    def __init__(self, inner: Any, at: set[int]) -> None:
+        self.inner, self.at, self.calls = inner, at, 0
+
+    def predict(self, windows: Any) -> Any:
+        self.calls += 1
+        if self.calls in self.at:
+            raise RuntimeError("out of memory")
+        return self.inner.predict(windows)
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_stream_continues_after_its_network_has_failed(
+    walk: ImuSequence, make_oracle: Callable[..., Any], backend: BackendName
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    expected = {state.time: state.p_W for state in stream(Navigator(oracle, CONFIG), walk)}
+    navigator = Navigator(Failing(oracle, {5, 6, 20}), CONFIG, backend=backend)
+    states, failures = [], 0
+    for sample in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        try:
+            states.append(navigator.push(*sample))
+        except RuntimeError:
+            failures += 1
+    assert failures == 3
+    errors = [np.linalg.norm(s.p_W - expected[s.time]) for s in states if s is not None]
+    assert len(errors) == len(expected) - 3
+    assert max(errors) < 0.1
