@@ -254,6 +254,18 @@ def test_a_checkpoint_of_other_recordings_is_refused(
         run(folder, start_from=load_model(finished[0]))
 
 
+def test_a_checkpoint_of_recordings_that_were_corrected_since_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    """Their names and lengths are the same; ground truth or samples are not."""
+    folder, position_W = finished[0].parent, STREAMS[0].position_W
+    swapped = replace(STREAMS[0], position_W=position_W[:, [1, 0, 2]])
+    other_sign = replace(STREAMS[0], imu_W=STREAMS[0].imu_W * np.float32([1, 1, 1, -1, 1, 1]))
+    for corrected in (swapped, replace(STREAMS[0], position_W=1.01 * position_W), other_sign):
+        with pytest.raises(ConfigError, match="other recordings"):
+            train(TINY, [corrected, STREAMS[1]], [1.0, 1.0], VALIDATION, folder)
+
+
 def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
     log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
     assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]
