@@ -52,7 +52,8 @@ def train(
         on_step: called after each step with the step and its mean squared error [m^2], for a
             progress bar.
         on_epoch: called after each validation.
-        trained_on: description of the training data, for the card.
+        trained_on: description of the training data, for the card; that of the initial weights is
+            added to it.
         start_from: model that provides the initial weights.
         calibration: calibration of other weights, used if the errors on `validation` are
             meaningless: a last stage also trains on it, and weak truth alone has no such windows.
@@ -101,7 +102,15 @@ def train(
         known = known_motion(streams, legs)
         if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
             known = start_from.card.known_motion.extended(known)
-        return run.finish(held_out, list(trained_on), calibration, known)
+        sources = [*trained_on, *_inherited(start_from)]
+        return run.finish(held_out, sources, calibration, known)
+
+
+def _inherited(start_from: DisplacementModel | None) -> list[str]:
+    """Return the sources of the initial weights, whose licences hold for the result as well."""
+    sources = [] if start_from is None else start_from.card.trained_on
+    before = "initial weights, "
+    return list(dict.fromkeys(before + words.removeprefix(before) for words in sources))
 
 
 def _material(

@@ -401,8 +401,13 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1)
     other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
-    last = load_model(run(tmp_path / "last", slow, start_from=first, calibration=other))
+    options = {"calibration": other, "trained_on": ["walks"]}
+    last = load_model(run(tmp_path / "last", slow, start_from=first, **options))
     assert last.card.calibration == other
+    assert last.card.trained_on == ["walks", "initial weights, swings"]
     before = dict(first.training_form.named_parameters())
     for name, value in last.training_form.named_parameters():
         torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)
+    again = load_model(run(tmp_path / "again", slow, start_from=last, trained_on=["swings"]))
+    inherited = ["initial weights, walks", "initial weights, swings"]
+    assert again.card.trained_on == ["swings", *inherited]
