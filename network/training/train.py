@@ -16,6 +16,7 @@ from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import workers
+from stario.network.training.result import write_result
 from stario.network.training.run import EpochReport, TrainingRun
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_samplers
@@ -102,8 +103,15 @@ def train(
         known = known_motion(streams, legs)
         if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
             known = start_from.card.known_motion.extended(known)
-        sources = [*trained_on, *_inherited(start_from)]
-        return run.finish(held_out, sources, calibration, known)
+        path = folder / "model.safetensors"
+        if processes.is_leader:
+            sources = [*trained_on, *_inherited(start_from)]
+            validating = {id(stream) for stream in (*validation, *validation_legs)}
+            learned = any(id(stream) in validating for stream in (*streams, *legs))
+            write_result(
+                path, run.best_network(), config, held_out, sources, calibration, known, learned
+            )
+        return path
 
 
 def _inherited(start_from: DisplacementModel | None) -> list[str]:

@@ -411,3 +411,10 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     again = load_model(run(tmp_path / "again", slow, start_from=last, trained_on=["swings"]))
     inherited = ["initial weights, walks", "initial weights, swings"]
     assert again.card.trained_on == ["swings", *inherited]
+
+
+def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> None:
+    """A last stage trains on the validation recordings, too."""
+    everything = [*STREAMS, *VALIDATION]
+    path = train(replace(TINY, epochs=1), everything, [1.0] * 4, VALIDATION, tmp_path)
+    assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
