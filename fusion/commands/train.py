@@ -140,7 +140,7 @@ def train(
     if recorded and not (validation_data.streams or validation_data.legs):
         raise InputError(
             "recordings",
-            "none whose last fifth has an unbroken stretch of 2 s",
+            "none whose last fifth has 2 s of poses, or two legs between known positions",
             "validation data to select and calibrate on",
             "name recordings with --validation",
         )

@@ -10,6 +10,7 @@ from typing import Any
 from stario.network.card import Card, parse_card
 from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.windows import WINDOW_SAMPLES
 
 CARD_KEY = "stario_card"
 """Metadata key of the card, stored as JSON."""
@@ -23,7 +24,8 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
 
     Raises:
         InputError: the extra `onnx` is not installed.
-        WeightsError: the file is missing, truncated, or not written by `export_onnx`.
+        WeightsError: the file is missing, truncated, not written by `export_onnx`, or its graph was
+            changed since.
     """
     runtime = onnx_packages("onnxruntime")
     if not path.is_file():
@@ -40,11 +42,26 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
     # ONNX Runtime's errors have no common base of their own.
     except Exception as error:
         found = str(error).splitlines()[0]
-        raise WeightsError(path, "graph", found, "a complete ONNX file") from error
+        expected = f"a complete ONNX file that ONNX Runtime {runtime.__version__} can read"
+        raise WeightsError(path, "graph", found, expected) from error
     metadata = session.get_modelmeta().custom_metadata_map
     if CARD_KEY not in metadata:
         raise WeightsError(path, CARD_KEY, "no such metadata", "a file from `stario export`")
+    _check_graph(session, path)
     return OnnxEngine(session), parse_card(metadata[CARD_KEY], path)
+
+
+def _check_graph(session: Any, path: Path) -> None:
+    """Refuse a graph converted by other tools, for example to half precision or a fixed batch."""
+    nodes = {node.name: node for node in (*session.get_inputs(), *session.get_outputs())}
+    for name, tail in (("windows", [6, WINDOW_SAMPLES]), ("displacement", [3]), ("log_sigma", [3])):
+        expected, found = f"tensor(float) of shape {['batch', *tail]}", "none"
+        if name in nodes:
+            (batch, *rest), kind = nodes[name].shape, nodes[name].type
+            if isinstance(batch, str) and rest == tail and kind == "tensor(float)":
+                continue
+            found = f"{kind} of shape {[batch, *rest]}"
+        raise WeightsError(path, name, found, expected, "export the weights again")
 
 
 def onnx_packages(*names: str) -> Any:

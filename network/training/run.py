@@ -20,12 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from stario.network.architectures import architecture, build_network
-from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.known_motion import KnownMotion
-from stario.network.model import DisplacementModel, save_model
+from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
-from stario.network.training.calibrate import calibrate
 from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.parallel import Workers
@@ -330,28 +327,7 @@ class TrainingRun:
         else:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
 
-    def finish(
-        self,
-        held_out: ValidationSet,
-        trained_on: list[str],
-        kept: Calibration | None,
-        known: KnownMotion | None,
-    ) -> Path:
-        """Calibrate the best weights, unless a calibration is given, and write the model."""
-        path = self.folder / "model.safetensors"
-        if not self.workers.is_leader:
-            return path
+    def best_network(self) -> DisplacementNetwork:
+        """Return the network with the best weights so far."""
         self.averaged.load_state_dict(self.best)
-        residuals, log_sigma = held_out.residuals(self.averaged)
-        # Sigma is also widened for unknown motion: the calibration must not widen it again.
-        widened = 1.0 if known is None else held_out.variance_factors(known)[:, None]
-        card = Card(
-            architecture=self.config.architecture,
-            calibration=kept or calibrate(residuals / np.sqrt(widened), log_sigma),
-            trained_on=trained_on,
-            recipe=json.loads(json.dumps(asdict(self.config))),
-            figures={"validation_mse_m2": held_out.errors(self.averaged, residuals)},
-            known_motion=known,
-        )
-        save_model(path, self.averaged, card)
-        return path
+        return self.averaged

@@ -8,12 +8,15 @@ import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from stario.network.card import Calibration
 from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import workers
+from stario.network.training.result import write_result
 from stario.network.training.run import EpochReport, TrainingRun
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_samplers
@@ -50,7 +53,8 @@ def train(
         on_step: called after each step with the step and its mean squared error [m^2], for a
             progress bar.
         on_epoch: called after each validation.
-        trained_on: description of the training data, for the card.
+        trained_on: description of the training data, for the card; that of the initial weights is
+            added to it.
         start_from: model that provides the initial weights.
         calibration: calibration of other weights, used if the errors on `validation` are
             meaningless: a last stage also trains on it, and weak truth alone has no such windows.
@@ -99,7 +103,22 @@ def train(
         known = known_motion(streams, legs)
         if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
             known = start_from.card.known_motion.extended(known)
-        return run.finish(held_out, list(trained_on), calibration, known)
+        path = folder / "model.safetensors"
+        if processes.is_leader:
+            sources = [*trained_on, *_inherited(start_from)]
+            validating = {id(stream) for stream in (*validation, *validation_legs)}
+            learned = any(id(stream) in validating for stream in (*streams, *legs))
+            write_result(
+                path, run.best_network(), config, held_out, sources, calibration, known, learned
+            )
+        return path
+
+
+def _inherited(start_from: DisplacementModel | None) -> list[str]:
+    """Return the sources of the initial weights, whose licences hold for the result as well."""
+    sources = [] if start_from is None else start_from.card.trained_on
+    before = "initial weights, "
+    return list(dict.fromkeys(before + words.removeprefix(before) for words in sources))
 
 
 def _material(
@@ -109,8 +128,21 @@ def _material(
 ) -> str:
     """Return the digest of training data, validation data and initial weights."""
     content = [
-        [[(stream.name, len(stream)) for stream in part] for part in streams],
+        [[(stream.name, len(stream), _moments(stream)) for stream in part] for part in streams],
         [f"{weight:.6g}" for weight in weights],
         start_from.card.sha256 if start_from else "",
     ]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def _moments(stream: WorldStream | LegStream) -> list[str]:
+    """Return the sums over time of t x, for every column x of a stream: they tell corrected data.
+
+    Unlike a digest of the bytes, they are the same on processors that round differently.
+    """
+    arrays = [value for value in vars(stream).values() if isinstance(value, np.ndarray)]
+    return [
+        f"{moment:.6g}"
+        for array in arrays
+        for moment in np.atleast_1d(np.linspace(0.0, 1.0, len(array)) @ array.astype(np.float64))
+    ]

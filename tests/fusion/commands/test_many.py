@@ -298,4 +298,6 @@ def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
     stario, recording: Path, tmp_path: Path
 ) -> None:
     write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
-    stario("train", "short.csv", "--generated", 1).assert_one_line_error("--validation")
+    stario("train", "short.csv", "--generated", 1).assert_one_line_error(
+        "two legs between known positions", "--validation"
+    )

@@ -104,6 +104,11 @@ def test_truncated_absent_and_foreign_files_are_refused(exported: Path, tmp_path
         load_model(tmp_path / "absent.onnx")
     import onnx
 
+    converted = onnx.load(exported)
+    converted.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+    onnx.save(converted, broken)
+    with pytest.raises(WeightsError, match=r"windows: found tensor.* of shape \[1, 6, 200\]"):
+        load_model(broken)
     foreign = onnx.load(exported)
     del foreign.metadata_props[:]
     onnx.save(foreign, broken)

@@ -254,6 +254,18 @@ def test_a_checkpoint_of_other_recordings_is_refused(
         run(folder, start_from=load_model(finished[0]))
 
 
+def test_a_checkpoint_of_recordings_that_were_corrected_since_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    """Their names and lengths are the same; ground truth or samples are not."""
+    folder, position_W = finished[0].parent, STREAMS[0].position_W
+    swapped = replace(STREAMS[0], position_W=position_W[:, [1, 0, 2]])
+    other_sign = replace(STREAMS[0], imu_W=STREAMS[0].imu_W * np.float32([1, 1, 1, -1, 1, 1]))
+    for corrected in (swapped, replace(STREAMS[0], position_W=1.01 * position_W), other_sign):
+        with pytest.raises(ConfigError, match="other recordings"):
+            train(TINY, [corrected, STREAMS[1]], [1.0, 1.0], VALIDATION, folder)
+
+
 def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
     log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
     assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]
@@ -389,8 +401,20 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1)
     other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
-    last = load_model(run(tmp_path / "last", slow, start_from=first, calibration=other))
+    options = {"calibration": other, "trained_on": ["walks"]}
+    last = load_model(run(tmp_path / "last", slow, start_from=first, **options))
     assert last.card.calibration == other
+    assert last.card.trained_on == ["walks", "initial weights, swings"]
     before = dict(first.training_form.named_parameters())
     for name, value in last.training_form.named_parameters():
         torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)
+    again = load_model(run(tmp_path / "again", slow, start_from=last, trained_on=["swings"]))
+    inherited = ["initial weights, walks", "initial weights, swings"]
+    assert again.card.trained_on == ["swings", *inherited]
+
+
+def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> None:
+    """A last stage trains on the validation recordings, too."""
+    everything = [*STREAMS, *VALIDATION]
+    path = train(replace(TINY, epochs=1), everything, [1.0] * 4, VALIDATION, tmp_path)
+    assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
