@@ -218,3 +218,15 @@ def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):
     legend = fig.legends[0].get_window_extent()
     assert fig.bbox.x0 <= legend.x0
     assert legend.x1 <= fig.bbox.x1
+
+
+def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
+    still = ImuSequence("walk", truth.time, *(np.ones((len(truth), 3)) for _ in range(2)))
+    lost = [(k, k + 0.01) for k in np.arange(10.0, 20.0, 0.1)]
+    for axes in imu_overview(still, gaps=[(30.0, 34.0), *lost]).axes[:2]:
+        (shaded,) = (patch for patch in axes.patches if patch.get_label() == "gap")
+        assert (shaded.get_x(), shaded.get_width()) == (30.0, 4.0)
+        assert shaded.get_zorder() < line(axes, "x").get_zorder()
+        marks = line(axes, "lost")
+        assert len(marks.get_xdata()) == len(lost)
+        assert set(marks.get_ydata()) == {1.0}
