@@ -12,7 +12,7 @@ from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.arrays import interpolated
-from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps
+from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, unbroken
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
@@ -156,11 +156,8 @@ def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
 ) -> list[go.Scatter]:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    low, high = value - 3.0 * sigma, value + 3.0 * sigma
-    outlines = [
-        np.vstack([np.c_[time, low][part], np.c_[time, high][part][::-1], [[np.nan] * 2]])
-        for part in np.ma.clump_unmasked(np.ma.masked_invalid(low))
-    ]
+    edges = unbroken(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
+    outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
     x, y = np.vstack([np.empty((0, 2)), *outlines]).T
     return [
         go.Scatter(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.state import Track
-from stario.sequences.drawing.figures import split_at_gaps
+from stario.sequences.drawing.figures import split_at_gaps, unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.readers.checked import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -83,8 +83,7 @@ def _log_path(
 ) -> None:
     """Log a whole path at once, broken in gaps and where poses are not valid."""
     _, path = split_at_gaps(trajectory.time, trajectory.position_W, trajectory.valid)
-    strips = [path[part] for part in np.ma.clump_unmasked(np.ma.masked_invalid(path[:, 0]))]
-    stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
+    stream.log(entity, rr.LineStrips3D(unbroken(path), colors=[colour], radii=[0.02]), static=True)
 
 
 def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:
