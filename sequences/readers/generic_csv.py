@@ -46,13 +46,8 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.text import (
-    first_lines,
-    is_row,
-    read_lines,
-    read_quickly,
-    rows_below,
-)
+from stario.sequences.readers.lines import first_lines, is_row, read_lines
+from stario.sequences.readers.text import read_quickly, rows_below
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,

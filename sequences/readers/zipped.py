@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_bytes
+from stario.sequences.readers.lines import first_bytes
 
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _MAX_BYTES = 4 * 2**30

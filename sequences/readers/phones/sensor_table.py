@@ -17,8 +17,9 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.columns import Column
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
-from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
+from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
