@@ -71,7 +71,9 @@ def _read_unpacked(
         if len(inside) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
             found = f"{len(inside)} recordings ({names})"
-            raise ReadError(path, "content", found, "one", f"unpack the {path.suffix[1:].lower()}")
+            raise ReadError(
+                path, "content", found, "one", f"unpack the {path.suffix[1:].lower() or 'zip'}"
+            )
         try:
             sequence = read_recording(inside[0])
         except ReadError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import logging
 from collections.abc import Callable
@@ -14,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.lines import is_row, read_lines
+from stario.sequences.readers.lines import (
+    ends_within_a_row,
+    is_row,
+    read_lines,
+    unquoted,
+    with_seconds,
+)
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)
@@ -98,6 +103,7 @@ def read_table(
     used: list[int] | None = None,
     decimal: str = ".",
     killed: bool = False,
+    dated: bool = False,
 ) -> Table:
     """Read rows of numbers; `nan` and empty cells become NaN.
 
@@ -109,13 +115,16 @@ def read_table(
         used: the columns to return, in this order; the first `columns` if None.
         decimal: decimal mark, a point or a comma.
         killed: whether to skip a last row that is cut short because the app was killed.
+        dated: whether to read ISO dates as seconds since 1970.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if used is None else used
-    return read_quickly(path, skip, delimiter, wanted, decimal) or _read_carefully(
-        path, columns, skip, delimiter, wanted, decimal, killed
+    cut = killed and ends_within_a_row(path, delimiter)
+    quick = None if cut or dated else read_quickly(path, skip, delimiter, wanted, decimal)
+    return quick or _read_carefully(
+        path, columns, skip, delimiter, wanted, decimal, killed, cut, dated
     )
 
 
@@ -163,15 +172,21 @@ def _read_carefully(
     wanted: list[int],
     decimal: str = ".",
     killed: bool = False,
+    cut: bool = False,
+    dated: bool = False,
 ) -> Table:
-    lines = [_unquoted(line, delimiter) for line in read_lines(path)]
+    lines = [unquoted(line, delimiter) for line in read_lines(path)]
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
+    if dated:
+        lines = [with_seconds(line) for line in lines]
     numbered = rows_below(path, lines, skip)
     if killed and len(numbered) > 1:
         try:
             _row(path, *numbered[-1], columns, delimiter, wanted)
         except ReadError:
+            cut = True
+        if cut:
             _log.warning("%s: skipped the last row, which is cut short", path)
             numbered.pop()
     rows = [line for _, line in numbered]
@@ -190,16 +205,6 @@ def _read_carefully(
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
     """Convert time stamps [ns] to seconds since an origin."""
     return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
-
-
-def _unquoted(line: str, delimiter: str | None) -> str:
-    """Remove the quotes around a line's cells; a delimiter within a cell becomes a blank."""
-    if '"' not in line:
-        return line
-    if delimiter is None:
-        return line.replace('"', " ")
-    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
 
 
 def rows_below(path: Path, lines: list[str], skip: int) -> list[tuple[int, str]]:
@@ -225,8 +230,22 @@ def _row(
     values = []
     for k in wanted:
         try:
-            values.append(float(cells[k]) if cells[k].strip() else float("nan"))
+            values.append(cell_value(cells[k]))
         except ValueError:
             where = f"line {number}, column {k + 1}"
             raise ReadError(path, where, repr(cells[k].strip()), "a number") from None
     return values
+
+
+def cell_value(cell: str) -> float:
+    """Return the number in a cell; NaN if it is blank or says that there is none, such as NA.
+
+    Raises:
+        ValueError: it holds anything else.
+    """
+    return float("nan") if is_missing(cell) else float(cell)
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell is blank or says that there is no value."""
+    return cell.strip().lower() in ("", "na", "n/a", "null", "none")
