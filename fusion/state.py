@@ -153,8 +153,9 @@ class Health:
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
-        final_sigma: final standard deviations, the largest over the axes: tilt and yaw [rad],
-            velocity [m/s], horizontal position and height [m], biases [rad/s], [m/s^2].
+        final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
+            ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
+            [rad/s], [m/s^2].
         notes: further remarks, one line each, such as a graph that fell back to the filter.
     """
 

@@ -17,7 +17,7 @@ from stario.sequences.sequence import (
     Magnetometer,
     Trajectory,
 )
-from stario.sequences.units import with_units
+from stario.sequences.units import FAST_RAD_S, unit_named, with_units
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +59,21 @@ def with_conventions(
     if accel_sign == "apple":
         turned = accel_unit.removeprefix("-")
         accel_unit = turned if accel_unit.startswith("-") else f"-{accel_unit}"
+    if unit_named(gyro_unit) == "deg/s":
+        _warn_if_in_radians(sequence)
     sequence = with_axes(with_units(sequence, gyro_unit, accel_unit), axes)
     return with_gravity(sequence) if gravity == "removed" else sequence
+
+
+def _warn_if_in_radians(sequence: ImuSequence) -> None:
+    """Warn of deg/s given for rates that are plausible in rad/s, whatever the header says."""
+    speeds = np.linalg.norm(sequence.gyro, axis=1)
+    speeds = speeds[np.isfinite(speeds)]
+    if len(speeds) and (speed := float(np.percentile(speeds, 95))) <= FAST_RAD_S:
+        log.warning(
+            "%s: its rates, up to %.2g, fit rad/s; --gyro-unit deg/s divides them by 57: omit it "
+            "unless the device lay still", sequence.name, speed,
+        )  # fmt: skip
 
 
 def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:

@@ -21,6 +21,10 @@ ACCEL_UNITS = {
 }
 """The minus is for devices that report gravity instead of specific force: Apple's."""
 
+FAST_RAD_S = 15.0
+"""Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
+least 41 if deg/s are taken for rad/s."""
+
 MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mG": 0.1}
 
 _SPELLINGS = {

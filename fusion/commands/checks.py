@@ -25,7 +25,9 @@ from stario.fusion.commands.options import (
     JsonOption,
     OptionalPathsArgument,
     ReadingOptions,
+    changed,
     expand_option_groups,
+    refuse_unused,
 )
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
     Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
+
+_WALKS, _SECONDS, _SPLIT = 20, 120.0, "validation"
 
 RecordingsArgument = Annotated[
     list[Path],
@@ -65,12 +69,12 @@ def backends(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
-    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = _WALKS,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = _SECONDS,
     data: Annotated[
         Path | None, typer.Option(help="Folder of the development recordings to use instead.")
     ] = None,
-    split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
+    split: Annotated[str, typer.Option(help="With --data: split to use.")] = _SPLIT,
     as_json: JsonOption = False,
 ) -> None:
     """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
@@ -85,6 +89,18 @@ def backends(
     )
     from stario.network.training.splits import split_paths
 
+    if paths:
+        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
+    if data is None:
+        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
+    else:
+        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+    simulated = {"--walks": walks != _WALKS, "--seconds": seconds != _SECONDS}
+    if paths or data is not None:
+        refuse_unused(simulated, "with recordings", "use with simulated walks")
+    else:
+        unused = changed(reading) | changed(estimating)
+        refuse_unused(unused, "with simulated walks", "use with PATH or --data")
     scores: list[Score] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
@@ -127,10 +143,15 @@ def faults(
     """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
 
+    if not network:
+        refuse_unused(changed(estimating, "model"), "without --network", "use with --network")
     settings = estimating.settings()
     if path is not None:
+        refuse_unused(changed(reading, "where"), "with one recording", "no filter")
         sequence = reading.read(path)
     else:
+        unused = changed(reading) | changed(estimating, "magnetometer", "declination")
+        refuse_unused(unused, "with the simulated walk", "use with PATH")
         sequence, matched = matched_walk(seed=seed)
         settings = matched if estimating.config is None else settings
     results = run_faults(sequence, settings, estimating.network() if network else None, seed)

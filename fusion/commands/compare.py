@@ -23,7 +23,9 @@ from stario.fusion.commands.options import (
     OutOption,
     ReadingOptions,
     ReportOption,
+    changed,
     expand_option_groups,
+    refuse_unused,
 )
 from stario.sequences.errors import InputError
 
@@ -50,6 +52,8 @@ def compare(
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.readers.checked import optional_package
 
+    if not paths:
+        refuse_unused(changed(reading), "without PATH", "use with a recording to read")
     if report:
         optional_package("plotly", "report")
     settings, network = estimating.settings(), estimating.network()

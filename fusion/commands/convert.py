@@ -10,7 +10,7 @@ import typer
 
 from stario.fusion.commands.common import check_new, collect_results, exit_if_skipped
 from stario.fusion.commands.options import OverwriteOption, ReadingOptions, expand_option_groups
-from stario.sequences.errors import InputError
+from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
@@ -45,14 +45,17 @@ def convert(
     files, skipped = reading.recordings(sources)
     _check_target(target, [*sources, *files], overwrite)
     if layout != "archive":
-        only = sources[0] if len(sources) == 1 and not reading.where else _only(files, skipped)
-        sequence = reading.read(only)
+        sequence = reading.read(_only(files, skipped))
         written = convert_sequence(sequence, target, to)
-        typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
-        typer.echo("\n".join(str(path) for path in written))
+        typer.echo(sequence.summary())
+        typer.echo("\n".join(f"written: {path}" for path in written))
         return
-    names = convert_all(_read(reading, files, skipped), target)
-    typer.echo(f"{len(names)} recording{'s' * (len(names) != 1)} in {target}")
+    read: list[str] = []
+    names = convert_all(_read(reading, files, skipped, read), target)
+    for name, stored in zip(read, names, strict=True):
+        if stored != name:
+            typer.echo(f"{name} is stored as {stored}")
+    typer.echo(f"written: {target}, {len(names)} recording{'s' * (len(names) != 1)}")
     exit_if_skipped(skipped)
 
 
@@ -68,17 +71,20 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
 
 def _only(files: list[Path], skipped: list[Skipped]) -> Path:
     """Return the only recording found."""
+    if len(skipped) == 1 and not files:
+        raise StarioError(skipped[0].reason)
     exit_if_skipped(skipped)
     if len(files) != 1:
         expected = "one recording, or an archive (.h5) as OUT"
-        raise InputError("convert", f"{len(files)} recordings", expected)
+        fix = f"name one, such as {files[0]}" if files else ""
+        raise InputError("convert", f"{len(files)} recordings", expected, fix)
     return files[0]
 
 
 def _read(
-    reading: ReadingOptions, files: list[Path], skipped: list[Skipped]
+    reading: ReadingOptions, files: list[Path], skipped: list[Skipped], names: list[str]
 ) -> Iterator[ImuSequence]:
-    """Yield one recording after the other; add those that cannot be converted to `skipped`."""
+    """Yield each recording and append its name; add those that cannot be used to `skipped`."""
     from stario.sequences.datasets.batch import each
     from stario.sequences.datasets.convert import check_content
 
@@ -88,5 +94,6 @@ def _read(
         return sequence
 
     for sequence in collect_results(each(checked, files, jobs=1), skipped):
-        typer.echo(f"{sequence.name}: {len(sequence)} samples, {sequence.duration:.1f} s")
+        typer.echo(sequence.summary())
+        names.append(sequence.name)
         yield sequence

@@ -22,7 +22,9 @@ from stario.fusion.commands.options import (
     OutOption,
     ReadingOptions,
     RunsOption,
+    changed,
     expand_option_groups,
+    refuse_unused,
 )
 from stario.sequences.errors import InputError
 
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from stario.sequences.datasets.splits import ListEntry
 
 _GROUP = "{group}"
+_SPLIT, _RUNS = "test", Path("runs")
 
 
 @expand_option_groups
@@ -50,7 +53,7 @@ def evaluate(
             help="With --data: test, validation, training, holdout, all, open, or a list file "
             "with lines of name, group."
         ),
-    ] = "test",
+    ] = _SPLIT,
     by: Annotated[
         str | None,
         typer.Option(
@@ -76,7 +79,7 @@ def evaluate(
             "default, or weights files; several weights of one network are averaged.",
         ),
     ] = None,
-    runs: RunsOption = Path("runs"),
+    runs: RunsOption = _RUNS,
     convention: Annotated[
         str | None,
         typer.Option(help="How --models averages position errors: rms (default), ronin or mean."),
@@ -86,17 +89,7 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    if by is None and against is not None:
-        raise InputError("--against", f"{against} without --by", "a grouping", "add --by set")
-    if by is None and ekf:
-        raise InputError("--ekf", "use without --by", "a grouping", "add --by set")
-    if by is not None and models is not None:
-        fix = "name two networks by --model and --against"
-        raise InputError("--models", f"{models} with --by", "one of the two", fix)
-    if by is None and models is None and convention is not None:
-        raise InputError(
-            "--convention", f"{convention} without --models", "networks", "name them with --models"
-        )
+    _refuse_unused(estimating, paths, data, split, by, against, ekf, models, convention, runs)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
     if by is not None:
@@ -108,6 +101,37 @@ def evaluate(
     else:
         skipped += _tracks(files, reading, estimating, jobs, out, as_json)
     exit_if_skipped(skipped)
+
+
+def _refuse_unused(
+    estimating: EstimatorOptions,
+    paths: list[Path] | None,
+    data: Path | None,
+    split: str,
+    by: str | None,
+    against: str | None,
+    ekf: bool,
+    models: str | None,
+    convention: str | None,
+    runs: Path,
+) -> None:
+    """Refuse options that the chosen kind of evaluation does not use."""
+    if paths:
+        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
+    if data is None:
+        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
+    if by is None:
+        grouped = {"--against": against is not None, "--ekf": ekf}
+        refuse_unused(grouped, "without --by", "a grouping, such as --by set")
+    else:
+        refuse_unused({"--models": models is not None}, "with --by", "--model and --against")
+        settings = changed(estimating, "config", "magnetometer", "declination")
+        refuse_unused(settings, "with --by", "use without: the network alone is judged")
+    if models is None:
+        listed = {"--convention": convention is not None, "--runs": runs != _RUNS}
+        refuse_unused(listed, "without --models", "networks named with --models")
+    else:
+        refuse_unused(changed(estimating, "model"), "with --models", "one of the two")
 
 
 def _listed(
@@ -122,10 +146,7 @@ def _listed(
         return [ListEntry(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
-    if reading.where:
-        raise InputError(
-            "--where", "use with --data", "use with PATH", "name the archive instead of --data"
-        )
+    refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
     return read_packaged_list(split, data), []
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -104,6 +104,9 @@ class ReadingOptions:
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a named format applies to the path itself
+            refuse_unused(
+                changed(self, "where"), "with --format", "use with folders, lists or archives"
+            )
             return list(paths), []
         chosen = _attributes(self.where or ())
         files: list[Path] = []
@@ -168,6 +171,32 @@ class EstimatorOptions:
         from stario.network.model import load_model
 
         return load_model(self.model)
+
+
+def changed(group: ReadingOptions | EstimatorOptions, *names: str) -> dict[str, bool]:
+    """Return by command-line option whether these fields, or all, differ from their defaults."""
+    default, negated = type(group)(), {"magnetometer": "no-magnetometer"}
+    return {
+        f"--{negated.get(name, name).replace('_', '-')}": value != getattr(default, name)
+        for name, value in asdict(group).items()
+        if not names or name in names
+    }
+
+
+def refuse_unused(given: Mapping[str, bool], found: str, expected: str) -> None:
+    """Refuse options that would do nothing, rather than ignore them.
+
+    Args:
+        given: by option, whether it was given.
+        found: why it would do nothing, such as "without PATH".
+        expected: when it does something.
+
+    Raises:
+        InputError: one was given.
+    """
+    for option, used in given.items():
+        if used:
+            raise InputError(option, f"use {found}", expected)
 
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:

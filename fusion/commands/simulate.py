@@ -35,8 +35,16 @@ def simulate(
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
     from stario.sequences.simulation.magnetometer import INDOOR_FIELD
-    from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+    from stario.sequences.simulation.walks import (
+        CARRYING_MODES,
+        WalkStyle,
+        check_amount,
+        generate_walk,
+    )
 
+    if path.suffix.lower() != ".csv":
+        fix = "use `stario convert` for other formats and folders"
+        raise InputError("path", str(path), "a file name ending in .csv", fix)
     check_new("path", path, overwrite)
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     if imu not in sensors:
@@ -44,6 +52,7 @@ def simulate(
     modes = (*CARRYING_MODES, "random")
     if carry not in modes:
         raise InputError("--carry", repr(carry), f"one of {', '.join(modes)}")
+    check_amount(seconds, rate)
     style = None if carry == "random" else WalkStyle(carry=carry)
     walk = generate_walk(seed, seconds, style=style)
     field = INDOOR_FIELD if magnetometer else None

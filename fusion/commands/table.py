@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stario.fusion.commands.common import exit_if_skipped
-from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_values
+from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_values, refuse_unused
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.table.sets import DataSet
+
+
+_PER_GROUP = 2
 
 
 def table(
@@ -43,7 +46,7 @@ def table(
     split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
     per_group: Annotated[
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
-    ] = 2,
+    ] = _PER_GROUP,
     config: Annotated[
         Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
     ] = None,
@@ -101,7 +104,10 @@ def _data_sets(
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     datasets: list[DataSet] = []
-    if data is not None:
+    if data is None:
+        unused = {"--sets": sets is not None, "--per-group": per_group != _PER_GROUP}
+        refuse_unused(unused, "without --data", "use with --data")
+    else:
         names = None if sets is None else [name.strip() for name in sets.split(",")]
         datasets += development_sets(data, seed, per_group, names)
     for word in published:

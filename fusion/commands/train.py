@@ -20,8 +20,10 @@ from stario.fusion.commands.options import (
     JobsOption,
     OptionalPathsArgument,
     ReadingOptions,
+    changed,
     expand_option_groups,
     recipe_values,
+    refuse_unused,
 )
 from stario.sequences.errors import InputError
 
@@ -116,6 +118,12 @@ def train(
     from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
 
+    if recorded_only:
+        refuse_unused({"--generated": bool(generated)}, "with --recorded-only", "one of the two")
+    if data is not None:
+        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+    elif not paths and not validation:
+        refuse_unused(changed(reading), "without recordings", "use with PATH")
     first = load_model(start_from) if start_from else None  # fails before anything slow starts
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     if not paths and data is None and generated is None:
@@ -123,8 +131,6 @@ def train(
     walks = 0 if recorded_only else _GENERATED if generated is None else generated
     folder = cache or cache_folder()
     streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
-    if data is not None and reading.where:
-        raise InputError("--where", "with --data", "with PATH only", "name the archive instead")
     recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
     )
@@ -206,9 +212,8 @@ def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path],
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
-        for option, used in (("--leave-out", group is not None), ("--learn-from", name != "all")):
-            if used:
-                raise InputError(option, "no --data", "the folder of the development recordings")
+        unused = {"--leave-out": group is not None, "--learn-from": name != "all"}
+        refuse_unused(unused, "without --data", "use with the development recordings")
         return [], []
     if name not in ("all", "open", "few"):
         raise InputError("--learn-from", repr(name), "all, open or few")

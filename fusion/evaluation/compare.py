@@ -43,8 +43,8 @@ METRICS = (
     "pde",
     "aye_rad",
     "known_positions_m",
-    "nees",
-    "nis",
+    "nees_median",
+    "nis_mean",
     "seconds_network",
     "seconds_filter",
 )
@@ -56,8 +56,9 @@ METRIC_WORDS = {
     "in the track's shape and length only [m]",
     "known_positions_m": "root mean square of the horizontal distance to positions or waypoints "
     "known without attitude, after a fit of yaw and position [m]",
-    "nees": "median over time of the 3-D position's NEES, aligned as the track (expected: 2.4)",
-    "nis": "mean NIS of the network's measurements (expected: 3)",
+    "nees_median": "median over time of the 3-D position's NEES, aligned as the track "
+    "(expected: 2.4)",
+    "nis_mean": "mean NIS of the network's measurements (expected: 3)",
     "seconds_network": "computing time of the network [s]",
     "seconds_filter": "computing time of everything except the network [s]",
     "alignment": "yaw and position of the first common pose; tilt is never aligned",
@@ -169,11 +170,11 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
         figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
         figures["ate_fit_m"] = evaluate_track(track.trajectory, truth, alignment="yaw").ate_m
         if track.trajectory.position_covariance_W is not None:
-            figures["nees"] = position_nees(track.trajectory, truth, alignment).median
+            figures["nees_median"] = position_nees(track.trajectory, truth, alignment).median
     elif sequence.positions is not None:
         error, count = position_error(track, sequence.positions)
         figures["known_positions_m"] = error if count >= MIN_POSITIONS else None
-    figures["nis"] = track.nis
+    figures["nis_mean"] = track.nis
     figures["seconds_network"] = track.seconds_network
     figures["seconds_filter"] = track.seconds_filter
     return figures

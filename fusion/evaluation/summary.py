@@ -18,9 +18,9 @@ _COLUMNS = (
     ("network", "ate_m", "network, own attitude"),
     ("ekf", "ate_m", "EKF"),
     ("graph", "ate_m", "graph"),
-    ("ekf", "nis", "EKF NIS"),
-    ("ekf", "nees", "EKF NEES"),
-    ("graph", "nees", "graph NEES"),
+    ("ekf", "nis_mean", "EKF NIS"),
+    ("ekf", "nees_median", "EKF NEES"),
+    ("graph", "nees_median", "graph NEES"),
 )
 
 
@@ -50,7 +50,10 @@ def scores_of(comparison: Comparison) -> Scores:
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """Return figures of every recording, with medians and means over them, as plain values."""
     records = {scores.name: scores.record for scores in recordings}
-    metrics = ("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m", "nees", "nis")
+    metrics = (
+        *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m"),
+        *("nees_median", "nis_mean"),
+    )
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
@@ -71,8 +74,8 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     lines.append(f"ATE in m: {METRIC_WORDS['ate_m']};")
     lines.append(f"in parentheses {METRIC_WORDS['ate_fit_m']};")
     lines.append(f"horizontal: {METRIC_WORDS['horizontal']};")
-    lines.append(f"NIS: {METRIC_WORDS['nis']};")
-    lines.append(f"NEES: {METRIC_WORDS['nees']}; alignment: {METRIC_WORDS['alignment']}.")
+    lines.append(f"NIS: {METRIC_WORDS['nis_mean']};")
+    lines.append(f"NEES: {METRIC_WORDS['nees_median']}; alignment: {METRIC_WORDS['alignment']}.")
     return "\n".join(lines)
 
 

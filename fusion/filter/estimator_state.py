@@ -88,15 +88,19 @@ class UpdateCounts:
 
     def health(self, counts: SampleCounts, state: NavState) -> Health:
         """Return the health report: outcomes of samples and updates, and the state's sigmas."""
-        sigma = np.sqrt(np.diag(state.covariance))
         groups = {
-            "tilt_rad": sigma[0:2],
-            "yaw_rad": sigma[2:3],
-            "velocity_m_s": sigma[3:6],
-            "position_m": sigma[6:8],
-            "height_m": sigma[8:9],
-            "gyro_bias_rad_s": sigma[9:12],
-            "accel_bias_m_s2": sigma[12:15],
+            "tilt_rad": slice(0, 2),
+            "yaw_rad": slice(2, 3),
+            "velocity_m_s": slice(3, 6),
+            "position_m": slice(6, 8),
+            "height_m": slice(8, 9),
+            "gyro_bias_rad_s": slice(9, 12),
+            "accel_bias_m_s2": slice(12, 15),
+        }
+        # The largest in any direction, not along an axis: W's yaw is arbitrary.
+        variance = {
+            name: np.linalg.eigvalsh(state.covariance[part, part])[-1]
+            for name, part in groups.items()
         }
         return changed(
             counts.health(),
@@ -107,7 +111,7 @@ class UpdateCounts:
             fixes=dict(self.fixes),
             zero_velocity=dict(self.zero_velocity),
             bearings=dict(self.bearings),
-            final_sigma={name: float(np.max(values)) for name, values in groups.items()},
+            final_sigma={name: math.sqrt(max(value, 0.0)) for name, value in variance.items()},
         )
 
 

@@ -192,5 +192,7 @@ def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]
         points = np.clip(points, low - (high - low).max(), high + (high - low).max())
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    margin = 0.08 * max(1.0, float((high - low).max()))
-    return np.stack([low - margin, high + margin], axis=1)
+    # At least a metre, lest the millimetres of a device at rest look like a walk.
+    half = 0.5 * (high - low) + 0.08 * max(1.0, float((high - low).max()))
+    half = np.maximum(half, 0.5)
+    return np.stack([0.5 * (low + high) - half, 0.5 * (low + high) + half], axis=1)

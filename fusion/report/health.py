@@ -164,14 +164,19 @@ def _updates(health: Health) -> Iterator[Finding]:
         )
         yield Finding("warning", text, advice)
     ratio = health.mean_nis / health.nis_expected
+    nis = f"mean NIS {health.mean_nis:.1f}, expected {health.nis_expected:.0f}"
     if ratio > NIS_RATIO:
-        text = f"Innovations are larger than expected (mean NIS {health.mean_nis:.1f})."
-        advice = "Sigmas are too small by about the ratio's square root; recalibrate the weights."
-        yield Finding("warning", text, f"{advice} Ratio: {ratio:.1f}.")
-    elif ratio < 1.0 / NIS_RATIO:
-        text = f"Innovations are smaller than expected (mean NIS {health.mean_nis:.1f})."
+        text = f"The network and the IMU disagree by more than their sigmas allow ({nis})."
         advice = (
-            "Innovations reveal little about the track's sigmas: persistent errors keep them small."
+            f"The track's sigmas are too small by a factor of about {math.sqrt(ratio):.1f}: "
+            "fine-tune the weights on recordings of this kind with `stario train --start-from`."
+        )
+        yield Finding("warning", text, advice)
+    elif ratio < 1.0 / NIS_RATIO:
+        text = f"The network and the IMU agree more closely than their sigmas suggest ({nis})."
+        advice = (
+            "Nothing to do. It does not mean that the track's sigmas are too large: errors that "
+            "last from window to window hardly show here."
         )
         yield Finding("note", text, advice)
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")

@@ -30,8 +30,8 @@ _COLUMNS = {
     "ate_fit_m": ("fitted [m]", 2),
     "rte_m": ("RTE [m]", 2),
     "aye_rad": ("AYE [rad]", 3),
-    "nees": ("NEES", 1),
-    "nis": ("NIS", 1),
+    "nees_median": ("NEES", 1),
+    "nis_mean": ("NIS", 1),
 }
 
 

@@ -12,7 +12,7 @@ from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.arrays import interpolated
-from stario.sequences.drawing.figures import TRACK_STYLES
+from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, unbroken
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
@@ -20,7 +20,8 @@ _AXIS_LOOKS = (("x", "#0072B2", "solid"), ("y", "#D55E00", "dash"), ("z", "#009E
 TRUTH = "truth"
 _DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
 _MAX_INNOVATIONS = 1500
-
+_MAX_PAUSE = 1.0
+"""Longest time between updates [s] across which the innovations' band is drawn."""
 
 Column = Callable[[Series], FloatArray | None]
 """Function from a track to the column that a panel draws."""
@@ -96,7 +97,8 @@ def innovation_panels(innovations: Innovations, start: float, gate: float) -> li
     panels = []
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
-        traces = _band("innovation", time, 0.0 * residual, sigma, FAINT)
+        ticks, edge = split_at_gaps(time, sigma[:, None], max_gap=_MAX_PAUSE)
+        traces = _band("innovation", ticks, 0.0 * edge[:, 0], edge[:, 0], FAINT)
         traces += _dots(time, residual, gated, "m")
         title = f"Innovation {axis} [m], band: 3 sigma"
         panels.append(Panel(title, traces, {"range": _limits(traces)}))
@@ -142,10 +144,10 @@ def _curve(
 def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
     traces = []
     for name, series in tracks.items():
-        inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
-        valid = np.isfinite(truth.position[:, 0])
-        true_position = interpolated(series.time, truth.time[valid], truth.position[valid, :2])
+        # Not a number in the truth's gaps, and beyond its ends.
+        true_position = interpolated(series.time, truth.time, truth.position[:, :2])
         error = np.linalg.norm(series.position[:, :2] - true_position, axis=1)
+        inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
         traces += _curve(name, series.time, np.where(inside, error, np.nan), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
 
@@ -154,17 +156,20 @@ def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
 ) -> list[go.Scatter]:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    common: dict[str, Any] = {
-        "x": _rounded(time),
-        "mode": "lines",
-        "line": {"width": 0},
-        "hoverinfo": "skip",
-        "legendgroup": group,
-    }
-    fill = {"fill": "tonexty", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
+    edges = unbroken(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
+    outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
+    x, y = np.vstack([np.empty((0, 2)), *outlines]).T
     return [
-        go.Scatter(y=_rounded(value - 3.0 * sigma), **common),
-        go.Scatter(y=_rounded(value + 3.0 * sigma), **common, **fill),
+        go.Scatter(
+            x=_rounded(x),
+            y=_rounded(y),
+            mode="lines",
+            line={"width": 0},
+            hoverinfo="skip",
+            legendgroup=group,
+            fill="toself",  # each stretch between gaps on its own; "tonexty" would fill the gaps
+            fillcolor=f"rgba({red},{green},{blue},0.16)",
+        )
     ]
 
 

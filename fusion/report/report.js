@@ -56,7 +56,7 @@
     Plotly.relayout(map, { shapes: places(t) });
     Plotly.relayout(time, { shapes: line(t) });
     const k = nearest(main.t, t);
-    const sigma = main.xx ? `, sigma ${number(axis(main, k)[0], 2)} m` : "";
+    const sigma = main.xx && main.x[k] !== null ? `, sigma ${number(axis(main, k)[0], 2)} m` : "";
     readout.textContent = `${number(t, 1)} s  |  ${main.label}: x ${number(main.x[k], 2)} m, y ${number(main.y[k], 2)} m` +
       `${sigma}, ${number(main.speed[k], 2)} m/s, yaw ${number(wrapped(main.yaw[k]), 0)} deg`;
     document.body.dataset.time = t.toFixed(3);

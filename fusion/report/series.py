@@ -9,7 +9,8 @@ import numpy as np
 from stario.fusion.state import Track
 from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import yaw_of
-from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.drawing.figures import indices_after_gaps
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, Trajectory
 
 MAX_POINTS = 1500
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
@@ -21,7 +22,7 @@ Bias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A track as columns of N rows, NaN where poses are not valid.
+    """A track as columns of N rows, NaN where poses are not valid and once in each gap.
 
     Attributes:
         time: (N,) time since the recording's first sample [s].
@@ -69,7 +70,7 @@ def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
         aligned: its trajectory as drawn, pose for pose.
         start: time of the recording's first sample [s].
     """
-    rows = _thinned(len(track.time))
+    _, rows, shown = _rows(aligned)
     plain = trajectory_series(aligned, start)
     if track.covariance is None:
         return plain
@@ -77,7 +78,9 @@ def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
     sigma = np.sqrt(P[:, range(15), range(15)])
 
     def bias(values: FloatArray | None, scale: float, part: slice) -> Bias | None:
-        return None if values is None else (scale * values[rows], scale * sigma[:, part])
+        if values is None:
+            return None
+        return np.where(shown[:, None], scale * values[rows], np.nan), scale * sigma[:, part]
 
     return replace(
         plain,
@@ -90,10 +93,7 @@ def track_series(track: Track, aligned: Trajectory, start: float) -> Series:
 
 def trajectory_series(trajectory: Trajectory, start: float) -> Series:
     """Return the columns of a trajectory; without velocities, speed is taken from positions."""
-    rows = _thinned(len(trajectory.time))
-    time = trajectory.time[rows] - start
-    valid = trajectory.valid[rows]
-    position = np.where(valid[:, None], trajectory.position_W[rows], np.nan)
+    time, rows, shown = _rows(trajectory)
     yaw = np.degrees(np.unwrap(yaw_of(trajectory.attitude_WB[rows])))
     covariance = trajectory.position_covariance_W
     if trajectory.velocity_W is None:
@@ -101,10 +101,10 @@ def trajectory_series(trajectory: Trajectory, start: float) -> Series:
     else:
         speed = np.linalg.norm(trajectory.velocity_W[rows], axis=1)
     return Series(
-        time,
-        position,
-        np.where(valid, speed, np.nan),
-        np.where(valid, yaw, np.nan),
+        time - start,
+        np.where(shown[:, None], trajectory.position_W[rows], np.nan),
+        np.where(shown, speed, np.nan),
+        np.where(shown, yaw, np.nan),
         None if covariance is None else covariance[rows],
     )
 
@@ -122,9 +122,22 @@ def ellipse(covariance: FloatArray) -> FloatArray:
     return outline.T
 
 
-def _thinned(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    rows = np.linspace(0, count - 1, min(count, MAX_POINTS))
-    return np.unique(np.round(rows).astype(np.intp))
+def _rows(
+    trajectory: Trajectory,
+) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.intp]], BoolArray]:
+    """Return the times (N,) and rows (N,) drawn of a track, and which of them are shown.
+
+    At most `MAX_POINTS` poses are drawn, and in the middle of each gap a row that is not shown.
+    """
+    time, count = trajectory.time, len(trajectory.time)
+    rows = np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(np.intp))
+    after = np.unique(np.searchsorted(rows, indices_after_gaps(time, MAX_TRUTH_GAP)))
+    middle = 0.5 * (time[rows[after - 1]] + time[rows[after]])
+    return (
+        np.insert(time[rows], after, middle),
+        np.insert(rows, after, rows[after]),
+        np.insert(trajectory.valid[rows], after, False),
+    )
 
 
 def _speed_sigma(velocity: FloatArray, covariance: FloatArray) -> FloatArray:

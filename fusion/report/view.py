@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.state import Track
+from stario.sequences.drawing.figures import split_at_gaps, unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.readers.checked import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -80,12 +81,9 @@ def open_view(path: Path) -> None:
 def _log_path(
     stream: Any, entity: str, trajectory: Trajectory, colour: tuple[int, int, int]
 ) -> None:
-    """Log a whole path at once, broken where poses are not valid."""
-    valid = trajectory.valid
-    cuts = np.flatnonzero(np.diff(valid.astype(int))) + 1
-    parts = np.split(trajectory.position_W, cuts)
-    strips = [p for p, ok in zip(parts, np.split(valid, cuts), strict=True) if ok.all() and len(p)]
-    stream.log(entity, rr.LineStrips3D(strips, colors=[colour], radii=[0.02]), static=True)
+    """Log a whole path at once, broken in gaps and where poses are not valid."""
+    _, path = split_at_gaps(trajectory.time, trajectory.position_W, trajectory.valid)
+    stream.log(entity, rr.LineStrips3D(unbroken(path), colors=[colour], radii=[0.02]), static=True)
 
 
 def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:

@@ -99,6 +99,13 @@ def split_at_gaps(
     )
 
 
+def unbroken(values: FloatArray) -> list[FloatArray]:
+    """Return the stretches (n, k) of values (N, k) between rows with a NaN."""
+    known = np.isfinite(values).all(axis=1)
+    starts = np.flatnonzero(np.diff(known, prepend=False, append=False))
+    return [values[a:b] for a, b in zip(starts[::2], starts[1::2], strict=True)]
+
+
 def indices_after_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
     """Return the indices of the times (N,) [s] that follow a gap.
 

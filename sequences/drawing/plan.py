@@ -84,7 +84,7 @@ def plan_view(
         if name in leaves:
             label += f" (leaves the figure by {distance(beyond[name])})"
         _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
-    _mark_gaps(axes, tracks)
+    _mark_gaps(axes, tracks, frame)
     if known is not None:
         size = 7.0 if known.kind == "waypoints" else 3.0
         label = f"{known.kind}, fitted"
@@ -93,7 +93,7 @@ def plan_view(
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=INK, label="start")
     axes.plot([], [], "s", mfc=INK, mec="white", label="end")
-    fig.legend(loc="outside lower center", ncols=3, **LEGEND)
+    _add_legend(fig)
     return fig
 
 
@@ -111,17 +111,27 @@ def _draw_path(
     axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
 
 
-def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory]) -> None:
+def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory], frame: FloatArray) -> None:
     """Mark where each track continues after a gap, during which its direction is unknown."""
     label = "after a gap"
     for name, track in tracks.items():
         if name == "pdr":  # it has no poses while the person stands
             continue
-        after = indices_after_gaps(track.time, _MARKED_GAP)
-        if len(after):
-            x, y = track.position_W[after, :2].T
-            axes.plot(x, y, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
+        time, position = track.time[track.valid], track.position_W[track.valid, :2]
+        marks = position[indices_after_gaps(time, _MARKED_GAP)]
+        marks = marks[((marks >= frame[0]) & (marks <= frame[1])).all(axis=1)]
+        if len(marks):
+            axes.plot(*marks.T, "D", mfc="none", mec=RED, ms=7, label=label, zorder=4)
             label = ""
+
+
+def _add_legend(fig: Figure) -> None:
+    """Add a legend below the axes, in as many columns as fit the figure's width."""
+    for columns in (3, 2, 1):
+        legend = fig.legend(loc="outside lower center", ncols=columns, **LEGEND)
+        if columns == 1 or legend.get_window_extent().width < fig.bbox.width:
+            return
+        legend.remove()
 
 
 def _box_of(path: FloatArray) -> FloatArray:

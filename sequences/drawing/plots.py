@@ -35,12 +35,14 @@ from stario.sequences.drawing.figures import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
+    MAX_IMU_GAP,
     MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     BoolArray,
     FloatArray,
     ImuSequence,
     Trajectory,
+    is_gap,
     whole_seconds,
 )
 
@@ -141,7 +143,8 @@ def imu_overview(
         rotation: times [s] and norm of the true angular rate [rad/s], drawn with that of the
             gyroscope.
         rest: first and last time of stretches to shade as stationary [s].
-        gaps: first and last time of stretches to shade as gaps [s].
+        gaps: first and last time of stretches without samples [s]: shaded, or marked at the upper
+            edge if they are short enough to be bridged.
     """
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
@@ -162,9 +165,8 @@ def imu_overview(
         panels[2].set(ylabel="rotation [rad/s]", ylim=(0, reach_of(np.linalg.norm(gyro, axis=1))))
     for k, (start, stop) in enumerate(rest):
         panels[1].axvspan(start, stop, color=SKY, alpha=0.3, lw=0, label="" if k else "at rest")
-    for k, (start, stop) in enumerate(gaps):
-        for axes in panels[:2]:
-            axes.axvspan(start, stop, color=RED, alpha=0.5, lw=1, label="" if k else "gap")
+    for axes in panels[:2]:
+        _draw_gaps(axes, np.reshape([*gaps], (-1, 2)))
     for axes in panels[: 2 + (rotation is not None)]:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **LEGEND)
     if sequence.truth is not None:
@@ -175,6 +177,18 @@ def imu_overview(
     fig.align_ylabels()
     panels[-1].set_xlim(time[0], time[-1] if time[-1] > time[0] else time[0] + 1.0)
     return fig
+
+
+def _draw_gaps(axes: Axes, gaps: FloatArray) -> None:
+    """Shade gaps (n, 2) [s] behind the curves; mark those that are bridged at the upper edge."""
+    long = is_gap(np.diff(gaps)[:, 0], MAX_IMU_GAP)
+    for k, (start, stop) in enumerate(gaps[long]):
+        label = "" if k else "gap"
+        axes.axvspan(start, stop, color=RED, alpha=0.5, lw=1, zorder=0.5, label=label)
+    if not long.all():
+        short = gaps[~long].mean(axis=1)
+        edge = axes.get_xaxis_transform()
+        axes.plot(short, np.ones(len(short)), "|", color=RED, ms=9, transform=edge, label="lost")
 
 
 def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:

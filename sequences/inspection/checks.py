@@ -19,7 +19,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import dead_gyro, disorder
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import fit_truth
-from stario.sequences.units import GYRO_UNITS, TIME_UNITS
+from stario.sequences.units import FAST_RAD_S, GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
 
 MIN_SECONDS = 1.5
@@ -33,10 +33,6 @@ recording: the cost does not grow with its length."""
 
 _NO_SENSOR = 1e4
 """Largest median magnitude that a sensor can have, in deg/s, m/s^2 or any unit in between."""
-
-_FAST_RAD_S = 15.0
-"""Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
-least 41 if deg/s are taken for rad/s."""
 
 _OFF_GRAVITY = 0.1
 """Relative error of the average force above any calibration error; recordings reach 0.008."""
@@ -165,10 +161,10 @@ def check_gyro(
     found = f"rotations of {speed:.3g} rad/s"
     if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _MIN_LOSS_RATIO * lost_in_degrees):
         found += " that contradict the accelerometer"
-    elif speed <= _FAST_RAD_S:
+    elif speed <= FAST_RAD_S:
         return force, average
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
-    if speed <= _FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
+    if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif unit_known:
         fix = _UNIT_NAMED

@@ -27,8 +27,8 @@ from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
 _INSPECTION_FACTOR = 6.0
 """Factor for a device at rest, used by inspection: its sensors may be noisier than a phone's."""
 
-_MAX_BIAS_RATE = 0.06
-"""Largest mean rate [rad/s] that can be a bias: 3.4 degrees per second."""
+_USUAL_BIAS = 0.06
+"""Mean rate [rad/s] that may be a bias without further evidence: 3.4 degrees per second."""
 
 _PROBABILITY = 0.999
 """Probability that a sensor at rest passes the test."""
@@ -58,12 +58,29 @@ def looks_still(gyro: float, accel: float, bound: float) -> bool:
 def is_still(gyro: FloatArray, accel: FloatArray, seconds: float, factor: float) -> bool:
     """Return whether samples (n, 3) [rad/s], [m/s^2] that span `seconds` show no motion.
 
-    A steady turn has no scatter: the mean rate must also be small enough to be a bias.
+    A steady turn has no scatter: the mean rate must also be a bias.
     """
-    if len(gyro) < 2 or np.linalg.norm(gyro.mean(axis=0)) > _MAX_BIAS_RATE:
+    if len(gyro) < 2 or not _is_bias(gyro.mean(axis=0), accel, seconds):
         return False
     rates, forces = (float(np.square(x - x.mean(axis=0)).sum()) for x in (gyro, accel))
     return looks_still(rates, forces, scatter_bound(len(gyro), seconds, factor))
+
+
+def _is_bias(rate: FloatArray, accel: FloatArray, seconds: float) -> bool:
+    """Return whether a mean rate (3,) [rad/s] is a bias rather than a turn.
+
+    A turn about a horizontal axis would turn gravity in the samples (n, 3) of the accelerometer.
+    One about the vertical would not: a bias there must be of the size of that about the others.
+    """
+    if np.linalg.norm(rate) <= _USUAL_BIAS:
+        return True
+    force, half = accel.mean(axis=0), len(accel) // 2
+    size = max(float(np.linalg.norm(force)), 1e-9)
+    vertical = float(rate @ force) / size
+    horizontal = float(np.linalg.norm(rate - vertical * force / size))
+    change = float(np.linalg.norm(accel[half:].mean(axis=0) - accel[:half].mean(axis=0)))
+    tilts = change > 0.5 * horizontal * size * 0.5 * seconds  # half of what a turn would give
+    return abs(vertical) <= 2.0 * horizontal and not tilts
 
 
 @dataclass(frozen=True, eq=False)

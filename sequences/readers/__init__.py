@@ -22,6 +22,7 @@ from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
+from stario.sequences.readers.lines import first_bytes, first_line
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.phones.files import incomplete_sensors
@@ -36,7 +37,6 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.text import first_bytes, first_line
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
@@ -71,7 +71,9 @@ def _read_unpacked(
         if len(inside) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
             found = f"{len(inside)} recordings ({names})"
-            raise ReadError(path, "content", found, "one", f"unpack the {path.suffix[1:].lower()}")
+            raise ReadError(
+                path, "content", found, "one", f"unpack the {path.suffix[1:].lower() or 'zip'}"
+            )
         try:
             sequence = read_recording(inside[0])
         except ReadError as error:

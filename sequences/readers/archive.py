@@ -18,7 +18,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError, StarioError
 from stario.sequences.readers.checked import checked, optional_package, rotations
-from stario.sequences.readers.text import first_bytes
+from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     BoolArray,
     DeviceAttitude,

@@ -26,7 +26,8 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
-from stario.sequences.readers.text import IntArray, first_bytes, seconds
+from stario.sequences.readers.lines import first_bytes
+from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 

@@ -3,12 +3,12 @@
 The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order and
 separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
 
-- `t` in s, ms, us or ns, from any origin, read exactly and returned as seconds since the first
-  IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in m/s^2 or g
-  (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named are rad/s,
-  m/s^2 and, for time, the unit that gives a plausible sample rate.
+- `t` in s, ms, us or ns, from any origin, or as ISO dates, read exactly and returned as seconds
+  since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in
+  m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named
+  are rad/s, m/s^2 and, for time, the unit that gives a plausible sample rate.
 - `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
-  blank or `nan` where it was not sampled.
+  blank, `NA` or `nan` where it was not sampled.
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
   leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
 - or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
@@ -20,7 +20,6 @@ A sample written as `nan` stays NaN; other columns are ignored.
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -46,13 +45,14 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.text import (
+from stario.sequences.readers.lines import (
+    ends_within_a_row,
     first_lines,
-    is_row,
     read_lines,
-    read_quickly,
-    rows_below,
+    unquoted,
+    with_seconds,
 )
+from stario.sequences.readers.text import cell_value, is_missing, read_quickly, rows_below
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,
@@ -76,7 +76,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
-    if _ends_within_a_row(path, lines, header):
+    if len(lines) > header.lines + 1 and ends_within_a_row(path, header.separator):
         # The recorder was killed while it wrote: all earlier rows are complete.
         _log.warning("%s: skipped the last line, %d, which is cut short", path, len(lines))
         rows = _rows_carefully(path, lines[:-1], header)
@@ -115,17 +115,6 @@ class _Rows:
     line_numbers: Sequence[int]
 
 
-def _ends_within_a_row(path: Path, lines: list[str], header: Header) -> bool:
-    """Return whether the last line has no line end and fewer cells than the row before it."""
-    if len(lines) < header.lines + 2 or not is_row(lines[-2]):
-        return False
-    if lines[-1].count(header.separator) >= lines[-2].count(header.separator):
-        return False
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) not in b"\r\n"
-
-
 def _rows_quickly(path: Path, header: Header) -> _Rows | None:
     """Return the rows of a large file if every row is complete, else None."""
     columns = header.columns
@@ -153,7 +142,10 @@ def _rows_quickly(path: Path, header: Header) -> _Rows | None:
 
 def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
     columns = header.columns
-    numbered = rows_below(path, lines, header.lines)
+    below = rows_below(path, lines, header.lines)
+    numbered = [(number, unquoted(line, header.separator)) for number, line in below]
+    if with_seconds(numbered[0][1]) != numbered[0][1]:
+        numbered = [(number, with_seconds(line)) for number, line in numbered]
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
     values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
@@ -206,7 +198,7 @@ def _row(path: Path, number: int, line: str, separator: str, columns: list[Colum
     for column in columns:
         cell = cells[column.index].strip()
         try:
-            row.append(float(cell) if cell else float("nan"))
+            row.append(cell_value(cell))
         except ValueError:
             where = f"line {number}, {column.title}"
             fix = "write a decimal point" if "," in cell else ""
@@ -220,7 +212,7 @@ def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArra
     indices = [header.columns[name].index for name in IMU]
     for k in np.flatnonzero(np.isnan(values).all(axis=1)):
         cells = numbered[k][1].split(header.separator)
-        is_imu[k] = any(cells[index].strip() for index in indices)
+        is_imu[k] = not all(is_missing(cells[index]) for index in indices)
     return is_imu
 
 

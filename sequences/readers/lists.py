@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.archive import AttributeFilter, split_name
-from stario.sequences.readers.text import first_line, first_lines, numbers_in, read_lines
+from stario.sequences.readers.lines import first_line, first_lines, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
 _HEAD_LINES = 20

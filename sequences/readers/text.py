@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import logging
 from collections.abc import Callable
@@ -14,91 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.lines import (
+    ends_within_a_row,
+    is_row,
+    read_lines,
+    unquoted,
+    with_seconds,
+)
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)
 
 IntArray = NDArray[np.int64]
 
-_HEAD_BYTES = 32768
 _LARGE_BYTES = 2_000_000
-
-
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file.
-
-    Raises:
-        ReadError: the file is missing, empty or not text.
-    """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise ReadError(path, "file", "no such file", "a readable file") from None
-    except OSError as error:
-        raise ReadError(path, "file", type(error).__name__, "a readable file") from None
-    if b"\0" in content:
-        raise ReadError(path, "file", "binary data", "UTF-8 text")
-    lines = _decoded(content).splitlines()
-    if not any(line.strip() for line in lines):
-        raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
-    return lines
-
-
-def first_line(path: Path, comments: bool = False) -> str | None:
-    """Return the first line as in `first_lines`, None if there is none."""
-    return next(iter(first_lines(path, 1, comments)), None)
-
-
-def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
-    """Return up to `count` lines of a text file that are neither blank nor (by default) comments.
-
-    Reads little of the file, and never raises: used to recognise formats.
-    """
-    return [x for x in head_lines(path) if is_row(x) or (comments and x.strip())][:count]
-
-
-def _decoded(content: bytes) -> str:
-    """Decode UTF-8, or else Latin-1, in which old apps write the signs of units."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def head_lines(path: Path) -> list[str]:
-    """Return the lines at the start of a text file, the last possibly cut; never raises."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError:
-        return []
-    if b"\0" in head:
-        return []
-    # The head may end within a character: decode its last line, cut anyway, separately.
-    end = max(head.rfind(b"\n"), 0)
-    return _decoded(head[:end]).splitlines() + _decoded(head[end:].lstrip(b"\r\n")).splitlines()
-
-
-def first_bytes(path: Path, count: int = 16) -> bytes:
-    """Return the first bytes of a file, empty if it does not exist; never raises."""
-    try:
-        with path.open("rb") as file:
-            return file.read(count)
-    except OSError:
-        return b""
-
-
-def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
-    """Return the numbers of a line, or an empty list if it holds anything else."""
-    try:
-        return [float(cell) for cell in line.split(delimiter)]
-    except ValueError:
-        return []
-
-
-def first_numbers(path: Path) -> list[float]:
-    """Return the first row's numbers, or an empty list if the first row is anything else."""
-    return numbers_in(first_line(path) or "")
 
 
 @dataclass(frozen=True)
@@ -175,6 +103,7 @@ def read_table(
     used: list[int] | None = None,
     decimal: str = ".",
     killed: bool = False,
+    dated: bool = False,
 ) -> Table:
     """Read rows of numbers; `nan` and empty cells become NaN.
 
@@ -186,13 +115,16 @@ def read_table(
         used: the columns to return, in this order; the first `columns` if None.
         decimal: decimal mark, a point or a comma.
         killed: whether to skip a last row that is cut short because the app was killed.
+        dated: whether to read ISO dates as seconds since 1970.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if used is None else used
-    return read_quickly(path, skip, delimiter, wanted, decimal) or _read_carefully(
-        path, columns, skip, delimiter, wanted, decimal, killed
+    cut = killed and ends_within_a_row(path, delimiter)
+    quick = None if cut or dated else read_quickly(path, skip, delimiter, wanted, decimal)
+    return quick or _read_carefully(
+        path, columns, skip, delimiter, wanted, decimal, killed, cut, dated
     )
 
 
@@ -240,15 +172,21 @@ def _read_carefully(
     wanted: list[int],
     decimal: str = ".",
     killed: bool = False,
+    cut: bool = False,
+    dated: bool = False,
 ) -> Table:
-    lines = [_unquoted(line, delimiter) for line in read_lines(path)]
+    lines = [unquoted(line, delimiter) for line in read_lines(path)]
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
+    if dated:
+        lines = [with_seconds(line) for line in lines]
     numbered = rows_below(path, lines, skip)
     if killed and len(numbered) > 1:
         try:
             _row(path, *numbered[-1], columns, delimiter, wanted)
         except ReadError:
+            cut = True
+        if cut:
             _log.warning("%s: skipped the last row, which is cut short", path)
             numbered.pop()
     rows = [line for _, line in numbered]
@@ -269,16 +207,6 @@ def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
     return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
 
 
-def _unquoted(line: str, delimiter: str | None) -> str:
-    """Remove the quotes around a line's cells; a delimiter within a cell becomes a blank."""
-    if '"' not in line:
-        return line
-    if delimiter is None:
-        return line.replace('"', " ")
-    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
-
-
 def rows_below(path: Path, lines: list[str], skip: int) -> list[tuple[int, str]]:
     """Return a file's lines below its header that hold cells, with their numbers.
 
@@ -289,12 +217,6 @@ def rows_below(path: Path, lines: list[str], skip: int) -> list[tuple[int, str]]
     if not numbered:
         raise ReadError(path, "rows", "none below the header", "rows of numbers")
     return numbered
-
-
-def is_row(line: str) -> bool:
-    """Return whether a line is neither blank nor a comment."""
-    text = line.strip()
-    return bool(text) and text[0] != "#"
 
 
 def _row(
@@ -308,8 +230,22 @@ def _row(
     values = []
     for k in wanted:
         try:
-            values.append(float(cells[k]) if cells[k].strip() else float("nan"))
+            values.append(cell_value(cells[k]))
         except ValueError:
             where = f"line {number}, column {k + 1}"
             raise ReadError(path, where, repr(cells[k].strip()), "a number") from None
     return values
+
+
+def cell_value(cell: str) -> float:
+    """Return the number in a cell; NaN if it is blank or says that there is none, such as NA.
+
+    Raises:
+        ValueError: it holds anything else.
+    """
+    return float("nan") if is_missing(cell) else float(cell)
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell is blank or says that there is no value."""
+    return cell.strip().lower() in ("", "na", "n/a", "null", "none")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_bytes
+from stario.sequences.readers.lines import first_bytes
 
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _MAX_BYTES = 4 * 2**30
@@ -19,7 +19,7 @@ _MAX_BYTES = 4 * 2**30
 
 def is_zip(path: Path) -> bool:
     """Return whether a file is a zip with text files in it; never raises."""
-    if path.suffix.lower() != ".zip" or first_bytes(path, 4) != b"PK\x03\x04":
+    if first_bytes(path, 4) != b"PK\x03\x04":
         return False
     try:
         with zipfile.ZipFile(path) as file:

@@ -24,6 +24,9 @@ from stario.sequences.simulation.routes import RISER, Route, drift, integral, ra
 CARRYING_MODES = tuple(CARRIES)
 """Names of the carrying modes."""
 
+MAX_SAMPLES = 2_000_000
+"""Most samples of a simulated recording, which is about half a gigabyte as CSV."""
+
 _SLOWEST_STEP_RATE = 0.8
 """Step rate of a person who barely moves [Hz]."""
 
@@ -115,12 +118,13 @@ def generate_walk(
         Poses of the device in a world frame whose origin is the start on the floor.
 
     Raises:
-        InputError: duration or rate out of range.
+        InputError: duration or rate out of range, or more than `MAX_SAMPLES` poses.
     """
     if not (math.isfinite(duration) and duration >= 1.0):
         raise InputError("duration", repr(duration), "a finite duration of at least 1 s")
     if not (math.isfinite(rate) and rate >= 50.0):
         raise InputError("rate", repr(rate), "a finite rate of at least 50 Hz")
+    check_amount(duration, rate)
     rng = np.random.default_rng(seed)
     style = WalkStyle.random(rng) if style is None else style
     count = round(duration * rate) + 1
@@ -135,6 +139,13 @@ def generate_walk(
         position_W=route.position_W + R_WH.apply(motion.offset_H),
         attitude_WB=R_WH * R_HD,
     )
+
+
+def check_amount(duration: float, rate: float) -> None:
+    """Raise InputError for more than `MAX_SAMPLES` within a duration [s] at a rate [Hz]."""
+    if duration * rate > MAX_SAMPLES:
+        most = f"at most {MAX_SAMPLES / rate:.0f} s at {rate:g} Hz ({MAX_SAMPLES} samples)"
+        raise InputError("duration", f"{duration:g} s", most)
 
 
 def step_rate(speed: FloatArray, style: WalkStyle) -> FloatArray:

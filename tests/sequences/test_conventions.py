@@ -121,3 +121,10 @@ def test_unknown_options_are_refused(walk: ImuSequence) -> None:
         with_conventions(walk, gravity="gone")
     with pytest.raises(InputError, match="gyro_unit"):
         with_conventions(walk, gyro_unit="rpm")
+
+
+def test_degrees_for_rates_that_fit_radians_give_a_warning(walk, caplog) -> None:
+    with_conventions(replace(walk, gyro=np.degrees(walk.gyro)), gyro_unit="deg/s")
+    assert not caplog.records
+    with_conventions(walk, gyro_unit="dps")
+    assert "fit rad/s; --gyro-unit deg/s divides them by 57" in caplog.text

@@ -92,8 +92,8 @@ def fusion_gain(
         group,
         network_m,
         {name: _error(found) for name, found in figures.items()},
-        _number(figures[first]["nis"]),
-        _number(figures[first]["nees"]),
+        _number(figures[first]["nis_mean"]),
+        _number(figures[first]["nees_median"]),
         yaw_error,
         yaw_sigma,
     )

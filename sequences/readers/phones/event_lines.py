@@ -25,9 +25,10 @@ from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.lines import head_lines, read_lines
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
-from stario.sequences.readers.text import IntArray, head_lines, read_lines, seconds
+from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 from stario.sequences.time_order import increasing_mask
 

@@ -11,6 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_table import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
@@ -19,7 +20,6 @@ from stario.sequences.readers.phones.sensor_words import (
     sensor_of,
     words_of,
 )
-from stario.sequences.readers.text import head_lines
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}

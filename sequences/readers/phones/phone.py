@@ -30,6 +30,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.generic_csv import is_generic_csv
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import (
     SUFFIXES,
@@ -53,7 +54,7 @@ from stario.sequences.readers.phones.sensor_words import (
 )
 from stario.sequences.readers.phones.sign import accel_sign, is_in_g
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.text import IntArray, head_lines, seconds
+from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
     ImuSequence,

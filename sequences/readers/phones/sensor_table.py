@@ -6,21 +6,24 @@ blanks; with any of the latter three, numbers may have a decimal comma.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.columns import Column
+from stario.sequences.readers.lines import head_lines, with_seconds
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
-from stario.sequences.readers.text import IntArray, Table, head_lines, read_table
+from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
+
+_log = logging.getLogger(__name__)
 
 _HEAD_ROWS = 24
 UNITS = {
@@ -43,12 +46,14 @@ class SensorTable(Layout):
         delimiter: separator of the cells; None for blanks.
         decimal: decimal mark, a point or a comma.
         skip: number of lines before the first row.
+        dated: whether the times are ISO dates.
     """
 
     file: Path
     delimiter: str | None = ","
     decimal: str = "."
     skip: int = 0
+    dated: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,16 @@ def sensor_table(file: Path) -> SensorTable | None:
     """Return how to read a file's rows, or None if that cannot be determined; never raises."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
     numbered = numbered[: 4 * _HEAD_ROWS]
+    dated = [(k, with_seconds(line)) for k, line in numbered]
+    table = _table(file, numbered)
+    if table is None and dated != numbered:
+        table = _table(file, dated)
+        return None if table is None else replace(table, dated=True)
+    return table
+
+
+def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
+    """Return how to read a file's rows, given the lines at its start with their numbers."""
     if len(numbered) < 2:
         return None
     found = first_row(numbered[:-1])  # the last line may be cut
@@ -98,8 +113,16 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     """
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     rows = _rows(table, [clock, *places, *table.biases])
-    kept = np.asarray(np.isfinite(rows.values[:, 1:4]).any(axis=1))  # wide files leave cells empty
+    blank = np.isnan(rows.values[:, 1:])
+    kept = np.asarray(~blank.any(axis=1))
+    if not kept.all() and (partly := int((blank.any(axis=1) & ~blank.all(axis=1)).sum())):
+        # Rows without any of the three are those of other sensors in a wide file.
+        _log.warning(
+            "%s: dropped %d samples of the %s with a blank cell", table.file, partly, sensor
+        )
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
+    if not kept.any():
+        raise ReadError(table.file, titles, "no row with all three", "samples of three axes")
     values = rows.values[:, 1:4]
     if table.biases:
         values = values - rows.values[:, 4:7]
@@ -111,8 +134,6 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     _check_size(table.file, titles, sensor, values[kept])
     per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
-    if sensor != "mag":
-        checked(table.file, titles, np.where(kept.reshape(-1, 1), values, 0.0), rows.first_row)
     return Samples(stamps, values[kept], unit)
 
 
@@ -121,8 +142,9 @@ def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
     indices = [place.index for place in used]
     columns = max(indices) + 1
     return read_table(
-        table.file, columns, table.skip, table.delimiter, indices, table.decimal, killed=True
-    )
+        table.file, columns, table.skip, table.delimiter, indices, table.decimal,
+        killed=True, dated=table.dated,
+    )  # fmt: skip
 
 
 def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:

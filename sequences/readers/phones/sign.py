@@ -15,9 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.files import PhoneFiles
 from stario.sequences.readers.phones.sensor_table import Samples
-from stario.sequences.readers.text import IntArray, head_lines, seconds
+from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)

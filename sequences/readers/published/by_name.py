@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations
-from stario.sequences.readers.text import first_line, read_lines, read_table, seconds
+from stario.sequences.readers.lines import first_line, read_lines
+from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import FloatArray, Magnetometer
 
 

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.text import first_line, read_table, seconds
+from stario.sequences.readers.lines import first_line
+from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
 

@@ -23,9 +23,10 @@ from scipy.spatial.transform import Slerp
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.published.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
-from stario.sequences.readers.text import IntArray, first_line, read_table, seconds
+from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 
 _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")

@@ -30,15 +30,8 @@ from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, time_unit
-from stario.sequences.readers.text import (
-    IntArray,
-    Table,
-    first_lines,
-    first_numbers,
-    numbers_in,
-    read_table,
-    seconds,
-)
+from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
+from stario.sequences.readers.text import IntArray, Table, read_table, seconds
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset

@@ -31,8 +31,8 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
+from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.published.by_name import JsonFields
-from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"

@@ -253,7 +253,8 @@ def test_a_converted_recording_gives_the_same_track(
     assert stario("convert", recording, "there").code == 0
     done = stario("convert", "there", "back.csv")
     assert done.code == 0
-    assert "there: 1201 samples, 12.0 s\nback.csv" in done.out
+    assert "there: EuRoC layout, 12.0 s at 100.0 Hz, no magnetometer" in done.out
+    assert "truth: 1201 poses\nwritten: back.csv" in done.out
     for path, out in ((recording, "a"), ("back.csv", "b")):
         assert stario("run", path, "--out", out).code == 0
     a, b = (read_tum(tmp_path / out / "ekf.tum") for out in "ab")
@@ -267,7 +268,7 @@ def test_recordings_are_archived_and_selected_from_the_archive(
 ) -> None:
     done = stario("convert", recording, recording.parent, "all.h5")
     assert done.code == 0, done.err
-    assert "2 recordings in all.h5" in done.out
+    assert "walk is stored as walk-2\nwritten: all.h5, 2 recordings" in done.out
     done = stario("run", "all.h5", "--where", "name=*-2", "--out", "two")
     assert done.code == 0, done.err
     assert (tmp_path / "two/ekf.tum").exists()
@@ -278,6 +279,12 @@ def test_recordings_are_archived_and_selected_from_the_archive(
         stario(*arguments, "--where", "person=eve").assert_one_line_error("person=eve", "none")
     stario("run", "all.h5", "--where", "eve").assert_one_line_error("--where", "attribute=value")
     stario("convert", "all.h5", "out.csv").assert_one_line_error("2 recordings", "all.h5:walk")
+
+
+def test_a_folder_with_one_recording_is_converted(stario, recording: Path) -> None:
+    assert stario("convert", recording.parent, "out.csv").code == 0
+    there, here = read_generic_csv(Path("out.csv")), read_generic_csv(recording)
+    np.testing.assert_array_equal(there.gyro, here.gyro)
 
 
 @pytest.mark.usefixtures("no_figures")

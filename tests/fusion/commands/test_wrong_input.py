@@ -93,12 +93,18 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["simulate", "no/such/folder.csv"], ["folder"]),
         (["simulate", ".", "--seconds", "2"], ["folder"]),
         (["simulate", "a.csv", "--seconds", "0"], ["duration"]),
+        (["simulate", "a.csv", "--seconds", "1e9"], ["duration", "10000 s at 200 Hz"]),
+        (["simulate", "a.csv", "--seconds", "2001", "--rate", "1000"], ["2000 s at 1000 Hz"]),
+        (["simulate", "a"], [".csv"]),
+        (["simulate", "a.h5"], ["a.h5", ".csv", "convert"]),
+        (["convert", "RECORDING", "a.h5", "--to", "csv"], ["a.h5", "csv"]),
+        (["convert", "RECORDING", "a.csv", "--to", "euroc"], ["a.csv", "euroc"]),
         (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
         (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
         (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
-        (["train", "--data", ".", "--where", "person=dan"], ["--where: found with --data"]),
+        (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
     ],
@@ -108,6 +114,45 @@ def test_invalid_arguments_give_a_one_line_error(
 ) -> None:
     done = stario(*(recording if word == "RECORDING" else word for word in arguments))
     done.assert_one_line_error(*words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("compare --gyro-unit deg/s", "--gyro-unit without PATH"),
+        ("compare --where person=dan", "--where without PATH"),
+        ("inspect RECORDING --format csv --where person=dan", "--where --format"),
+        ("evaluate RECORDING --data .", "--data with PATH"),
+        ("evaluate RECORDING --split validation", "--split without --data"),
+        ("evaluate RECORDING --runs other", "--runs without --models"),
+        ("evaluate RECORDING --model open --models default", "--model with --models"),
+        ("evaluate RECORDING --by set --no-magnetometer", "--no-magnetometer with --by"),
+        ("evaluate RECORDING --by set --config settings.toml", "--config with --by"),
+        ("check backends --model open", "--model simulated"),
+        ("check backends --accel-unit g", "--accel-unit simulated"),
+        ("check backends --split test", "--split without --data"),
+        ("check backends --data . --where person=dan", "--where with --data"),
+        ("check backends RECORDING --data .", "--data with PATH"),
+        ("check backends RECORDING --walks 3", "--walks recordings"),
+        ("check backends RECORDING --seconds 30", "--seconds recordings"),
+        ("check faults RECORDING --model open", "--model without --network"),
+        ("check faults --no-magnetometer", "--no-magnetometer simulated"),
+        ("check faults --axes y,-x,z", "--axes simulated"),
+        ("check faults RECORDING --where person=dan", "--where one recording"),
+        ("check table --out cells --set a=. --sets oxiod", "--sets without --data"),
+        ("check table --out cells --set a=. --per-group 3", "--per-group without --data"),
+        ("train RECORDING --recorded-only --generated 5", "--generated with --recorded-only"),
+        ("train --generated 1 --gyro-unit deg/s", "--gyro-unit without recordings"),
+        ("train RECORDING --leave-out ridi", "--leave-out without --data"),
+        ("train RECORDING --learn-from few", "--learn-from without --data"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(
+    stario, recording: Path, tmp_path: Path, arguments: str, words: str
+) -> None:
+    given = (recording if word == "RECORDING" else word for word in arguments.split())
+    stario(*given).assert_one_line_error(*words.split())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def warnings_of(health: Health) -> str:
 
 def test_small_innovations_are_not_reported_as_small_errors() -> None:
     (line,) = health_lines(Health(updates=100, mean_nis=0.8))[1:]
-    assert "smaller" in line
+    assert "does not mean that the track's sigmas are too large" in line
     assert "safe side" not in line
 
 
@@ -120,3 +120,7 @@ def test_a_board_shaken_beyond_its_range_is_distrusted_and_one_turned_by_hand_is
     [warning] = [line for line in health_lines(shaken) if line.startswith("!")]
     assert "cannot be trusted" in warning
     assert not any("trusted" in line for line in health_lines(turned))
+
+
+def test_the_factor_by_which_sigmas_are_too_small_is_the_root_of_the_ratio() -> None:
+    assert "a factor of about 2.0" in warnings_of(Health(updates=100, mean_nis=12.0))

@@ -1,6 +1,10 @@
 """The file for rerun's viewer holds track, attitude, covariance and sensors, with their units."""
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.sequence import Trajectory
 
 
 @pytest.fixture
@@ -27,3 +31,16 @@ def test_the_viewer_is_started_on_the_file(tmp_path, view, monkeypatch):
     monkeypatch.setattr(view.subprocess, "Popen", lambda command, **_: started.append(command))
     view.open_view(tmp_path / "track.rrd")
     assert started[0][-3:] == ["-m", "rerun", str(tmp_path / "track.rrd")]
+
+
+def test_a_path_is_broken_in_a_gap(view):
+    class Stream:
+        def log(self, entity, strips, static):
+            self.strips = strips.strips.as_arrow_array().to_pylist()
+
+    time = np.arange(0.0, 20.0, 0.1)
+    time = time[(time < 5.0) | (time > 9.0)]
+    path = Trajectory(time, np.outer(time, [1.0, 0.0, 0.0]), Rotation.identity(len(time)))
+    stream = Stream()
+    view._log_path(stream, "world/track", path, (0, 0, 0))
+    assert [len(strip) for strip in stream.strips] == [(time < 5.0).sum(), (time > 9.0).sum()]

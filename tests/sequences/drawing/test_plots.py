@@ -194,3 +194,39 @@ def test_a_track_is_marked_where_it_resumes_after_a_gap(tracks):
         (axes,) = plan_view({name: track}, None, "").axes
         found = [line for line in axes.lines if line.get_label() == "after a gap"]
         assert len(found) == marks
+
+
+def test_the_mark_after_a_gap_is_at_the_first_valid_pose_and_only_within_the_frame(truth, tracks):
+    keep = (truth.time < 20.0) | (truth.time > 34.0)
+    cut = Trajectory(truth.time[keep], truth.position_W[keep], truth.attitude_WB[keep])
+    resumed = int(np.argmax(cut.time > 34.0))
+    usable = np.arange(len(cut.time)) != resumed  # the pose right after the gap is unknown
+    (axes,) = plan_view({"ekf": replace(cut, valid=usable)}, truth, "").axes
+    mark = line(axes, "after a gap")
+    assert (mark.get_xdata()[0], mark.get_ydata()[0]) == tuple(cut.position_W[resumed + 1, :2])
+    far = with_growing_error(cut, 0.5, power=2)
+    fig = plan_view({"inertial": far, "ekf": truth}, truth, "")
+    assert "after a gap" not in labels(fig.legends[0])
+
+
+def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):
+    straight = replace(truth, position_W=np.outer(truth.time, [0.0, 1.2, 0.0]))
+    names = ("inertial", "pdr", "network", "network_true_attitude", "ekf")
+    distant = {name: with_growing_error(straight, 0.5, power=2) for name in names}
+    fig = plan_view(distant, straight, "")
+    fig.canvas.draw()
+    legend = fig.legends[0].get_window_extent()
+    assert fig.bbox.x0 <= legend.x0
+    assert legend.x1 <= fig.bbox.x1
+
+
+def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
+    still = ImuSequence("walk", truth.time, *(np.ones((len(truth), 3)) for _ in range(2)))
+    lost = [(k, k + 0.01) for k in np.arange(10.0, 20.0, 0.1)]
+    for axes in imu_overview(still, gaps=[(30.0, 34.0), *lost]).axes[:2]:
+        (shaded,) = (patch for patch in axes.patches if patch.get_label() == "gap")
+        assert (shaded.get_x(), shaded.get_width()) == (30.0, 4.0)
+        assert shaded.get_zorder() < line(axes, "x").get_zorder()
+        marks = line(axes, "lost")
+        assert len(marks.get_xdata()) == len(lost)
+        assert set(marks.get_ydata()) == {1.0}

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.inspection.stillness import find_rest
 from stario.sequences.noise import ImuNoise
@@ -11,6 +12,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
 BIAS = np.array([0.01, -0.02, 0.005])
+UP_B = np.array([0.6, 0.0, 0.8])
 
 
 def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
@@ -18,8 +20,7 @@ def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
     rng = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     gyro = BIAS + NOISE.gyro_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))
-    up_B = np.array([0.6, 0.0, 0.8])
-    accel = (STANDARD_GRAVITY + 0.05) * up_B
+    accel = (STANDARD_GRAVITY + 0.05) * UP_B
     accel = accel + NOISE.accel_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))
     return ImuSequence("lying", time, gyro, accel)
 
@@ -57,8 +58,18 @@ def test_rest_is_found_between_motions_but_not_across_a_gap() -> None:
 
 def test_a_slow_turn_is_not_mistaken_for_bias() -> None:
     still = device_at_rest(10.0, 100.0)
-    turning = ImuSequence("t", still.time, still.gyro + np.array([0.0, 0.0, 0.1]), still.accel)
-    assert find_rest(turning) is None
+    about_up = ImuSequence("t", still.time, still.gyro + 0.1 * UP_B, still.accel)
+    assert find_rest(about_up) is None
+    rate = np.array([0.0, 0.1, 0.0])
+    gravity = Rotation.from_rotvec(-np.outer(still.time, rate)).apply(still.accel)
+    assert find_rest(ImuSequence("t", still.time, still.gyro + rate, gravity)) is None
+
+
+def test_a_large_bias_is_one_if_gravity_does_not_turn() -> None:
+    still, bias = device_at_rest(10.0, 100.0), np.array([-0.12, 0.0, 0.02])
+    rest = find_rest(ImuSequence("t", still.time, still.gyro - BIAS + bias, still.accel))
+    assert rest.seconds == pytest.approx(10.0, abs=0.6)
+    np.testing.assert_allclose(rest.gyro_bias, bias, atol=1e-3)
 
 
 def test_less_than_a_second_of_rest_is_too_short() -> None:

@@ -1,0 +1,153 @@
+"""Lines of text files: decoding, and a look at a file's first lines to recognise its format."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+from stario.sequences.errors import ReadError
+
+_HEAD_BYTES = 32768
+_TAIL_BYTES = 16384
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+"""Byte order marks, with which spreadsheets begin a file of Unicode text."""
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file.
+
+    Raises:
+        ReadError: the file is missing, empty or not text.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise ReadError(path, "file", "no such file", "a readable file") from None
+    except OSError as error:
+        raise ReadError(path, "file", type(error).__name__, "a readable file") from None
+    if b"\0" in content and not content.startswith(_UTF_16):
+        raise ReadError(path, "file", "binary data", "UTF-8 text")
+    lines = _decoded(content).splitlines()
+    if not any(line.strip() for line in lines):
+        raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
+    return lines
+
+
+def first_line(path: Path, comments: bool = False) -> str | None:
+    """Return the first line as in `first_lines`, None if there is none."""
+    return next(iter(first_lines(path, 1, comments)), None)
+
+
+def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
+    """Return up to `count` lines of a text file that are neither blank nor (by default) comments.
+
+    Reads little of the file, and never raises: used to recognise formats.
+    """
+    return [x for x in head_lines(path) if is_row(x) or (comments and x.strip())][:count]
+
+
+def head_lines(path: Path) -> list[str]:
+    """Return the lines at the start of a text file, the last possibly cut; never raises."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return []
+    if head.startswith(_UTF_16):
+        return _decoded(head).splitlines()
+    if b"\0" in head:
+        return []
+    # The head may end within a character: decode its last line, cut anyway, separately.
+    end = max(head.rfind(b"\n"), 0)
+    return _decoded(head[:end]).splitlines() + _decoded(head[end:].lstrip(b"\r\n")).splitlines()
+
+
+def first_bytes(path: Path, count: int = 16) -> bytes:
+    """Return the first bytes of a file, empty if it does not exist; never raises."""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
+def first_numbers(path: Path) -> list[float]:
+    """Return the first row's numbers, or an empty list if the first row is anything else."""
+    return numbers_in(first_line(path) or "")
+
+
+def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
+    """Return the numbers of a line, or an empty list if it holds anything else."""
+    try:
+        return [float(cell) for cell in line.split(delimiter)]
+    except ValueError:
+        return []
+
+
+def is_row(line: str) -> bool:
+    """Return whether a line is neither blank nor a comment."""
+    text = line.strip()
+    return bool(text) and text[0] != "#"
+
+
+def _decoded(content: bytes) -> str:
+    """Decode UTF-8, UTF-16 with its mark, or else Latin-1, in which old apps write units."""
+    if content.startswith(_UTF_16):
+        return content.decode("utf-16", errors="replace")  # the head may end within a character
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def unquoted(line: str, delimiter: str | None) -> str:
+    """Remove the quotes around a line's cells; a delimiter within a cell becomes a blank."""
+    if '"' not in line:
+        return line
+    if delimiter is None:
+        return line.replace('"', " ")
+    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
+
+
+def with_seconds(line: str) -> str:
+    """Replace ISO dates with their seconds since 1970; without a zone they are taken as UTC."""
+    return _DATE.sub(_seconds_of, line)
+
+
+def _seconds_of(match: re.Match[str]) -> str:
+    day, clock, fraction, zone = match.groups(default="")
+    try:
+        time = datetime.fromisoformat(f"{day}T{clock}{zone}")
+    except ValueError:  # such as 24:60:00
+        return match[0]
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return f"{int(time.timestamp())}{fraction}"  # the digits of the fraction stay exact
+
+
+def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
+    """Return whether a killed recorder left a last row without its end; never raises.
+
+    Such a row has no line end, and fewer cells than the one before it or a last cell that is
+    shorter than that of every other row near the end.
+    """
+    try:
+        with path.open("rb") as file:
+            start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
+            file.seek(start)
+            tail = file.read().replace(b"\0", b"")  # as in UTF-16
+    except OSError:
+        return False
+    if tail.endswith((b"\n", b"\r")):
+        return False
+    rows = [row.split(delimiter) for row in tail.decode("latin-1").splitlines() if is_row(row)]
+    *earlier, last = rows[1:] if start else rows or [[]]
+    if len(earlier) < 2:
+        return False
+    ends = [cells[-1].strip(' "') for cells in earlier]
+    shortest = min((len(end) for end in ends if not end[:1].isalpha()), default=0)  # no titles
+    return len(last) < len(earlier[-1]) or len(last[-1].strip(' "')) < shortest

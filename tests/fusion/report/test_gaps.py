@@ -1,0 +1,61 @@
+"""The report's lines and bands end at a gap and go on after it; they do not cross it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("plotly", reason="pip install 'stario[report]'")
+
+from stario.fusion.report.figures import map_figure
+from stario.fusion.report.panels import motion_panels
+from stario.fusion.report.series import MAX_POINTS, trajectory_series
+from stario.sequences.sequence import Trajectory
+
+
+def along_x(time: np.ndarray, speed: float = 1.0) -> Trajectory:
+    position = np.outer(speed * time, [1.0, 0.0, 0.0])
+    covariance = np.tile(0.01 * np.eye(3), (len(time), 1, 1))
+    return Trajectory(time, position, Rotation.identity(len(time)), None, covariance)
+
+
+def stretches(values) -> int:
+    """Number of stretches of numbers between the NaN."""
+    finite = np.isfinite(np.asarray(values, dtype=float))
+    return int(finite[0]) + int((~finite[:-1] & finite[1:]).sum())
+
+
+@pytest.mark.parametrize("rate", [10.0, 200.0])  # the second has to be thinned
+def test_map_and_panels_break_where_poses_are_missing(rate):
+    time = np.arange(0.0, 60.0, 1.0 / rate)
+    track = along_x(time[(time < 20.0) | (time > 27.0)])
+    series = trajectory_series(track, 0.0)
+    assert len(series.time) <= MAX_POINTS + 1
+    inside = (series.time > 20.0) & (series.time < 27.0)
+    assert np.isnan(series.position[inside]).all()
+    assert inside.any()
+    figure = map_figure({"ekf": series}, None, None)
+    path = next(
+        trace for trace in figure.data if trace.mode == "lines" and trace.customdata is not None
+    )
+    assert stretches(path.x) == 2
+    height = motion_panels({"ekf": series}, None)[0]
+    assert [stretches(trace.y) for trace in height.traces] == [2, 2]  # band and line
+
+
+def test_an_error_is_drawn_only_where_the_truth_is_known():
+    time = np.arange(0.0, 60.0, 0.1)
+    truth = along_x(time[(time < 20.0) | (time > 27.0)])
+    series, true = (trajectory_series(track, 0.0) for track in (along_x(time), truth))
+    error = motion_panels({"ekf": series}, true)[0].traces[0]
+    x, y = np.asarray(error.x), np.asarray(error.y, dtype=float)
+    assert np.isnan(y[(x > 20.05) & (x < 26.95)]).all()
+    assert np.isfinite(y[(x < 19.85) | (x > 27.15)]).all()
+
+
+def test_a_device_at_rest_does_not_fill_the_map():
+    track = along_x(np.arange(0.0, 60.0, 0.1), speed=5e-5)  # 3 mm
+    series = trajectory_series(replace(track, position_covariance_W=None), 0.0)
+    low, high = map_figure({"ekf": series}, None, None).layout.xaxis.range
+    assert high - low >= 1.0

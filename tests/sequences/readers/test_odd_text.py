@@ -1,0 +1,121 @@
+"""Text as spreadsheets, other languages and killed recorders leave it: read, or refused by name."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences import ReadError, find_recordings, read_recording
+from stario.sequences.readers.columns import HEADER
+
+ROW = "0.1,0.2,0.3,1.5,2.5,9.25"
+ROWS = [f"{0.01 * k:.2f},{ROW}" for k in range(6)]
+
+
+def write(path: Path, *lines: str, encoding: str = "utf-8") -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes("\n".join(lines).encode(encoding) + "\n".encode(encoding)[-2:])
+    return path
+
+
+def phone(folder: Path, gyro: list[str], accel: list[str], encoding: str = "utf-8") -> Path:
+    for name, rows in (("Gyroscope", gyro), ("Accelerometer", accel)):
+        lines = "\n".join(["time,x,y,z", *rows]) + "\n"
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.csv").write_bytes(lines.encode(encoding))
+    return folder
+
+
+def phone_rows(cells: str = "0.1,0.2,9.5", count: int = 60) -> list[str]:
+    return [f"{0.02 * k:.2f},{cells}" for k in range(count)]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "latin-1"])
+def test_any_encoding_of_a_csv_is_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "own.csv"
+    path.write_bytes(("\n".join([HEADER, *ROWS]) + "\n").encode(encoding))
+    assert find_recordings(path) == [path]
+    assert np.allclose(read_recording(path).accel, [1.5, 2.5, 9.25])
+    folder = phone(tmp_path / "phone", phone_rows(), phone_rows(), encoding)
+    assert find_recordings(folder) == [folder]
+    assert np.allclose(read_recording(folder).accel, [0.1, 0.2, 9.5])
+
+
+def test_a_zip_is_recognised_by_its_content(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "download", "w") as file:
+        file.writestr("walk.csv", "\n".join([HEADER, *ROWS]))
+    assert len(read_recording(tmp_path / "download")) == len(ROWS)
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00", "-0330"])
+@pytest.mark.parametrize("joint", ["T", " "])
+def test_iso_dates_are_times(tmp_path: Path, zone: str, joint: str) -> None:
+    days = [f"2024-02-2{8 + k // 30}" for k in range(60)]  # across midnight, in a leap year
+    clocks = [f"23:59:59.{10 * k + 700:03d}" for k in range(30)]
+    clocks += [f"00:00:00.{10 * k:03d}123456" for k in range(30)]
+    times = [f"{day}{joint}{clock}{zone}" for day, clock in zip(days, clocks, strict=True)]
+    expected = 0.01 * np.arange(60) + np.where(np.arange(60) < 30, 0.0, 123456e-9)
+    header = HEADER.replace("t [s]", "timestamp")
+    own = write(tmp_path / "own.csv", header, *(f"{time},{ROW}" for time in times))
+    np.testing.assert_allclose(read_recording(own).time, expected, atol=1e-12)
+    rows = [f"{time},0.1,0.2,9.5" for time in times]
+    read = read_recording(phone(tmp_path / "phone", rows, rows))
+    np.testing.assert_allclose(read.time, expected, atol=1e-9)
+
+
+def test_a_date_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
+    rows = [f"2024-02-28T25:00:00.0{k},{ROW}" for k in range(6)]
+    with pytest.raises(ReadError, match=r"line 2, t: found '2024-02-28T25:00:00\.00'"):
+        read_recording(write(tmp_path / "own.csv", HEADER, *rows))
+
+
+def test_quoted_cells_are_numbers(tmp_path: Path) -> None:
+    header, *rows = ([f'"{cell}"' for cell in line.split(",")] for line in (HEADER, *ROWS))
+    path = write(tmp_path / "own.csv", ",".join(header), *map(",".join, rows))
+    assert np.allclose(read_recording(path).accel, [1.5, 2.5, 9.25])
+
+
+@pytest.mark.parametrize("missing", ["", "NA", "n/a", "NULL"])
+def test_cells_without_a_value_are_blank(tmp_path: Path, missing: str) -> None:
+    header = f"{HEADER},mx [uT],my [uT],mz [uT]"
+    rows = [f"{row},{missing},{missing},{missing}" for row in ROWS]
+    rows[3] = f"{ROWS[3]},1,2,3"
+    rows.insert(3, ",".join(["0.025", *[missing] * 6, "4", "5", "6"]))
+    read = read_recording(write(tmp_path / "own.csv", header, *rows))
+    assert len(read) == len(ROWS)
+    assert read.magnetometer is not None
+    assert read.magnetometer.field.tolist() == [[4, 5, 6], [1, 2, 3]]
+
+
+@pytest.mark.parametrize("cell", ["9", "9.", "", "-"])
+def test_a_last_cell_cut_within_its_digits_is_skipped(tmp_path: Path, cell: str) -> None:
+    last = f"0.06,{ROW.rsplit(',', 1)[0]},{cell}"
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join([HEADER, *ROWS, last]))
+    assert len(read_recording(path)) == len(ROWS)
+    path.write_text("\n".join([HEADER, *ROWS, f"0.06,{ROW}"]))  # whole, but without a line end
+    assert len(read_recording(path)) == len(ROWS) + 1
+    folder = phone(tmp_path / "phone", phone_rows(), phone_rows())
+    for name in ("Gyroscope", "Accelerometer"):
+        with (folder / f"{name}.csv").open("a") as file:
+            file.write(f"1.20,0.1,0.2,{cell}")
+    read = read_recording(folder)
+    assert len(read) == 60
+    assert np.allclose(read.accel, [0.1, 0.2, 9.5])
+
+
+@pytest.mark.parametrize("cell", ["", "nan", "NA"])
+def test_a_blank_cell_of_a_phones_sensor_loses_only_its_sample(
+    tmp_path: Path, cell: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    gyro, accel = phone_rows(), phone_rows()
+    gyro[20] = f"0.40,0.1,{cell},9.5"
+    accel[30] = f"0.60,{cell},0.2,9.5"
+    read = read_recording(phone(tmp_path / "phone", gyro, accel))
+    assert len(read) == 59
+    assert 0.4 not in read.time.round(6)
+    assert np.allclose(read.accel, [0.1, 0.2, 9.5])
+    assert "Gyroscope.csv: dropped 1 samples of the gyro with a blank cell" in caplog.text
