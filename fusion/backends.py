@@ -16,17 +16,27 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.estimates import (
+    Estimate,
+    nav_states,
+    plain_scale_sensitivities,
+    smoothed_poses,
+)
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements
-from stario.fusion.filter.frame_transform import smoothed_track, to_final_frame, with_undirected
+from stario.fusion.filter.frame_transform import (
+    frame_rotation,
+    smoothed_track,
+    to_final_frame,
+    with_undirected,
+)
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.intervals import Start
 from stario.fusion.recording import PreprocessedRecording, Progress
-from stario.fusion.state import NavState, Track, track_from_states
+from stario.fusion.state import NavState, Track, changed, track_from_states
 from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
@@ -70,9 +80,10 @@ class Backend(NamedTuple):
 def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
     """Return the filter's states."""
     frame = filtered.estimator.frame.state
-    states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
+    sigma = config.filter.network_scale_sigma
+    states = to_final_frame(nav_states(filtered.estimates, sigma), frame.transforms)
     smoothed = smoothed_track(
-        smoothed_poses(filtered.clones), (*frame.transforms, *frame.undirected)
+        smoothed_poses(filtered.clones, sigma), (*frame.transforms, *frame.undirected)
     )
     return Solution(with_undirected(states, frame.undirected), smoothed)
 
@@ -91,6 +102,11 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     solved, note = smooth(
         final, first, filtered.measurements, frame.transforms, config, bias, sigma
     )
+    # The graph's measurements are the filter's, and so is its sensitivity to the network's scale.
+    errors = config.filter.network_scale_sigma * plain_scale_sensitivities(filtered.estimates)
+    for k, (before, after, error) in enumerate(zip(states, final, errors, strict=True)):
+        error = frame_rotation(after.R_WB @ before.R_WB.T) @ error
+        solved[k] = changed(solved[k], covariance=solved[k].covariance + np.outer(error, error))
     return Solution(with_undirected(solved, frame.undirected), notes=(note,))
 
 

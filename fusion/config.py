@@ -43,6 +43,9 @@ class FilterConfig:
             NEES on the training recordings and on validation recordings unseen by the network.
         network_turn_sigma: standard deviation of the network's yaw error, correlated over about a
             minute [rad]; becomes a state once fixes make the direction observable.
+        network_scale_sigma: standard deviation of the network's scale error, the same all along a
+            track: a person's steps are longer or shorter than those of the training. It is part of
+            the covariances and not of the estimate.
         gate: probability of the chi-square test. The covariance of an outlier is inflated rather
             than the measurement rejected: without it the speed drifts, and the next correct
             measurement looks false.
@@ -69,6 +72,7 @@ class FilterConfig:
     update_rate: int = 2
     covariance_scale: float = 0.5
     network_turn_sigma: float = 0.05
+    network_scale_sigma: float = 0.05
     gate: float = 0.997
     tilt_sigma: float = 0.05
     yaw_sigma: float = 1e-3

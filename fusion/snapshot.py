@@ -35,12 +35,13 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 16
+FORMAT, VERSION = "stario snapshot", 17
 
 
 _HOLDS = """
 fusion.config fusion.continuous fusion.filter.displacements fusion.filter.ekf_state
-fusion.filter.estimator_state fusion.filter.frame_transform fusion.filter.gyro_bias
+fusion.filter.estimates fusion.filter.estimator_state fusion.filter.frame_transform
+fusion.filter.gyro_bias
 fusion.filter.initial fusion.filter.magnetic fusion.filter.map_frame fusion.filter.planar_alignment
 fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing fusion.graph.builder
 fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state fusion.graph.keyframes

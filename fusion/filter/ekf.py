@@ -23,6 +23,7 @@ from stario.fusion.filter.jacobians import (
     mean_velocity_jacobian,
     position_jacobian,
     propagated,
+    scale_jacobian,
     turn_jacobian,
     velocity_jacobian,
     yaw_jacobian,
@@ -60,7 +61,7 @@ class StateCloningEkf(ErrorStateEngine):
         zero = np.zeros(3)
         undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
         self.state = EkfState.initial(undefined, slots)
-        super().__init__(CORE + CLONE * slots + 1)
+        super().__init__(len(self.state.P), considered=self.state.scale_row)
         self.gravity = gravity
         self.slots = slots
 
@@ -161,6 +162,7 @@ class StateCloningEkf(ErrorStateEngine):
 
         The network's input was rotated by the estimated attitude, so the displacement contains the
         yaw error of clone i, p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own (turn).
+        Its scale error is considered.
 
         Args:
             slot_i: slot of the window's first pose.
@@ -176,15 +178,16 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: a slot holds no clone.
         """
-        self.state.time_of_clone(slot_i)
+        s, X = self.state, self.state.X
+        s.time_of_clone(slot_i)
         if slot_j is not None:
-            self.state.time_of_clone(slot_j)
-        X, turn_row = self.state.X, self.state.turn_row
+            s.time_of_clone(slot_j)
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
-        if self.state.has_turn:
-            d_W = exp_so3(np.array([0.0, 0.0, -self.state.network_turn])) @ d_W
-            blocks.append(turn_jacobian(p_j - p_i, turn_row))
+        blocks.append(scale_jacobian(p_j - p_i, s.scale_row))
+        if s.has_turn:
+            d_W = exp_so3(np.array([0.0, 0.0, -s.network_turn])) @ d_W
+            blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
         return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode, power)
 
     def update_mean_velocity(
@@ -282,7 +285,7 @@ class StateCloningEkf(ErrorStateEngine):
             rows = P[GYRO_BIAS]
             S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
             K = np.linalg.solve(S, rows).T
-            P = P - K @ rows
+            P = self._considering(P - K @ rows, P)
             self.x = (K @ -self.state.b_g)[:, None]
             self._inject(0.5 * (P + P.T))
             old = step

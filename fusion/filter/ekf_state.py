@@ -8,13 +8,13 @@ estimates of a recording are converted to them at its end.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -25,40 +25,14 @@ _CLONE_COLUMNS = [0, 1, 2, 4]
 GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
 
+_NEGLIGIBLE_SCALE_SIGMA = 1e-6
+"""Sigma of the network's scale error in P: it follows what a scale error would do to the state, yet
+gains do not depend on it (README.md, "The network's scale")."""
+
 _MAX_ORIGIN_DISTANCE = 1e3
 """Positions farther than this from the origin [m] are expressed relative to a nearby point: in the
 right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
 they are map coordinates."""
-
-_CHUNK = 2000
-"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A filter's estimate of its newest state, or of a clone.
-
-    Attributes:
-        time: [s].
-        X: (3, 5) R_WB, v_W, p_W; for a clone (3, 4) R_WB, p_W. The position is relative to
-            `origin_W`.
-        origin_W: (3,) [m].
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        P: (15, 15) covariance of theta, rho_v, rho_p, d_bg, d_ba; for a clone (6, 6) of theta,
-            rho_p.
-        in_gap: as in `NavState`.
-        map_frame: as in `NavState`.
-    """
-
-    time: float
-    X: FloatArray
-    origin_W: FloatArray
-    b_g: FloatArray
-    b_a: FloatArray
-    P: FloatArray
-    in_gap: bool = False
-    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +87,9 @@ class EkfState:
         origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
-        P = np.zeros((CORE + CLONE * slots + 1,) * 2)
+        P = np.zeros((CORE + CLONE * slots + 2,) * 2)
         P[:CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
+        P[-1, -1] = _NEGLIGIBLE_SCALE_SIGMA**2
         return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
 
     @property
@@ -152,9 +127,19 @@ class EkfState:
         return bool(self.P[self.turn_row, self.turn_row] > 0.0)
 
     @property
+    def scale_row(self) -> int:
+        """Row of the network's scale error, which is considered and never estimated."""
+        return self.turn_row + 1
+
+    @property
+    def scale_sensitivity(self) -> FloatArray:
+        """Sensitivity (n,) of the error state to the network's scale error."""
+        return np.asarray(self.P[:, self.scale_row] / self.P[self.scale_row, self.scale_row])
+
+    @property
     def first_field(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return self.turn_row + 1
+        return self.scale_row + 1
 
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
@@ -182,7 +167,8 @@ class EkfState:
         """Return the estimate of the current pose and biases."""
         # Copies: a view would keep the whole covariance alive for as long as the estimate.
         X, P = self.X[0].copy(), self.P[:CORE, :CORE].copy()
-        return Estimate(self.time, X, self.origin_W, self.b_g, self.b_a, P, in_gap, map_frame)
+        J = self.scale_sensitivity[:CORE]
+        return Estimate(self.time, X, self.origin_W, self.b_g, self.b_a, P, J, in_gap, map_frame)
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
         """Return the current estimate of a clone.
@@ -193,7 +179,8 @@ class EkfState:
         time, first = self.time_of_clone(slot), CORE + CLONE * slot
         X = self.X[1 + slot][:, _CLONE_COLUMNS].copy()
         P = self.P[first : first + CLONE, first : first + CLONE].copy()
-        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, map_frame=map_frame)
+        J = self.scale_sensitivity[first : first + CLONE]
+        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, J, map_frame=map_frame)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
@@ -269,31 +256,3 @@ def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArr
     P[:, row] *= kept
     P[row, row] += (1.0 - kept**2) * sigma**2
     return P
-
-
-def plain_covariances(estimates: Sequence[Estimate]) -> FloatArray:
-    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate."""
-    P, X = (np.array([getattr(e, name) for e in estimates]) for name in ("P", "X"))
-    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
-
-
-def nav_states(estimates: Sequence[Estimate]) -> list[NavState]:
-    """Convert estimates of newest states to `NavState`, with plain errors."""
-    states = []
-    for k in range(0, len(estimates), _CHUNK):
-        part = estimates[k : k + _CHUNK]
-        for e, covariance in zip(part, plain_covariances(part), strict=True):
-            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
-            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
-            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
-    return states
-
-
-def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
-    """Convert estimates of clones to `SmoothedPose`, with plain errors."""
-    if not clones:
-        return []
-    return [
-        SmoothedPose(e.time, e.X[:, :3], e.X[:, 3] + e.origin_W, covariance, e.map_frame)
-        for e, covariance in zip(clones, plain_covariances(clones), strict=True)
-    ]

@@ -70,10 +70,12 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     Args:
         dim: size of the error state; the first `CORE` rows belong to the current state.
+        considered: row of the error that no update estimates (Schmidt 1966): its gain is zero.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, considered: int) -> None:
         super().__init__(dim_x=dim, dim_z=3)
+        self._considered = considered
         self.P = np.zeros((dim, dim))
         self.Q = np.zeros((dim, dim))
 
@@ -162,6 +164,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.R, self.S = covariance, HPH + covariance
         self.SI = whitener.T @ whitener
         self.K = (whitener.T @ W).T
+        self.K[self._considered] = 0.0
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
@@ -170,6 +173,14 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             return self._correct_as_joseph(blocks)
         # P is symmetric: its transpose is the same matrix in BLAS order.
         P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
+        return self._considering(P, self.P)
+
+    def _considering(self, P: FloatArray, before: FloatArray) -> FloatArray:
+        """Return a new covariance after an update, with the considered error's variance as before.
+
+        Its covariances with other errors depend on their gains alone, as in any update.
+        """
+        P[self._considered, self._considered] = before[self._considered, self._considered]
         return P
 
     def _correct_as_joseph(self, blocks: Sequence[Block]) -> FloatArray:

@@ -13,7 +13,8 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
@@ -314,7 +315,8 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`released` as a `SmoothedPose`; None at first."""
-        return smoothed_poses([self.released])[0] if self.released else None
+        sigma = self._config.filter.network_scale_sigma
+        return smoothed_poses([self.released], sigma)[0] if self.released else None
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
@@ -322,7 +324,8 @@ class Estimator:
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
-        return with_undirected(nav_states([self.estimate()]), self.frame.state.undirected)[0]
+        states = nav_states([self.estimate()], self._config.filter.network_scale_sigma)
+        return with_undirected(states, self.frame.state.undirected)[0]
 
     def innovations(self) -> Innovations:
         """Return every innovation so far."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.filter.jacobians import CORE
 from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState, SmoothedPose, changed
@@ -90,9 +91,7 @@ class FrameTransform:
         if not self.applies_to(state.time):
             return changed(state, map_frame=state.map_frame + 1)
         v_W, p_W = self.R @ state.v_W, self.position(state.p_W)
-        A = np.eye(15)
-        for first in (0, 3, 6):
-            A[first : first + 3, first : first + 3] = self.R
+        A = frame_rotation(self.R)
         covariance = A @ state.covariance @ A.T
         covariance += _turn_covariance(
             self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot
@@ -107,6 +106,14 @@ class FrameTransform:
             covariance=covariance,
             map_frame=state.map_frame + 1,
         )
+
+
+def frame_rotation(R: FloatArray) -> FloatArray:
+    """Return the matrix (15, 15) that rotates plain errors with the frame by R (3, 3)."""
+    A = np.eye(CORE)
+    for first in (0, 3, 6):
+        A[first : first + 3, first : first + 3] = R
+    return A
 
 
 def unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:

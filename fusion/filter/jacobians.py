@@ -57,6 +57,11 @@ def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
     return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
 
 
+def scale_jacobian(d_W: FloatArray, scale_row: int) -> Block:
+    """Return the block for the network's scale error: -d over the floor, d (3,) [m]."""
+    return scale_row, np.array([[-d_W[0]], [-d_W[1]], [0.0]])
+
+
 def mean_velocity_jacobian(
     v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
 ) -> list[Block]:

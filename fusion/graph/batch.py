@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import IntervalMeasurements
-from stario.fusion.filter.frame_transform import FrameTransform
+from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
@@ -83,9 +83,7 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     transforms = [transform for transform in transforms if transform.since <= first.time]
     if not transforms:
         return replace(first, covariance=prior.covariance)
-    turn = first.R_WB @ prior.R_WB.T
-    to_last = np.kron(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), turn)
-    to_last[9:, 9:] = np.eye(6)
+    to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
     if any(transform.placed for transform in transforms):
         covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)

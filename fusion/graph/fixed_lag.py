@@ -16,7 +16,8 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, nav_states
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.estimates import nav_states, plain_scale_sensitivities
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
@@ -151,8 +152,12 @@ class FixedLagEstimator:
     def nav_state(self) -> NavState:
         """Return the newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
-        states = [nav_states([ahead])[0].shifted(self._origin_W)]
-        return with_undirected(states, self._filter.frame.state.undirected)[0]
+        state = nav_states([ahead])[0].shifted(self._origin_W)
+        # The graph's measurements are the filter's, and so is its sensitivity to the scale.
+        error = plain_scale_sensitivities([self._filter.estimate()])[0]
+        error *= self._config.filter.network_scale_sigma
+        state = replace(state, covariance=state.covariance + np.outer(error, error))
+        return with_undirected([state], self._filter.frame.state.undirected)[0]
 
     def health(self, counts: SampleCounts) -> Health:
         """Return the filter's report with the graph's sigmas and the number of fallbacks."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import Estimate
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
@@ -206,12 +206,14 @@ def _run(
     intervals, front_end = cut_recording(ImuSequence("walk", walk.time, gyro, accel), config)
     assert front_end.start is not None  # two seconds are enough
     estimator = Estimator(config, front_end.start, prior)
+    scale_sigma = config.filter.network_scale_sigma
+    scale = 1.0 - scale_sigma * rng.normal()
     rows = []
     for count, interval in enumerate(intervals, 1):
-        estimator.step(interval, _drawn_displacement(walk, interval, config, rng))
+        estimator.step(interval, _drawn_displacement(walk, interval, scale, config, rng))
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
-            rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(estimator.estimate(), scale_sigma, walk, k, b_g[k], b_a[k]))
     return np.array(rows), float(estimator.innovations().nis.mean())
 
 
@@ -238,9 +240,13 @@ def _drawn_start(
 
 
 def _drawn_displacement(
-    walk: AnalyticWalk, interval: ImuInterval, config: NavigatorConfig, rng: np.random.Generator
+    walk: AnalyticWalk,
+    interval: ImuInterval,
+    scale: float,
+    config: NavigatorConfig,
+    rng: np.random.Generator,
 ) -> Displacement | None:
-    """Draw a window's displacement in its levelled frame, with the noise the filter assumes."""
+    """Draw a window's displacement in its levelled frame, with the errors the filter assumes."""
     if interval.R_NB_window is None:
         return None
     stop = round(interval.stop * RATE)
@@ -250,13 +256,20 @@ def _drawn_displacement(
     )
     # The filter treats overlapping windows as less certain than each one is.
     sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
-    return d_N + sigma * rng.normal(size=3), _DISPLACEMENT_SIGMA**2 * np.eye(3)
+    noise = sigma * rng.normal(size=3)
+    return d_N * (scale, scale, 1.0) + noise, _DISPLACEMENT_SIGMA**2 * np.eye(3)
 
 
 def _errors(
-    now: Estimate, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
+    now: Estimate,
+    scale_sigma: float,
+    walk: AnalyticWalk,
+    k: int,
+    b_g: FloatArray,
+    b_a: FloatArray,
 ) -> tuple[float, float, float]:
-    X, P = now.X, now.P
+    X, J = now.X, now.scale_sensitivity
+    P = now.P + scale_sigma**2 * np.outer(J, J)
     R = walk.R_WB[k] @ X[:, :3].T
     pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])
     error = np.concatenate([pose, b_g - now.b_g, b_a - now.b_a])

@@ -58,9 +58,9 @@ class DenseEkf(StateCloningEkf):
         H = np.zeros((len(residual), self.dim_x))
         for first, block in blocks:
             H[:, first : first + block.shape[1]] = block
-        self.R = covariance
+        self.R, before = covariance, self.P
         self.update(residual[:, None], lambda x: H, lambda x: H @ x)
-        return self.P
+        return self._considering(self.P, before)
 
 
 def engine_speed() -> tuple[float, float]:
