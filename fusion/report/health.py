@@ -175,7 +175,7 @@ def _updates(health: Health) -> Iterator[Finding]:
     elif ratio < 1.0 / NIS_RATIO:
         text = f"The network and the IMU agree more closely than their sigmas suggest ({nis})."
         advice = (
-            "Nothing to do. It does not mean that the track's sigmas are too large: errors that "
+            "It does not mean that the track's sigmas are too large: errors that "
             "last from window to window hardly show here."
         )
         yield Finding("note", text, advice)
