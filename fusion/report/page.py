@@ -89,7 +89,7 @@ def write_report(
         "TITLE": html.escape(sequence.name),
         "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
         "FACTS": _facts(sequence, tracks[main], series[main]),
-        "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks], known),
+        "LEGEND": _legend([*([] if truth is None else ["truth"]), *mapped], known),
         "HEALTH": "" if health is None else _health(findings(health)),
         "TABLE": "" if truth is None else _table(metrics, alignment),
         "STYLE": _asset("report.css"),
