@@ -149,7 +149,7 @@ def track_table(
     truth: Trajectory | None,
     words: dict[str, str],
 ) -> str:
-    """Format a table with a row of metrics per track, and their meaning if there is truth.
+    """Format a table with a row of known metrics per track, and the meaning of its columns.
 
     Args:
         metrics: metrics by track.
@@ -157,7 +157,7 @@ def track_table(
         truth: ground truth, or None.
         words: meaning of each metric.
     """
-    columns = {
+    titles = {
         "ate_m": "ATE [m]",
         "ate_fit_m": "fitted [m]",
         "rte_m": "RTE [m]",
@@ -168,13 +168,19 @@ def track_table(
         "seconds_network": "network [s]",
         "seconds_filter": "other [s]",
     }
+    known = {
+        key for values in metrics.values() for key, value in values.items() if value is not None
+    }
+    columns = {key: title for key, title in titles.items() if key in known}
     rows = [
         [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
     ]
     lines = aligned([["", *columns.values()], *rows])
+    general = () if truth is None else ("horizontal", "alignment")
+    explained = [key for key in _EXPLAINED if key in (*columns, *general)]
+    lines += [f"{key}: {words[key]}." for key in explained]
     if truth is None:
         return "\n".join(lines)
-    lines += [f"{key}: {words[key]}." for key in _EXPLAINED]
     covered = float(truth.covers(time).mean())
     if covered < _FULL_COVERAGE:
         lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")

@@ -51,7 +51,13 @@ def convert(
         typer.echo("\n".join(f"written: {path}" for path in written))
         return
     read: list[str] = []
-    names = convert_all(_read(reading, files, skipped, read), target)
+    sequences = _read(reading, files, skipped, read)
+    try:
+        names = convert_all(sequences, target)
+    except InputError:
+        if not read:  # then nothing was written because each of them was skipped
+            exit_if_skipped(skipped)
+        raise
     for name, stored in zip(read, names, strict=True):
         if stored != name:
             typer.echo(f"{name} is stored as {stored}")

@@ -47,7 +47,7 @@ def map_figure(
         truth: ground truth in the same frame, or None.
         known: positions or waypoints in the same frame, if there is no true track, or None.
     """
-    figure, frame = go.Figure(), _frame(tracks, truth)
+    figure, frame = go.Figure(), _frame(tracks, truth, known)
     if truth is not None:
         figure.add_trace(_path(TRUTH, truth, 3.0))
     largest = 0.4 * float(np.ptp(frame, axis=1).max())
@@ -184,13 +184,17 @@ def _known(known: PositionTrack) -> go.Scatter:
     )
 
 
-def _frame(tracks: Mapping[str, Series], truth: Series | None) -> FloatArray:
-    """Return limits (2, 2) of x and y that fit all tracks except the inertial-only one."""
+def _frame(
+    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
+) -> FloatArray:
+    """Return limits (2, 2) of x and y that fit known positions and all tracks but the inertial."""
     bounded = [s for name, s in tracks.items() if name != "inertial"]
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]
         points = np.clip(points, low - (high - low).max(), high + (high - low).max())
+    if known is not None:
+        points = np.vstack([points, known.position_W[:, :2]])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     # At least a metre, lest the millimetres of a device at rest look like a walk.
     half = 0.5 * (high - low) + 0.08 * max(1.0, float((high - low).max()))

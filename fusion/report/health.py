@@ -173,12 +173,12 @@ def _updates(health: Health) -> Iterator[Finding]:
         )
         yield Finding("warning", text, advice)
     elif ratio < 1.0 / NIS_RATIO:
-        text = f"The network and the IMU agree more closely than their sigmas suggest ({nis})."
-        advice = (
-            "Nothing to do. It does not mean that the track's sigmas are too large: errors that "
-            "last from window to window hardly show here."
+        text = (
+            f"The network and the IMU agree more closely than their sigmas suggest ({nis}). It "
+            "does not mean that the track's sigmas are too large: errors that last from window to "
+            "window hardly show here."
         )
-        yield Finding("note", text, advice)
+        yield Finding("note", text)
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")
     useless = bearings - health.bearings.get("applied", 0)
     if useless > 0.5 * bearings:

@@ -22,7 +22,7 @@ from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import Alignment, align
 from stario.sequences.files import atomic_write
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
 _COLUMNS = {
@@ -89,7 +89,7 @@ def write_report(
         "TITLE": html.escape(sequence.name),
         "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
         "FACTS": _facts(sequence, tracks[main], series[main]),
-        "LEGEND": _legend([*([] if truth is None else ["truth"]), *tracks]),
+        "LEGEND": _legend([*([] if truth is None else ["truth"]), *mapped], known),
         "HEALTH": "" if health is None else _health(findings(health)),
         "TABLE": "" if truth is None else _table(metrics, alignment),
         "STYLE": _asset("report.css"),
@@ -145,8 +145,11 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
     return "".join(f"<div><b>{value}</b><span>{label}</span></div>" for value, label in facts)
 
 
-def _legend(names: Sequence[str]) -> str:
-    """Return a button for each track, with its line, that hides and shows it everywhere."""
+def _legend(names: Sequence[str], known: PositionTrack | None) -> str:
+    """Return a button for each track, with its line, that hides and shows it everywhere.
+
+    Known positions have words only.
+    """
     dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
     buttons = []
     for name in names:
@@ -159,6 +162,8 @@ def _legend(names: Sequence[str]) -> str:
             f'<button type="button" aria-pressed="true" data-track="{html.escape(name)}">'
             f"{line}{html.escape(label)}</button>"
         )
+    if known is not None:
+        buttons.append(f"<span>&#10005; {known.kind}, fitted to the track</span>")
     return "".join(buttons)
 
 

@@ -181,7 +181,8 @@ class Inspection:
             return ["at rest: never for a full second, so noise and bias are unknown"]
         bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
         return [
-            f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretches",
+            f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretch"
+            + "es" * (len(rest.stretches) != 1),
             f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise:.2e} rad/s/sqrt(Hz)",
             f"  accelerometer: {rest.accel_norm:.4f} m/s^2 "
             f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} relative to gravity), "

@@ -37,7 +37,7 @@ _STEMS = {
     "p": ("pos", "position"),
     "q": ("quat", "quaternion", "ori", "orientation"),
 }
-_ALIASES = dict.fromkeys(("t", "time", "times", "timestamp"), "t") | {
+_ALIASES = dict.fromkeys(("t", "time", "times", "timestamp", "datetime"), "t") | {
     stem + joint + axis: letter + axis
     for letter, stems in _STEMS.items()
     for stem in (letter, *stems)
@@ -87,6 +87,8 @@ def read_header(path: Path, lines: list[str]) -> Header:
 def _header_index(lines: list[str]) -> int | None:
     """Return the index of the first line that is no comment, or is a comment that names columns."""
     for index, line in enumerate(lines):
+        if line.strip().lower().startswith("sep="):  # for spreadsheets
+            continue
         if line.strip() and (not line.lstrip().startswith("#") or _names_columns(line)):
             return index
     return None

@@ -23,7 +23,7 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Literal
@@ -146,6 +146,8 @@ def _rows_carefully(path: Path, lines: list[str], header: Header) -> _Rows:
     numbered = [(number, unquoted(line, header.separator)) for number, line in below]
     if with_seconds(numbered[0][1]) != numbered[0][1]:
         numbered = [(number, with_seconds(line)) for number, line in numbered]
+        columns = {**columns, "t": replace(columns["t"], unit="s")}
+        header = replace(header, columns=columns)
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
     values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])

@@ -7,6 +7,9 @@ import sys
 
 import pytest
 
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.readers.generic_csv import read_generic_csv
+
 
 def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_figures):
     assert stario("run", recording, "--out", "plain").code == 0
@@ -25,6 +28,16 @@ def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path,
     text = (tmp_path / "told/walk/report.html").read_text()
     for label in ("inertial", "network", "EKF", "factor graph", "truth"):
         assert f"</svg>{label}</button>" in text
+
+
+def test_compare_without_truth_shows_only_what_is_known(stario, recording, no_figures, tmp_path):
+    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
+    done = stario("compare", "blind.csv", "--out", "told", "--report")
+    assert "ATE" not in done.out
+    assert "nis_mean: mean NIS" in done.out
+    text = (tmp_path / "told/blind/report.html").read_text()
+    assert "</svg>EKF</button>" in text
+    assert "</svg>inertial</button>" not in text  # the map without truth leaves it out
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):

@@ -281,6 +281,13 @@ def test_recordings_are_archived_and_selected_from_the_archive(
     stario("convert", "all.h5", "out.csv").assert_one_line_error("2 recordings", "all.h5:walk")
 
 
+def test_an_archive_of_nothing_is_not_written_and_the_reason_is_told(stario, tmp_path) -> None:
+    (tmp_path / "bad.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,x,0,0,9.8\n")
+    done = stario("convert", "bad.csv", "out.h5")
+    done.assert_one_line_error("bad.csv: line 2, gz: found 'x'")
+    assert not (tmp_path / "out.h5").exists()
+
+
 def test_a_folder_with_one_recording_is_converted(stario, recording: Path) -> None:
     assert stario("convert", recording.parent, "out.csv").code == 0
     there, here = read_generic_csv(Path("out.csv")), read_generic_csv(recording)

@@ -141,7 +141,7 @@ def test_rest_is_reported(walk: ImuSequence) -> None:
     gyro, accel = 0.003 * rng.normal(size=(500, 3)), 0.02 * rng.normal(size=(500, 3))
     accel[:, 2] += STANDARD_GRAVITY
     found = inspect_recording(ImuSequence("r", time, gyro, accel))
-    assert any("at rest: 5.0 s in 1 stretches" in line for line in found.lines())
+    assert "at rest: 5.0 s in 1 stretch" in found.lines()
     assert "truth: none" in found.lines()
 
 

@@ -58,7 +58,7 @@ def test_iso_dates_are_times(tmp_path: Path, zone: str, joint: str) -> None:
     clocks += [f"00:00:00.{10 * k:03d}123456" for k in range(30)]
     times = [f"{day}{joint}{clock}{zone}" for day, clock in zip(days, clocks, strict=True)]
     expected = 0.01 * np.arange(60) + np.where(np.arange(60) < 30, 0.0, 123456e-9)
-    header = HEADER.replace("t [s]", "timestamp")
+    header = HEADER.replace("t [s]", "datetime [ISO 8601]")
     own = write(tmp_path / "own.csv", header, *(f"{time},{ROW}" for time in times))
     np.testing.assert_allclose(read_recording(own).time, expected, atol=1e-12)
     rows = [f"{time},0.1,0.2,9.5" for time in times]
@@ -70,6 +70,14 @@ def test_a_date_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
     rows = [f"2024-02-28T25:00:00.0{k},{ROW}" for k in range(6)]
     with pytest.raises(ReadError, match=r"line 2, t: found '2024-02-28T25:00:00\.00'"):
         read_recording(write(tmp_path / "own.csv", HEADER, *rows))
+
+
+def test_a_line_that_tells_a_spreadsheet_the_separator_is_skipped(tmp_path: Path) -> None:
+    header = f"{HEADER},px [m],py [m],pz [m],qx,qy,qz,qw"
+    rows = [f"{row},1,2,3,0,0,0,1" for row in ROWS]
+    read = read_recording(write(tmp_path / "own.csv", "sep=,", header, *rows))
+    assert read.truth is not None
+    assert len(read.truth) == len(ROWS)
 
 
 def test_quoted_cells_are_numbers(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The report's lines and bands end at a gap and go on after it; they do not cross it."""
+"""The report draws what is known: lines end at gaps, and the map fits tracks and waypoints."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ pytest.importorskip("plotly", reason="pip install 'stario[report]'")
 from stario.fusion.report.figures import map_figure
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import MAX_POINTS, trajectory_series
-from stario.sequences.sequence import Trajectory
+from stario.sequences.sequence import PositionTrack, Trajectory
 
 
 def along_x(time: np.ndarray, speed: float = 1.0) -> Trajectory:
@@ -59,3 +59,11 @@ def test_a_device_at_rest_does_not_fill_the_map():
     series = trajectory_series(replace(track, position_covariance_W=None), 0.0)
     low, high = map_figure({"ekf": series}, None, None).layout.xaxis.range
     assert high - low >= 1.0
+
+
+def test_known_positions_are_within_the_map():
+    series = trajectory_series(along_x(np.arange(0.0, 10.0, 0.1)), 0.0)
+    taps = PositionTrack(np.array([1.0, 9.0]), np.array([[0.0, -40.0], [9.0, 0.0]]), "waypoints")
+    low, high = map_figure({"ekf": series}, None, taps).layout.yaxis.range
+    assert low < -40.0
+    assert high > 0.0
