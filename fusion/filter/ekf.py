@@ -184,10 +184,10 @@ class StateCloningEkf(ErrorStateEngine):
             s.time_of_clone(slot_j)
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
-        blocks.append(scale_jacobian(p_j - p_i, s.scale_row))
         if s.has_turn:
             d_W = exp_so3(np.array([0.0, 0.0, -s.network_turn])) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
+        blocks.append(scale_jacobian(d_W, s.scale_row))
         return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode, power)
 
     def update_mean_velocity(

@@ -66,8 +66,8 @@ def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> l
 
 def turn_matrix(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
     """Transformation of the filter's error state when the world is turned."""
-    turn = np.eye(ekf.dim_x)  # the network's turn, the last state, does not change
-    turn[:-1, :-1] = np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
+    turn = np.eye(ekf.dim_x)  # the network's turn and scale, the last errors, do not change
+    turn[:-2, :-2] = np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
     return turn
 
 
