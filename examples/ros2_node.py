@@ -6,9 +6,11 @@
     publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
                 tf         map -> odom -> base_link (REP 105)
 
-`odom` is continuous (`Navigator.continuous`): it drifts, but neither updates nor fixes make it
-jump, so that controllers may use it. It jumps only after a gap in the samples, during which the
-motion is unknown. Corrections by fixes go into map -> odom. Metres, radians, quaternions x y z w
+`odom` is continuous (`Navigator.continuous`): its position drifts, but neither updates nor fixes
+make it jump, so that controllers may use it; its attitude is the corrected one, whose yaw a fix may
+turn by some degrees. The position jumps only after a gap in the samples, during which the motion is
+unknown, and starts again where the clock was set back, as in a bag that is played again.
+Corrections by fixes go into map -> odom. Metres, radians, quaternions x y z w
 (REP 103). `base_link` is the IMU's frame here; if yours differs, publish the static transform
 between them and use the IMU's frame name instead.
 
@@ -32,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion import ContinuousPose, Navigator, NavState, demonstration
 from stario.network import load_model
-from stario.sequences import about_z, yaw_of
+from stario.sequences import InputError, about_z, yaw_of
 
 GYRO_NOISE = 0.01
 """Standard deviation of one rate sample [rad/s], for the twist's covariance."""
@@ -84,19 +86,30 @@ class OdometryBridge:
 
     def __init__(self, navigator: Navigator) -> None:
         self._navigator = navigator
-        self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom; follows the map
         self._first_ns: int | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._frame = Transform(Rotation.identity(), np.zeros(3))  # of odom; follows the map
         self._last: ContinuousPose | None = None
 
     def imu(self, message: Any) -> Odometry | None:
-        """Process a sensor_msgs/Imu; return odometry if it completes a state."""
+        """Process a sensor_msgs/Imu; return odometry if it completes a state.
+
+        Raises:
+            InputError: as for `Navigator.push`, which then starts again.
+        """
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if self._first_ns is None:
             self._first_ns = stamp_ns  # nanoseconds since 1970 exceed the precision of a float
         rate, force = message.angular_velocity, message.linear_acceleration
         gyro = (rate.x, rate.y, rate.z)
         time = (stamp_ns - self._first_ns) / 1e9
-        state = self._navigator.push(time, gyro, (force.x, force.y, force.z))
+        try:
+            state = self._navigator.push(time, gyro, (force.x, force.y, force.z))
+        except InputError:
+            self._begin()
+            raise
         if state is None:
             return None
         if self._last is not None and self._last.map_frame != state.map_frame:
@@ -211,7 +224,11 @@ def spin() -> None:
             self.create_subscription(PoseWithCovarianceStamped, "fix", self.bridge.fix, 10)
 
         def on_imu(self, message: Imu) -> None:
-            found = self.bridge.imu(message)
+            try:
+                found = self.bridge.imu(message)
+            except InputError as error:
+                self.get_logger().error(str(error))
+                return
             if found is None:
                 return
             output = OdometryMessage()

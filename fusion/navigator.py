@@ -91,13 +91,13 @@ class Navigator:
             The newest state if this sample completed an output period, else None.
 
         Raises:
-            InputError: time is not a number, or every sample is far from the previous one (time
-                not in seconds); gyro or accel does not hold three numbers; the mean force of the
-                first second cannot be gravity in m/s^2, or the rate is not about 50 Hz to 1 kHz;
-                gyro cannot be in rad/s, which shows once the device turns; or the clock was set
-                back by at least five seconds (after less, samples are late until it has caught
-                up). After the last four the stream starts again; after a clock that was set back,
-                without prior and fixes.
+            InputError: time is not a number, or every sample is far from the previous one (time not
+                in seconds), or a thousand have the same time (time in 32 bits); gyro or accel does
+                not hold three numbers; the mean force of the first second cannot be gravity in
+                m/s^2, or the rate is not about 50 Hz to 1 kHz; gyro cannot be in rad/s, which shows
+                once the device turns; or the clock was set back by at least five seconds (after
+                less, samples are late until it has caught up). After the last four the stream
+                starts again; after a clock that was set back, without prior and fixes.
         """
         sample = (seconds(time), *three("gyro", gyro), *three("accel", accel))
         state = None

@@ -18,7 +18,7 @@ from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.engines import TorchEngine
-from stario.sequences import read_recording
+from stario.sequences import InputError, read_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples"
@@ -190,6 +190,29 @@ def test_ros2_node_follows_a_map_moved_by_a_fix_at_the_current_time(ahead_ns):
             bridge.fix(fix_at(output.stamp_ns + ahead_ns, measured, 0.05))
     assert np.linalg.norm(outputs[-1].map_odom.p) > 4e6
     check_odometry(outputs, largest_step=0.5)
+
+
+def test_ros2_node_starts_odom_again_after_its_clock_was_set_back():
+    """As when a bag is played again, after a fix has moved the map."""
+    example = load("ros2_node")
+    bridge = example.OdometryBridge(Navigator(load_model("default")))
+    for message in example.demonstration_messages(6.0):
+        bridge.imu(message)
+    stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+    bridge.fix(fix_at(stamp_ns, (500.0, -200.0, 3.0), 0.3))
+    errors, again = [], []
+    for message in example.demonstration_messages(14.0):
+        message.header.stamp.sec -= 100
+        try:
+            odometry = bridge.imu(message)
+        except InputError as error:
+            errors.append(str(error))
+        else:
+            again += [] if odometry is None else [odometry]
+    assert len(errors) == 1
+    assert "set back" in errors[0]
+    assert np.linalg.norm(again[0].odom_base.p) < 1.0
+    check_odometry(again)
 
 
 BAGS = sorted(DATA.glob("raw/rosbag/*.bag"))

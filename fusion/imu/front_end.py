@@ -46,6 +46,9 @@ _HOLE_SECONDS = 0.05
 _ISOLATED_SAMPLES = 20
 """This many samples in a row, each isolated by gaps, show that times are not in seconds."""
 
+_REPEATED_SAMPLES = 1000
+"""This many samples with the first one's time show that times have too few digits."""
+
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
@@ -82,7 +85,7 @@ class FrontEnd:
         """Add a sample; return the intervals that it completes (usually none, rarely several).
 
         Raises:
-            InputError: every sample so far is isolated by gaps.
+            InputError: every sample so far is isolated by gaps, or all have the same time.
             ClockSetBackError: this and the preceding samples come from a clock that was set back.
         """
         time = sample[0]
@@ -99,6 +102,7 @@ class FrontEnd:
             newest = self._unconfirmed[-1][0]
         if time == newest:
             self.counts.duplicate += 1
+            self._check_time_advances(time)
         elif time < newest:
             self.counts.out_of_order += 1
             late = self._clock.note_late(time, newest)
@@ -190,6 +194,13 @@ class FrontEnd:
             raise InputError(
                 "time", f"samples {step:.3g} s apart", "50 to 1000 per second", "give times in s"
             )
+
+    def _check_time_advances(self, time: float) -> None:
+        """Refuse a stream that only repeats its first time, as seconds since 1970 in float32 do."""
+        if self.counts.used <= 1 and self.counts.duplicate >= _REPEATED_SAMPLES:
+            found = f"{self.counts.duplicate + 1} samples at {time:.10g} s"
+            remedy = "give times in s with 64 bits"
+            raise InputError("time", found, "a time that advances", remedy)
 
     def _span_gap(self, sample: Sample) -> list[ImuInterval]:
         """End the current interval, span the gap with one of its own and restart the grid."""

@@ -83,6 +83,13 @@ def test_a_stream_whose_times_are_not_in_seconds_is_refused(
     assert navigator.state is None
 
 
+def test_times_since_1970_in_32_bits_are_refused(walk: ImuSequence, still_model: Any) -> None:
+    """They repeat for two minutes, in which nothing would tell why there is no state."""
+    coarse = replace(walk, time=(walk.time + 1.7e9).astype(np.float32))
+    with pytest.raises(InputError, match=r"1001 samples at 1700000000 s.*64 bits"):
+        list(stream(Navigator(still_model, CONFIG), coarse))
+
+
 @pytest.mark.parametrize(
     ("mean", "variance", "reason"),
     [
