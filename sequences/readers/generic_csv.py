@@ -268,8 +268,11 @@ def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionT
         return None, None
     values = np.stack([rows.table[name] for name in names], axis=1)
     kept = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(rows.time))
-    kept = kept[increasing_mask(rows.time[kept])]
     has_attitude = "qx" in names
+    listed = len(kept) > 0 and not rows.is_imu[kept[0] : kept[-1] + 1].any()
+    if listed and not has_attitude:  # without samples in between, they may be in any order
+        kept = kept[np.argsort(rows.time[kept], kind="stable")]
+    kept = kept[increasing_mask(rows.time[kept])]
     if len(kept) < 2:
         what = ("ground truth", "trajectory") if has_attitude else ("a position", "track")
         _log.warning("%s: %d rows hold %s, too few for a %s", path, len(kept), *what)

@@ -6,6 +6,7 @@ errors, `bootstrap` the confidence intervals.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,10 +30,17 @@ from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 
+log = logging.getLogger(__name__)
+
 By = Literal["set", "group", "person", "device", "place", "carry"]
 
 POOLED = "all"
 """Name of the row over all sets, equally weighted; a group may have this name, too."""
+
+_NOT_COMPARED = (
+    "not compared, because its ground truth has neither 2 s of known positions nor three waypoints "
+    "within an unbroken stretch of samples"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +121,8 @@ def judge(
                 name: _errors(model(recording_labels["group"]), prepared, read)
                 for name, model in models.items()
             }
+            if not any(error.path_m > 0.0 for error in errors.values()):
+                log.warning("%s: %s", prepared.path, _NOT_COMPARED)
             judged.append(RecordingResult(prepared.path, recording_labels, errors))
         progress(done)
     return judged, skipped

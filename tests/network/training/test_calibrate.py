@@ -36,3 +36,12 @@ def test_a_few_outliers_do_not_determine_the_scale() -> None:
     error, log_sigma = errors_and_log_sigmas()
     error[::200] *= 1000.0
     np.testing.assert_allclose(calibrate(error, log_sigma).scale, TRUE_SCALE, rtol=0.15)
+
+
+def test_a_sigma_that_is_wrong_way_round_is_ignored() -> None:
+    """Its exponent would be negative: certain where errors are large."""
+    error, log_sigma = errors_and_log_sigmas()
+    found = calibrate(error, -log_sigma)
+    np.testing.assert_allclose(found.exponent, 0.0, atol=1e-3)
+    rms = np.sqrt(np.mean(np.minimum(error**2, 25.0 * np.square(found.scale)), axis=0))
+    np.testing.assert_allclose(found.scale, rms, rtol=0.05)

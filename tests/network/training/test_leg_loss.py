@@ -14,6 +14,7 @@ from stario.network.training.augment import Augmentation
 from stario.network.training.config import SIGMA_WEIGHT
 from stario.network.training.weak_truth import (
     VARIANCE_RATE,
+    VELOCITY_SIGMA,
     LegBatch,
     LegSampler,
     direction_loss,
@@ -133,3 +134,36 @@ def test_loss_and_gradients_follow_the_equations(drawn: tuple[LegBatch, list[Str
         np.testing.assert_allclose(sigma.grad[s], of_sigma, atol=1e-6)
     assert float(loss.detach()) == pytest.approx(expected / count, rel=1e-5)
     assert float(plain) == pytest.approx(per_second / count, rel=1e-5)
+
+
+def turned_away(d_N: FloatArray, change: FloatArray, size: float) -> float:
+    """Loss of a stretch's direction; `size` is the root mean square of |d_k+2 - d_k|, no variable.
+
+    Args:
+        d_N: (K, 3) displacements in N.
+        change: (K - 2, 2) changes of velocity by the accelerometer.
+        size: as above.
+    """
+    d, a = (v[:, 0] + 1j * v[:, 1] for v in (d_N[2:] - d_N[:-2], change))
+    c = np.mean(np.conj(d) * a)
+    chance = 0.25 * size * float(np.sqrt(np.mean(np.abs(a) ** 2)))
+    return float(2.0 * VARIANCE_RATE / VELOCITY_SIGMA**2 * max(0.0, abs(c) / 2 - c.real - chance))
+
+
+def test_direction_loss_and_its_gradient_follow_the_equations(
+    drawn: tuple[LegBatch, list[Stretch]],
+) -> None:
+    """Some stretches contradict the accelerometer beyond chance, others do not."""
+    batch, d_N = drawn[0], np.random.default_rng(3).normal(size=(STRETCHES, SECONDS, 3))
+    predicted = torch.tensor(d_N, requires_grad=True)
+    loss = direction_loss(predicted, batch)
+    loss.backward()
+    assert predicted.grad is not None
+    losses = []
+    for d, change, gradient in zip(d_N, batch.velocity_change.numpy(), predicted.grad, strict=True):
+        size = float(np.sqrt(np.mean(np.sum((d[2:] - d[:-2])[:, :2] ** 2, axis=1))))
+        of_stretch = partial(turned_away, change=change, size=size)
+        losses.append(of_stretch(d))
+        np.testing.assert_allclose(gradient, slope(of_stretch, d) / STRETCHES, atol=1e-6)
+    assert 0 < np.count_nonzero(losses) < STRETCHES
+    assert float(loss.detach()) == pytest.approx(np.mean(losses), rel=1e-5)

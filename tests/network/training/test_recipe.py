@@ -25,6 +25,7 @@ def test_the_learning_rate_warms_up_and_decays() -> None:
     assert (np.diff(rates[: peak + 1]) >= 0.0).all()
     assert (np.diff(rates[peak:]) <= 0.0).all()
     assert 0.0 < rates[-1] < 0.02
+    assert rates[0] > 0.0  # the first step learns, too
 
 
 def test_the_loss_is_minimal_at_the_true_sigma() -> None:

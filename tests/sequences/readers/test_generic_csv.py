@@ -328,3 +328,15 @@ def test_positions_without_attitude_are_kept_as_such(
     np.testing.assert_allclose(found.positions.time, time - walk.time[0], atol=1e-9)
     np.testing.assert_array_equal(found.positions.position_W, position)
     np.testing.assert_array_equal(found.accel, walk.accel)
+
+
+def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path: Path) -> None:
+    samples = [f"{0.01 * k:.2f},{ROW},," for k in range(1000)]
+    waypoints = [f"{time},,,,,,,{time + 1},0" for time in (8, 2, 5)]
+    header = "t,gx,gy,gz,ax,ay,az,px,py"
+    known = read_generic_csv(
+        write_lines(tmp_path / "a.csv", header, *samples, *waypoints)
+    ).positions
+    assert known is not None
+    assert known.time.tolist() == [2.0, 5.0, 8.0]
+    assert known.position_W[:, 0].tolist() == [3.0, 6.0, 9.0]

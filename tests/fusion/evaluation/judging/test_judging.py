@@ -236,6 +236,15 @@ def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     return judged
 
 
+def test_a_recording_with_two_waypoints_is_named_as_not_compared(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    prepared = [prepare(with_waypoints(walk, every), Path(f"{every:g}")) for every in (50.0, 8.0)]
+    judged, _ = judge(prepared, {"ours": lambda group: Stub(walk)}, {})
+    assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
+    assert [one.errors["ours"].path_m > 0.0 for one in judged] == [False, True]
+
+
 def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence) -> None:
     rows = {row.name: row for row in rows_of(judged_pair(walk), "person", "ours", "theirs")}
     assert list(rows) == ["a", "b", "all"]
