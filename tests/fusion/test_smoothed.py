@@ -53,7 +53,7 @@ def test_smoothed_poses_are_one_window_late_and_more_certain_than_the_filters(
         filtered = np.trace(track.covariance[at, 6:9, 6:9], axis1=1, axis2=2)
         smoothed = np.trace(track.smoothed.position_covariance_W, axis1=1, axis2=2)
         # The gains do not know the network's scale error, which the covariances contain.
-        assert (smoothed[2:] <= 1.02 * filtered[2:]).all()
+        assert (smoothed[2:] <= 1.05 * filtered[2:]).all()
         assert np.median(smoothed / filtered) < 0.99
 
 
