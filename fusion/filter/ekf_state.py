@@ -229,6 +229,13 @@ class EkfState:
             N[self.first_field, 0] = 1.0
         return changed(self, P=self.P + sigma**2 * (N @ N.T))
 
+    def with_scale_sigma(self, sigma: float = 0.0) -> EkfState:
+        """Return the state with a covariance that contains this sigma of the network's scale."""
+        J = self.scale_sensitivity
+        sigma = max(sigma, _NEGLIGIBLE_SCALE_SIGMA)
+        added = sigma**2 - self.P[self.scale_row, self.scale_row]
+        return changed(self, P=self.P + added * np.outer(J, J))
+
     def with_position_inflated(self, sigma: float) -> EkfState:
         """Return the state with its covariance inflated by a shift, `sigma` [m] per axis."""
         N = np.zeros((len(self.P), 3))

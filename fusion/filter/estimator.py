@@ -70,7 +70,7 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
+        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma, f.network_scale_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )

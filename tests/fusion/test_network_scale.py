@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig, Track
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.fixes import position_fix
-from stario.sequences.sequence import ImuSequence
+from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.state import NavState
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
 SIGMA = 0.05
 SETTINGS = {"adaptive": False, "covariance_scale": 1.0, "update_rate": 2}
@@ -131,3 +137,33 @@ def test_a_straight_walk_is_uncertain_along_itself(make_walk: Make, make_oracle:
     along = away[far, :2] / distance[far]
     sigma = np.sqrt(along @ track.covariance[far, 6:8, 6:8] @ along)
     assert sigma > SIGMA * distance[far]
+
+
+def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
+    """A scale error moves the end of a straight walk by many of the sigmas that the noise gives."""
+    ekf = StateCloningEkf(slots=2)
+    zero = np.zeros(3)
+    P = np.diag(np.repeat([1e-4, 1e-2, 1e-4, 1e-8, 1e-4], 3))
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, P))
+    rng, length, scale = np.random.default_rng(0), 1.2, 1.07
+    time = np.arange(0.0, 1.0 + 1e-9, 0.1)
+    accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
+    frame = MapFrame(PriorPose(np.eye(3), zero, zero), 0.997, 0.0, SIGMA)
+    slot = ekf.clone()
+    for second in range(200):
+        begin = float(second)
+        noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
+        ekf.propagate(
+            preintegrate(
+                begin + time, np.zeros_like(accel), accel, zero, zero, noise, STANDARD_GRAVITY
+            )
+        )
+        d_W = np.array([scale * length, 0.0, 0.0]) + rng.normal(0.0, 0.05, 3)
+        ekf.update_displacement(slot, None, d_W, 0.05**2 * np.eye(3), gate=14.0)
+        slot = ekf.clone(instead_of=slot)
+    truth = np.array([200.0 * length, 0.0, 0.0])
+    assert ekf.state.p_W[0] - truth[0] > 10.0
+    result = frame.update(ekf, position_fix(200.0, truth, np.eye(3)))
+    assert result.accepted
+    assert result.scale == 1.0
+    assert np.linalg.norm(ekf.state.p_W - truth) < 1.0
