@@ -25,9 +25,10 @@ from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
+from stario.network.training.legs import LegBatch, LegSampler
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import LegBatch, LegSampler, leg_loss
+from stario.network.training.weak_truth import leg_loss
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
 

@@ -15,11 +15,11 @@ from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
+from stario.network.training.legs import leg_samplers
 from stario.network.training.parallel import workers
 from stario.network.training.result import write_result
 from stario.network.training.run import EpochReport, TrainingRun
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import leg_samplers
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.windows import WorldStream

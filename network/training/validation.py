@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from stario.network.displacement import DisplacementNetwork
 from stario.network.known_motion import KnownMotion
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
-from stario.network.training.weak_truth import LegBatch, LegSampler, by_kind, leg_loss
+from stario.network.training.legs import LegBatch, LegSampler, by_kind
+from stario.network.training.weak_truth import leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream

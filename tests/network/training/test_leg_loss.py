@@ -12,14 +12,8 @@ import torch
 
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import SIGMA_WEIGHT
-from stario.network.training.weak_truth import (
-    VARIANCE_RATE,
-    VELOCITY_SIGMA,
-    LegBatch,
-    LegSampler,
-    direction_loss,
-    leg_loss,
-)
+from stario.network.training.legs import VARIANCE_RATE, LegBatch, LegSampler
+from stario.network.training.weak_truth import VELOCITY_SIGMA, direction_loss, leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray

@@ -13,18 +13,11 @@ import torch
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.legs import LegBatch, LegSampler, ends_covariance, velocity_change
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import (
-    LegBatch,
-    LegSampler,
-    direction_loss,
-    ends_covariance,
-    leg_loss,
-    leg_residuals,
-    velocity_change,
-)
+from stario.network.training.weak_truth import direction_loss, leg_loss, leg_residuals
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
