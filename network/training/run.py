@@ -10,7 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,6 +25,7 @@ from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
+from stario.network.training.history import EpochReport, History
 from stario.network.training.legs import LegBatch, LegSampler
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
@@ -33,27 +34,6 @@ from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import atomic_write
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class EpochReport:
-    """Result of one epoch; errors are mean squared displacement errors [m^2].
-
-    Attributes:
-        epoch: number of the epoch, from 1.
-        training_error: error on its augmented windows.
-        validation_error: the error that selects weights (`ValidationSet.selection_error`).
-        validation_by_recording: error of each recording, and of each kind of weak truth [m^2/s].
-        windows_per_second: training windows of this process, with full or weak truth.
-        drawing_share: share of the time spent drawing them while the network waits.
-    """
-
-    epoch: int
-    training_error: float
-    validation_error: float
-    validation_by_recording: dict[str, float]
-    windows_per_second: float = 0.0
-    drawing_share: float = 0.0
 
 
 class TrainingRun:
@@ -66,6 +46,9 @@ class TrainingRun:
         material: digest of the recordings and initial weights, for the checkpoint.
         folder: folder for checkpoint, model and log.
         workers: the processes that share the run.
+
+    Attributes:
+        history: reports of the epochs so far.
     """
 
     def __init__(
@@ -100,7 +83,7 @@ class TrainingRun:
             torch.manual_seed(config.seed + workers.rank)  # independent dropout
         self.step = 0
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
-        self.history: list[EpochReport] = []
+        self.history = History(config)
         folder.mkdir(parents=True, exist_ok=True)
 
     def start_from(self, model: DisplacementModel) -> None:
@@ -224,32 +207,6 @@ class TrainingRun:
             else:
                 value.copy_(current[name])
 
-    def epochs_since_best(self) -> int:
-        """Return the epochs since the smallest validation error; NaN and inf are never smallest.
-
-        Sigma is meaningless until the likelihood is part of the loss: from then on, only epochs
-        trained with it count.
-        """
-        counted = self.history[self._first_with_sigma - 1 :] or self.history
-        # `np.argmin` treats NaN as the smallest.
-        errors = [e if math.isfinite(e := r.validation_error) else math.inf for r in counted]
-        return len(errors) - 1 - int(np.argmin(errors))
-
-    def best_report(self) -> EpochReport:
-        """Return the report of the epoch whose weights are kept."""
-        return self.history[-1 - self.epochs_since_best()]
-
-    def should_stop(self) -> bool:
-        """Return whether validation has stopped improving; False until sigma is learned."""
-        learned = len(self.history) >= self._first_with_sigma
-        return learned and self.epochs_since_best() >= self.config.patience
-
-    @property
-    def _first_with_sigma(self) -> int:
-        """First epoch that learns sigma in every step; the last epoch of a short run."""
-        first = math.ceil(self.config.likelihood_from * self.config.epochs) + 1
-        return min(first, self.config.epochs) if self.config.likelihood_from < 1.0 else first
-
     def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch in the leading process, which shares the error with the others.
 
@@ -265,11 +222,11 @@ class TrainingRun:
             windows_per_second=self._windows / (self._drawing_s + self._learning_s),
             drawing_share=self._drawing_s / (self._drawing_s + self._learning_s),
         )
-        self.history.append(report)
-        if self.epochs_since_best() == 0 and math.isfinite(report.validation_error):
+        self.history.reports.append(report)
+        if self.history.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self._keep(candidate)
         if self.workers.is_leader:
-            history = [asdict(r) for r in self.history]
+            history = [asdict(r) for r in self.history.reports]
             path, config = self._checkpoint, self.config
             write_checkpoint(path, config, self._material, self.step, history, self._tensors())
             with atomic_write(self.folder / "log.json") as file:
@@ -305,7 +262,7 @@ class TrainingRun:
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
-        self.history = [EpochReport(**report) for report in history]
+        self.history.reports = [EpochReport(**report) for report in history]
         self._restore(tensors)
         log.info("resumed %s at step %d", self._checkpoint, self.step)
 

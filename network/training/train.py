@@ -15,10 +15,11 @@ from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
+from stario.network.training.history import EpochReport
 from stario.network.training.legs import leg_samplers
 from stario.network.training.parallel import workers
 from stario.network.training.result import write_result
-from stario.network.training.run import EpochReport, TrainingRun
+from stario.network.training.run import TrainingRun
 from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
@@ -94,11 +95,11 @@ def train(
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
-        while run.step < config.steps and not run.should_stop():
+        while run.step < config.steps and not run.history.should_stop():
             report = run.validate(run.epoch(on_step), held_out)
             if processes.is_leader:
                 on_epoch(report)
-        if before and (words := held_out.worse(before, run.best_report().validation_by_recording)):
+        if before and (words := held_out.worse(before, run.history.best().validation_by_recording)):
             log.warning("%s: %s", folder, words)
         known = known_motion(streams, legs)
         if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:

@@ -21,7 +21,7 @@ from stario.network.training.config import (
     TrainingConfig,
     training_config,
 )
-from stario.network.training.run import EpochReport
+from stario.network.training.history import EpochReport
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import ConfigError, InputError, ReadError
