@@ -12,7 +12,6 @@ by 170-180 degrees), dR_V jumps but the gyroscope measures no such rotation.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,18 +20,18 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, interpolated
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
-from stario.sequences.attitude.rotations import cumulative_rotations, tilt_aligning
+from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.truth.gyro_integral import GyroIntegral
 from stario.sequences.truth.mount_heading import heading_turn
+from stario.sequences.truth.mounts import (
+    MIN_FIT_S,
+    disagreeing,
+    fitted_mounts,
+    pieces_between_jumps,
+)
 
-_STRIDES_S = (0.03, 0.1, 0.25, 0.5)
-_FLIP_RAD = np.deg2rad(15.0)
-_GLITCH_RAD = np.deg2rad(6.0)
-_SAME_MOUNT_RAD = np.deg2rad(30.0)
-_MAX_GYRO_GAP_S = 0.5
-_MIN_PIECE_S = 1.0
-_MIN_FIT_S = 10.0
 _LAG_STEP_S = 0.0025
 _MAX_LAG_S, _REMAINING_LAG_S = 0.15, 0.04
 _CORRELATED_S = 0.1
@@ -86,16 +85,16 @@ def align_tracked_body(
     """
     _check_length("recording", imu_time)
     _check_length("capture", truth_time[valid])
-    gyro_B = _GyroIntegral(imu_time, gyro)
+    gyro_B = GyroIntegral(imu_time, gyro)
     sizes = _agreement(gyro_B, truth_time, attitude_WV, valid, 0.04, sizes_only=True)
     lag = _best_lag(sizes, _MAX_LAG_S)
     time = truth_time + lag
     attitude_B = gyro_B.attitude(time)
-    valid = valid & ~_disagreeing(time, attitude_WV, attitude_B)
-    pieces = _pieces(time, attitude_WV, attitude_B, valid)
+    valid = valid & ~disagreeing(time, attitude_WV, attitude_B)
+    pieces = pieces_between_jumps(time, attitude_WV, attitude_B, valid)
     start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
     _check_length("capture that agrees with the gyroscope", time[start:stop])
-    mounts = _mounts(time, attitude_WV, gyro_B, pieces)
+    mounts = fitted_mounts(time, attitude_WV, gyro_B, pieces)
     kept = np.zeros_like(valid)
     for start, stop in pieces:
         kept[start:stop] = valid[start:stop]
@@ -103,7 +102,7 @@ def align_tracked_body(
     rates = _agreement(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept, 0.06)
     lag += _best_lag(rates, _REMAINING_LAG_S)
     time = truth_time + lag
-    mounts = _mounts(time, attitude_WV, gyro_B, pieces)
+    mounts = fitted_mounts(time, attitude_WV, gyro_B, pieces)
     force_B, rate_B = interpolated(time, imu_time, accel), interpolated(time, imu_time, gyro)
     attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     if position_WV is not None:
@@ -113,7 +112,7 @@ def align_tracked_body(
         attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     # With the mount known, glitches about another axis than the motion's are detected as well.
     drift = attitude_WB * gyro_B.attitude(time).inv()
-    kept &= ~_disagreeing(time, drift, Rotation.identity(len(drift)))
+    kept &= ~disagreeing(time, drift, Rotation.identity(len(drift)))
     return BodyAlignment(
         lag=lag,
         # Over a shorter span, the capture's noise hides a trolley's turns.
@@ -152,44 +151,12 @@ def _level(
 
 def _check_length(what: str, time: FloatArray) -> None:
     length = float(time[-1] - time[0]) if len(time) else 0.0
-    if length < _MIN_FIT_S:
-        raise InputError(what, f"{length:.4g} s", f"at least {_MIN_FIT_S:.0f} s to find the mount")
-
-
-class _GyroIntegral:
-    """Attitude integrated from the gyroscope, at any time, and the rate's running integral."""
-
-    def __init__(self, time: FloatArray, gyro: FloatArray) -> None:
-        self.time = time
-        steps = np.diff(time)[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
-        self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self._quat = cumulative_rotations(Rotation.from_rotvec(steps))
-        self._rate = gyro
-
-    def attitude(self, time: FloatArray) -> Rotation:
-        """Return attitudes of B relative to its start at times in the recording (else clamped)."""
-        clipped = np.clip(time, self.time[0], self.time[-1])
-        left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
-        tau = clipped - self.time[left]
-        return Rotation.from_quat(self._quat[left]) * Rotation.from_rotvec(
-            self._rate[left] * tau[:, None]
-        )
-
-    def has_long_gap(self, start: float, stop: float) -> bool:
-        """Return whether the samples between two times have a gap too long to integrate across."""
-        first, last = np.searchsorted(self.time, [start, stop])
-        inside = self.time[max(first - 1, 0) : last + 1]
-        return bool(np.diff(inside).max(initial=0.0) > _MAX_GYRO_GAP_S)
-
-    def mean_rate(self, time: FloatArray, stride: int) -> FloatArray:
-        """Return mean rates (M - stride, 3) [rad/s] from each time to the one `stride` later."""
-        angle = interpolated(time, self.time, self.angle)
-        lengths = time[stride:] - time[:-stride]
-        return np.asarray((angle[stride:] - angle[:-stride]) / lengths[:, None], dtype=np.float64)
+    if length < MIN_FIT_S:
+        raise InputError(what, f"{length:.4g} s", f"at least {MIN_FIT_S:.0f} s to find the mount")
 
 
 def _agreement(
-    gyro_B: _GyroIntegral,
+    gyro_B: GyroIntegral,
     time: FloatArray,
     attitude: Rotation,
     valid: BoolArray,
@@ -229,94 +196,3 @@ def _best_lag(score: Callable[[float], float], reach: float) -> float:
     curvature = before - 2 * peak + after
     offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return float(lags[best] + np.clip(offset, -1, 1) * _LAG_STEP_S)
-
-
-def _disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
-    """Return whether each sample's rotation to most neighbours contradicts the gyroscope."""
-    n = len(time)
-    dt = float(np.median(np.diff(time)))
-    ahead, behind = np.zeros(n), np.zeros(n)
-    for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
-        error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
-        ahead[: n - stride] += error
-        behind[stride:] += error
-    enough = len(_STRIDES_S) / 2
-    return (ahead > enough) & (behind > enough)
-
-
-def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
-    """Return the difference of rotation angles over `stride` samples; the mount cancels out."""
-    half_V, half_B = (
-        np.arccos(np.clip(np.abs(np.sum(quat[:-stride] * quat[stride:], axis=1)), 0.0, 1.0))
-        for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
-    )
-    return np.asarray(2.0 * np.abs(half_V - half_B), dtype=np.float64)
-
-
-def _pieces(
-    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
-) -> list[tuple[int, int]]:
-    """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful."""
-    known = np.flatnonzero(valid)
-    if len(known) < 2:
-        return []
-    jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
-    edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
-    runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
-    return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
-
-
-def _mounts(
-    time: FloatArray,
-    attitude_WV: Rotation,
-    gyro_B: _GyroIntegral,
-    pieces: list[tuple[int, int]],
-) -> list[Rotation]:
-    """Return R_VB of each piece: fitted if it is long, else carried over by the gyroscope.
-
-    A rotation within a gap of the gyroscope is not a flip: nothing is carried across such a gap.
-    """
-    attitude_B = gyro_B.attitude(time)
-    fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
-    longest = int(np.argmax([stop - start for start, stop in pieces]))
-    mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
-    count = len(pieces)
-    # Pieces after and before the longest, their neighbours towards it, and the facing ends of both.
-    order = [(k, k - 1, pieces[k][0], pieces[k - 1][1] - 1) for k in range(longest + 1, count)]
-    order += [(k, k + 1, pieces[k][1] - 1, pieces[k + 1][0]) for k in range(longest - 1, -1, -1)]
-    for k, neighbour, here, there in order:
-        mount, fit = mounts[neighbour], fitted[k]
-        carried = fit or mount
-        if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
-            across = attitude_B[there].inv() * attitude_B[here]
-            carried = attitude_WV[here].inv() * attitude_WV[there] * mount * across
-        same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
-        agrees = fit is not None and _same_mount(fit, carried)
-        mounts[k] = mount if same else (fit if agrees and fit else carried)
-    return [mounts[k] for k in range(count)]
-
-
-def _same_mount(mount: Rotation, other: Rotation) -> bool:
-    return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
-
-
-def _fit(
-    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, piece: tuple[int, int]
-) -> Rotation | None:
-    """Fit R_VB, which takes rotation vectors of B to those of V, with outliers weighted down."""
-    start, stop = piece
-    if time[stop - 1] - time[start] < _MIN_FIT_S:
-        return None
-    stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
-    # Rotations that overlap by more than two thirds add little information.
-    before = np.arange(start, stop - stride, max(1, stride // 3))
-    phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
-    phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
-    weights = np.ones(len(phi_V))
-    mount = Rotation.identity()
-    for _ in range(5):
-        mount, _residual = Rotation.align_vectors(phi_V, phi_B, weights=weights)
-        residual = np.linalg.norm(phi_V - mount.apply(phi_B), axis=1)
-        scale = max(float(np.median(residual)), 1e-4)
-        weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
-    return mount

@@ -1,0 +1,114 @@
+"""The mount of a tracked body on the IMU, piece by piece between its flips.
+
+Frames and equation: `stario.sequences.truth.alignment`.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.truth.gyro_integral import GyroIntegral
+
+MIN_FIT_S = 10.0
+"""Minimum length of a piece whose mount can be fitted [s]."""
+
+_STRIDES_S = (0.03, 0.1, 0.25, 0.5)
+_FLIP_RAD = np.deg2rad(15.0)
+_GLITCH_RAD = np.deg2rad(6.0)
+_SAME_MOUNT_RAD = np.deg2rad(30.0)
+_MIN_PIECE_S = 1.0
+
+
+def disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
+    """Return whether each sample's rotation to most neighbours contradicts the gyroscope."""
+    n = len(time)
+    dt = float(np.median(np.diff(time)))
+    ahead, behind = np.zeros(n), np.zeros(n)
+    for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
+        error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
+        ahead[: n - stride] += error
+        behind[stride:] += error
+    enough = len(_STRIDES_S) / 2
+    return (ahead > enough) & (behind > enough)
+
+
+def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> FloatArray:
+    """Return the difference of rotation angles over `stride` samples; the mount cancels out."""
+    half_V, half_B = (
+        np.arccos(np.clip(np.abs(np.sum(quat[:-stride] * quat[stride:], axis=1)), 0.0, 1.0))
+        for quat in (attitude_WV.as_quat(), attitude_B.as_quat())
+    )
+    return np.asarray(2.0 * np.abs(half_V - half_B), dtype=np.float64)
+
+
+def pieces_between_jumps(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
+) -> list[tuple[int, int]]:
+    """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful."""
+    known = np.flatnonzero(valid)
+    if len(known) < 2:
+        return []
+    jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
+    edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
+    runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
+    return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
+
+
+def fitted_mounts(
+    time: FloatArray,
+    attitude_WV: Rotation,
+    gyro_B: GyroIntegral,
+    pieces: list[tuple[int, int]],
+) -> list[Rotation]:
+    """Return R_VB of each piece: fitted if it is long, else carried over by the gyroscope.
+
+    A rotation within a gap of the gyroscope is not a flip: nothing is carried across such a gap.
+    """
+    attitude_B = gyro_B.attitude(time)
+    fitted = [_fit(time, attitude_WV, attitude_B, piece) for piece in pieces]
+    longest = int(np.argmax([stop - start for start, stop in pieces]))
+    mounts: dict[int, Rotation] = {longest: fitted[longest] or Rotation.identity()}
+    count = len(pieces)
+    # Pieces after and before the longest, their neighbours towards it, and the facing ends of both.
+    order = [(k, k - 1, pieces[k][0], pieces[k - 1][1] - 1) for k in range(longest + 1, count)]
+    order += [(k, k + 1, pieces[k][1] - 1, pieces[k + 1][0]) for k in range(longest - 1, -1, -1)]
+    for k, neighbour, here, there in order:
+        mount, fit = mounts[neighbour], fitted[k]
+        carried = fit or mount
+        if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
+            across = attitude_B[there].inv() * attitude_B[here]
+            carried = attitude_WV[here].inv() * attitude_WV[there] * mount * across
+        same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
+        agrees = fit is not None and _same_mount(fit, carried)
+        mounts[k] = mount if same else (fit if agrees and fit else carried)
+    return [mounts[k] for k in range(count)]
+
+
+def _same_mount(mount: Rotation, other: Rotation) -> bool:
+    return bool((mount.inv() * other).magnitude() < _SAME_MOUNT_RAD)
+
+
+def _fit(
+    time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, piece: tuple[int, int]
+) -> Rotation | None:
+    """Fit R_VB, which takes rotation vectors of B to those of V, with outliers weighted down."""
+    start, stop = piece
+    if time[stop - 1] - time[start] < MIN_FIT_S:
+        return None
+    stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
+    # Rotations that overlap by more than two thirds add little information.
+    before = np.arange(start, stop - stride, max(1, stride // 3))
+    phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
+    phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
+    weights = np.ones(len(phi_V))
+    mount = Rotation.identity()
+    for _ in range(5):
+        mount, _residual = Rotation.align_vectors(phi_V, phi_B, weights=weights)
+        residual = np.linalg.norm(phi_V - mount.apply(phi_B), axis=1)
+        scale = max(float(np.median(residual)), 1e-4)
+        weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
+    return mount
