@@ -125,6 +125,8 @@ def train(
     elif not paths and not validation:
         refuse_unused(changed(reading), "without recordings", "use with PATH")
     first = load_model(start_from) if start_from else None  # fails before anything slow starts
+    if first is not None:
+        _ = first.training_form  # an exported graph has none
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     if not paths and data is None and generated is None:
         raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")

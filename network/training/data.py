@@ -93,12 +93,12 @@ def mix_sources(
         whole = sum(v * n for v, n in zip(lively, starts, strict=True)) / WINDOW_RATE
         streams += members
         weights += [share * v / whole if whole else 0.0 for v in lively]
-        words.append(f"{name}: {_minutes(members):.0f} min")
+        words.append(f"{name}: {_length(members)}")
     if any(len(s) >= reach for s in streams) and not any(weights):
         raise ConfigError("shares", "0 for every source present", "at least one above 0")
     legs = [s for recording in recorded for s in recording.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
-        words.append(f"{kind}: {_minutes([s for s in legs if s.kind == kind]):.0f} min")
+        words.append(f"{kind}: {_length([s for s in legs if s.kind == kind])}")
     return TrainingData(streams, weights, legs, words + _licences(recorded))
 
 
@@ -111,7 +111,7 @@ def _licences(recorded: Sequence[RecordingStreams]) -> list[str]:
             known.setdefault(f"{file}, licence {recording.licence}", []).append(recording)
     return [
         f"{words}: {len(members)} recordings, "
-        f"{sum(_minutes(recording.streams) for recording in members):.0f} min"
+        f"{_length([stream for recording in members for stream in recording.streams])}"
         for words, members in known.items()
     ]
 
@@ -133,8 +133,9 @@ def _sources(
     return [(name or "others", shares.get(name, left), found) for name, found in members.items()]
 
 
-def _minutes(streams: Sequence[Stream]) -> float:
-    return sum(len(stream) for stream in streams) / WINDOW_RATE / 60.0
+def _length(streams: Sequence[Stream]) -> str:
+    seconds = sum(len(stream) for stream in streams) / WINDOW_RATE
+    return f"{seconds / 60.0:.0f} min" if seconds >= 120.0 else f"{seconds:.0f} s"
 
 
 def _liveliness(stream: WorldStream) -> float:

@@ -250,7 +250,7 @@ def test_training_can_use_recordings_alone(
     done = stario("train", recording, "--recorded-only", "--config", tiny, "--out", "alone")
     assert done.code == 0, done.err
     trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
-    assert trained_on == ["recorded, others: 0 min"]  # nothing simulated, no licence known
+    assert trained_on == ["recorded, others: 10 s"]  # nothing simulated, no licence known
 
 
 def test_a_recording_cannot_both_train_and_validate(

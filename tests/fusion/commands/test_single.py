@@ -363,3 +363,6 @@ def test_export_accepts_the_name_of_a_network(stario, tmp_path: Path) -> None:
     done = stario("export", "--model", "R-ResNet", "--runs", "mine", "--out", "r.onnx")
     assert done.code == 0, done.err
     assert (tmp_path / "r.onnx").exists()
+    done = stario("train", "nowhere.csv", "--start-from", "r.onnx")
+    done.assert_one_line_error("an exported graph")
+    assert "nowhere.csv" not in done.err  # nothing is read first
