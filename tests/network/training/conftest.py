@@ -1,0 +1,26 @@
+"""A finished training run, and its model."""
+
+from pathlib import Path
+
+import pytest
+from training_runs import run
+
+from stario.network.card import card_path
+from stario.network.training.history import EpochReport
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpochReport]]:
+    """A run without interruption: the model's path and the reports of its epochs."""
+    reports: list[EpochReport] = []
+    folder = tmp_path_factory.mktemp("finished")
+    return run(folder, on_epoch=reports.append, trained_on=["swings"]), reports
+
+
+@pytest.fixture
+def model(finished: tuple[Path, list[EpochReport]], tmp_path: Path) -> Path:
+    """A copy of the trained model and its card."""
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(finished[0].read_bytes())
+    card_path(path).write_bytes(card_path(finished[0]).read_bytes())
+    return path

@@ -1,0 +1,115 @@
+"""Training runs that are killed, resumed, or already finished."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from training_runs import STREAMS, TINY, VALIDATION, run, swaying
+
+from stario.network.model import load_model
+from stario.network.training.history import EpochReport
+from stario.network.training.train import train
+from stario.sequences.errors import ConfigError, ReadError
+
+
+def test_a_killed_and_resumed_run_gives_the_same_weights(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    def kill(step: int, loss: float) -> None:
+        if step == 21:  # in the third epoch of eight steps
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, on_step=kill)
+    assert not (tmp_path / "model.safetensors").exists()
+    reports: list[EpochReport] = []
+    resumed = safetensors.torch.load_file(run(tmp_path, on_epoch=reports.append))
+    expected = safetensors.torch.load_file(finished[0])
+    assert [r.epoch for r in reports] == [3, 4]
+    assert resumed.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(resumed[name], value), name
+
+
+def test_a_finished_run_is_not_trained_further(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    checkpoint.write_bytes((finished[0].parent / checkpoint.name).read_bytes())
+    steps: list[int] = []
+    path = run(tmp_path, on_step=lambda step, loss: steps.append(step), trained_on=["swings"])
+    assert steps == []
+    assert path.read_bytes() == finished[0].read_bytes()
+
+
+def test_a_finished_run_logs_that_all_epochs_are_done(
+    finished: tuple[Path, list[EpochReport]], caplog: pytest.LogCaptureFixture
+) -> None:
+    run(finished[0].parent, trained_on=["swings"])
+    assert "all 4 epochs are done" in caplog.text
+
+
+def test_a_checkpoint_of_other_recordings_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    folder = finished[0].parent
+    more = [*STREAMS, swaying("e", 0.1)]
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, more, [1.0, 1.0, 1.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="other recordings"):
+        train(TINY, STREAMS, [1.0, 2.0], VALIDATION, folder)
+    with pytest.raises(ConfigError, match="initial weights"):
+        run(folder, start_from=load_model(finished[0]))
+
+
+def test_a_checkpoint_of_recordings_that_were_corrected_since_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    """Their names and lengths are the same; ground truth or samples are not."""
+    folder, position_W = finished[0].parent, STREAMS[0].position_W
+    swapped = replace(STREAMS[0], position_W=position_W[:, [1, 0, 2]])
+    other_sign = replace(STREAMS[0], imu_W=STREAMS[0].imu_W * np.float32([1, 1, 1, -1, 1, 1]))
+    for corrected in (swapped, replace(STREAMS[0], position_W=1.01 * position_W), other_sign):
+        with pytest.raises(ConfigError, match="other recordings"):
+            train(TINY, [corrected, STREAMS[1]], [1.0, 1.0], VALIDATION, folder)
+
+
+def test_a_checkpoint_of_another_recipe_is_refused(
+    finished: tuple[Path, list[EpochReport]],
+) -> None:
+    with pytest.raises(ConfigError, match=r"rate: found 0\.001, expected 0\.01"):
+        run(finished[0].parent, replace(TINY, rate=0.01))
+    harder = replace(TINY, augmentation=replace(TINY.augmentation, tilt=0.3))
+    with pytest.raises(ConfigError, match="augmentation"):
+        run(finished[0].parent, harder)
+
+
+@pytest.mark.parametrize("length", [0, 5, 1000, 100_000])
+def test_a_truncated_checkpoint_is_named(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path, length: int
+) -> None:
+    whole = (finished[0].parent / "checkpoint.safetensors").read_bytes()
+    (tmp_path / "checkpoint.safetensors").write_bytes(whole[:length])
+    with pytest.raises(ReadError, match=r"checkpoint.safetensors: checkpoint: found .*complete"):
+        run(tmp_path)
+
+
+def test_a_checkpoint_without_the_setting_successive_is_resumed(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    path = finished[0].parent / "checkpoint.safetensors"
+    with safetensors.safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    config = json.loads(metadata["config"])
+    del config["successive"]
+    content = safetensors.torch.load_file(path)
+    safetensors.torch.save_file(
+        content,
+        tmp_path / path.name,
+        metadata={**metadata, "config": json.dumps(config)},
+    )
+    assert run(tmp_path, trained_on=["swings"]).read_bytes() == finished[0].read_bytes()

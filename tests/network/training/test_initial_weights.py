@@ -1,0 +1,83 @@
+"""Training from initial weights: fine-tuning and a last stage."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from training_runs import STREAMS, TINY, VALIDATION, run
+
+from stario.network.card import Calibration
+from stario.network.known_motion import KnownMotion
+from stario.network.model import load_model
+from stario.network.training.train import train
+from stario.network.training.validation import ValidationSet
+
+
+def test_training_that_spoils_its_initial_weights_gives_a_warning(
+    model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run(tmp_path / "spoilt", replace(TINY, epochs=1, rate=0.1), start_from=load_model(model))
+    assert "times those of the initial weights" in caplog.text
+    held_out = ValidationSet(VALIDATION, torch.device("cpu"), TINY)
+    assert not held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 1.5})
+    assert "(d: 4 instead of 1)" in held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 4.0})
+
+
+def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(
+    model: Path, tmp_path: Path
+) -> None:
+    first, once = load_model(model), replace(TINY, epochs=1)
+    initial, none, half, all_learned = (
+        dict(weights.training_form.named_parameters())
+        for weights in (
+            first,
+            *(
+                load_model(
+                    run(tmp_path / str(share), replace(once, learned=share), start_from=first)
+                )
+                for share in (0.0, 0.5, 1.0)
+            ),
+        )
+    )
+    for name, before in initial.items():
+        torch.testing.assert_close(none[name], before, atol=0.0, rtol=0.0)
+        torch.testing.assert_close(half[name], 0.5 * (before + all_learned[name]))
+    assert any(not torch.equal(all_learned[name], before) for name, before in initial.items())
+
+
+def test_fine_tuned_weights_still_know_the_motion_of_the_initial_ones(
+    model: Path, tmp_path: Path
+) -> None:
+    """Weights of which none remain know that of their own training only: here, too little."""
+    first = load_model(model)
+    first.card = replace(first.card, known_motion=KnownMotion(((0.0,) * 5,), 1.0, {}))
+    for learned, known in ((0.3, first.card.known_motion), (1.0, None)):
+        config = replace(TINY, epochs=1, epoch_windows=16, learned=learned)
+        path = run(tmp_path / str(learned), config, start_from=first)
+        assert load_model(path).card.known_motion == known
+
+
+def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
+    model: Path, tmp_path: Path
+) -> None:
+    first = load_model(model)
+    slow = replace(TINY, rate=1e-8, epochs=1)
+    other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
+    options = {"calibration": other, "trained_on": ["walks"]}
+    last = load_model(run(tmp_path / "last", slow, start_from=first, **options))
+    assert last.card.calibration == other
+    assert last.card.trained_on == ["walks", "initial weights, swings"]
+    before = dict(first.training_form.named_parameters())
+    for name, value in last.training_form.named_parameters():
+        torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)
+    again = load_model(run(tmp_path / "again", slow, start_from=last, trained_on=["swings"]))
+    inherited = ["initial weights, walks", "initial weights, swings"]
+    assert again.card.trained_on == ["swings", *inherited]
+
+
+def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> None:
+    """A last stage trains on the validation recordings, too."""
+    everything = [*STREAMS, *VALIDATION]
+    path = train(replace(TINY, epochs=1), everything, [1.0] * 4, VALIDATION, tmp_path)
+    assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
