@@ -21,6 +21,7 @@ from stario.fusion.filter.estimates import (
     nav_states,
     plain_scale_sensitivities,
     smoothed_poses,
+    with_error,
 )
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements
@@ -36,7 +37,7 @@ from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.intervals import Start
 from stario.fusion.recording import PreprocessedRecording, Progress
-from stario.fusion.state import NavState, Track, changed, track_from_states
+from stario.fusion.state import NavState, Track, track_from_states
 from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
@@ -105,8 +106,8 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     # The graph's measurements are the filter's, and so is its sensitivity to the network's scale.
     errors = config.filter.network_scale_sigma * plain_scale_sensitivities(filtered.estimates)
     for k, (before, after, error) in enumerate(zip(states, final, errors, strict=True)):
-        error = frame_rotation(after.R_WB @ before.R_WB.T) @ error
-        solved[k] = changed(solved[k], covariance=solved[k].covariance + np.outer(error, error))
+        turn = frame_rotation(after.R_WB @ before.R_WB.T)
+        solved[k] = with_error(solved[k], turn @ error)
     return Solution(with_undirected(solved, frame.undirected), notes=(note,))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.filter.jacobians import plain_covariance
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.sequence import FloatArray
 
 _CHUNK = 2000
@@ -77,6 +77,11 @@ def nav_states(estimates: Sequence[Estimate], scale_sigma: float = 0.0) -> list[
             biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
             states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
     return states
+
+
+def with_error(state: NavState, error: FloatArray) -> NavState:
+    """Return a state whose covariance contains one more error (15,), of unknown sign."""
+    return changed(state, covariance=state.covariance + np.outer(error, error))
 
 
 def smoothed_poses(clones: Sequence[Estimate], scale_sigma: float) -> list[SmoothedPose]:

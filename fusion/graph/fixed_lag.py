@@ -17,7 +17,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimates import nav_states, plain_scale_sensitivities
+from stario.fusion.filter.estimates import nav_states, plain_scale_sensitivities, with_error
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
@@ -156,8 +156,7 @@ class FixedLagEstimator:
         # The graph's measurements are the filter's, and so is its sensitivity to the scale.
         error = plain_scale_sensitivities([self._filter.estimate()])[0]
         error *= self._config.filter.network_scale_sigma
-        state = replace(state, covariance=state.covariance + np.outer(error, error))
-        return with_undirected([state], self._filter.frame.state.undirected)[0]
+        return with_undirected([with_error(state, error)], self._filter.frame.state.undirected)[0]
 
     def health(self, counts: SampleCounts) -> Health:
         """Return the filter's report with the graph's sigmas and the number of fallbacks."""

@@ -24,7 +24,7 @@ from stario.fusion.evaluation.tables import (
 from stario.fusion.table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention, align, pose_errors
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.batch import Skipped, skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import StarioError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -58,22 +58,22 @@ def test_errors(
     """
     found: list[dict[str, object]] = []
     shown: dict[str, Shown] = {}
-    skipped: list[Skipped] = []
+    left_out: list[Skipped] = []
     paths = [entry.path for entry in test]
     outcomes = prepared_recordings(paths, reading.read, reading.options, reading.cache, 1)
     for entry, outcome in zip(test, outcomes, strict=True):
         if isinstance(outcome, Skipped):
-            skipped.append(outcome)
+            left_out.append(outcome)
             continue
         try:
             row, track = _recording(model, outcome, reading)
         except StarioError as error:
-            skipped.append(Skipped(str(entry.path), str(error)))
+            left_out.append(skipped(entry.path, error))
             continue
         found.append({"path": str(entry.path), "group": entry.group, **row})
         if track is not None and len(shown) < MAX_DRAWN:
             shown[outcome.name] = track
-    return found, shown, skipped
+    return found, shown, left_out
 
 
 def _recording(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
+from stario.sequences.windows import runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,9 +102,8 @@ def split_at_gaps(
 
 def unbroken(values: FloatArray) -> list[FloatArray]:
     """Return the stretches (n, k) of values (N, k) between rows with a NaN."""
-    known = np.isfinite(values).all(axis=1)
-    starts = np.flatnonzero(np.diff(known, prepend=False, append=False))
-    return [values[a:b] for a, b in zip(starts[::2], starts[1::2], strict=True)]
+    known = np.asarray(np.isfinite(values).all(axis=1))
+    return [values[a:b] for a, b in runs(known)]
 
 
 def indices_after_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
