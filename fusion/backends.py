@@ -17,11 +17,11 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimates import (
+    ASSUMED,
     Estimate,
     nav_states,
-    plain_scale_sensitivities,
     smoothed_poses,
-    with_error,
+    with_actual_covariances,
 )
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements
@@ -81,10 +81,9 @@ class Backend(NamedTuple):
 def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
     """Return the filter's states."""
     frame = filtered.estimator.frame.state
-    sigma = config.filter.network_scale_sigma
-    states = to_final_frame(nav_states(filtered.estimates, sigma), frame.transforms)
+    states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
     smoothed = smoothed_track(
-        smoothed_poses(filtered.clones, sigma), (*frame.transforms, *frame.undirected)
+        smoothed_poses(filtered.clones), (*frame.transforms, *frame.undirected)
     )
     return Solution(with_undirected(states, frame.undirected), smoothed)
 
@@ -92,7 +91,7 @@ def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solu
 def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
     """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
     estimator = filtered.estimator
-    frame, states = estimator.frame.state, nav_states(filtered.estimates)
+    frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
     end, has_field = states[-1], estimator.ekf.state.field is not None
     bias = (end.b_g, end.covariance[9:12, 9:12]) if has_field else None
     covariance = states[0].covariance.copy()
@@ -103,11 +102,11 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     solved, note = smooth(
         final, first, filtered.measurements, frame.transforms, config, bias, sigma
     )
-    # The graph's measurements are the filter's, and so is its sensitivity to the network's scale.
-    errors = config.filter.network_scale_sigma * plain_scale_sensitivities(filtered.estimates)
-    for k, (before, after, error) in enumerate(zip(states, final, errors, strict=True)):
-        turn = frame_rotation(after.R_WB @ before.R_WB.T)
-        solved[k] = with_error(solved[k], turn @ error)
+    turns = [
+        frame_rotation(after.R_WB @ before.R_WB.T)
+        for before, after in zip(states, final, strict=True)
+    ]
+    solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
     return Solution(with_undirected(solved, frame.undirected), notes=(note,))
 
 

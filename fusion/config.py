@@ -43,9 +43,9 @@ class FilterConfig:
             NEES on the training recordings and on validation recordings unseen by the network.
         network_turn_sigma: standard deviation of the network's yaw error, correlated over about a
             minute [rad]; becomes a state once fixes make the direction observable.
-        network_scale_sigma: standard deviation of the network's scale error, the same all along a
-            track: a person's steps are longer or shorter than those of the training. It is part of
-            the covariances and not of the estimate.
+        correlated_errors: whether covariances and NIS take the network's errors for correlated, as
+            those of real networks are, and the accelerometer for better than the gains assume;
+            False if all errors are white and as large as configured, as in a simulation.
         gate: probability of the chi-square test. The covariance of an outlier is inflated rather
             than the measurement rejected: without it the speed drifts, and the next correct
             measurement looks false.
@@ -72,7 +72,7 @@ class FilterConfig:
     update_rate: int = 2
     covariance_scale: float = 0.5
     network_turn_sigma: float = 0.05
-    network_scale_sigma: float = 0.05
+    correlated_errors: bool = True
     gate: float = 0.997
     tilt_sigma: float = 0.05
     yaw_sigma: float = 1e-3
@@ -93,11 +93,11 @@ class FilterConfig:
         check_number(self, "gate", 0.5, 1.0)
         if self.gate == 1.0:
             raise ConfigError("gate", "1", "a probability from 0.5 to below 1")
-        for name in ("adaptive", "magnetometer"):
+        for name in ("correlated_errors", "adaptive", "magnetometer"):
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigError(name, repr(getattr(self, name)), "True or False")
         for item in fields(self):
-            if item.name not in ("update_rate", "gate", "adaptive", "magnetometer", "declination"):
+            if item.type == "float" and item.name != "gate":
                 check_number(self, item.name)
         if self.declination is not None:
             check_number(self, "declination", -math.pi, math.pi)

@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 17
+FORMAT, VERSION = "stario snapshot", 18
 
 
 _HOLDS = """

@@ -173,6 +173,7 @@ class Health:
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
     accel_noise_factor: float = 1.0
+    network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 

@@ -21,6 +21,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.filter.network_errors import ErrorLevel, displacement_errors
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -149,9 +150,9 @@ class AccelNoiseScale:
 
     def updated(self, result: UpdateResult) -> AccelNoiseScale:
         """Return the scale after one displacement; unchanged if it has no innovation."""
-        if not math.isfinite(result.nis):
+        if not math.isfinite(result.gate_nis):
             return self
-        ratio = (result.nis / (TARGET_NIS * result.dof)) ** 2
+        ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
         log_factor = self.log_factor + self.gain * excess
         gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
@@ -169,6 +170,7 @@ class DisplacementUpdates:
         hypotheses: the filter, and the alternative without the outliers of the last seconds.
         outlier_share: fraction of outliers among recent displacements.
         accel_noise: estimated scale of the accelerometer's noise.
+        error_level: estimated level of the network's errors.
     """
 
     def __init__(self, ekf: StateCloningEkf, config: FilterConfig) -> None:
@@ -176,6 +178,7 @@ class DisplacementUpdates:
         self.hypotheses = HypothesisPair(ekf)
         self.outlier_share = 0.5  # outliers are assumed common at first
         self.accel_noise = AccelNoiseScale()
+        self.error_level = ErrorLevel()
 
     def update(
         self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
@@ -196,6 +199,8 @@ class DisplacementUpdates:
         self.outlier_share += gain * (result.gated - self.outlier_share)
         if f.adaptive:
             self.accel_noise = self.accel_noise.updated(result)
+            if f.correlated_errors:
+                self.error_level = self.error_level.updated(result)
         if self.hypotheses.alternative is None and rare and result.gated:
             self.hypotheses.alternative = AlternativeHypothesis(before, before.time)
         elif result.accepted:
@@ -221,9 +226,17 @@ class DisplacementUpdates:
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
-            covariance_W = R_WN @ (covariance_N * f.overlap_scale) @ R_WN.T
+            d_W, covariance_W = R_WN @ d_N, R_WN @ covariance_N @ R_WN.T
+            level, has_turn = self.error_level.level, self._ekf.state.has_turn
+            errors = (
+                displacement_errors(d_W, covariance_W, level, has_turn, f)
+                if f.correlated_errors
+                else None
+            )
+            limit = chi2_quantile(gate, 3)
             return self._ekf.update_displacement(
-                slot, None, R_WN @ d_N, covariance_W, chi2_quantile(gate, 3), gate_mode, power
+                *(slot, None, d_W, f.overlap_scale * covariance_W),
+                *(limit, gate_mode, power, errors),
             )
 
 
@@ -250,9 +263,9 @@ def with_turn(s: EkfState, sigma: float) -> EkfState:
     """Return the state with the network's turn estimated from now on, with prior sigma [rad]."""
     if s.has_turn or sigma == 0.0:
         return s
-    P = s.P.copy()
-    P[s.turn_row, s.turn_row] = sigma**2
-    return changed(s, P=P)
+    P = s.covariances.copy()
+    P[:, s.turn_row, s.turn_row] = sigma**2
+    return changed(s, covariances=P)
 
 
 def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
@@ -260,5 +273,6 @@ def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
     if not s.has_turn:
         return s
     correlation = math.exp(-seconds / TURN_SECONDS)
-    P = gauss_markov(s.P, s.turn_row, correlation, sigma)
-    return changed(s, P=P, network_turn=correlation * s.network_turn)
+    rows = slice(s.turn_row, s.turn_row + 1)
+    P = gauss_markov(s.covariances, rows, correlation, sigma)
+    return changed(s, covariances=P, network_turn=correlation * s.network_turn)

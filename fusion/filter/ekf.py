@@ -9,12 +9,20 @@ to "Displacement measurement".
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
-from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState, FieldState
+from stario.fusion.filter.ekf_state import (
+    CONSIDERED_SECONDS,
+    GYRO_BIAS,
+    EkfState,
+    FieldState,
+    gauss_markov,
+)
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import (
     CLONE,
     CORE,
@@ -23,7 +31,6 @@ from stario.fusion.filter.jacobians import (
     mean_velocity_jacobian,
     position_jacobian,
     propagated,
-    scale_jacobian,
     turn_jacobian,
     velocity_jacobian,
     yaw_jacobian,
@@ -36,6 +43,12 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
+
+if TYPE_CHECKING:
+    from stario.fusion.filter.network_errors import DisplacementErrors
+
+_CLONED = [0, 1, 2, 6, 7, 8]
+"""Rows of theta and rho_p, which a clone copies."""
 
 _PRIOR_TOLERANCE = 1e-6
 """Relative difference up to which two variances count as equal."""
@@ -50,29 +63,35 @@ class StateCloningEkf(ErrorStateEngine):
     Args:
         slots: number of poses that can be held at once.
         gravity: magnitude of gravity [m/s^2].
+        accel_share: actual variance of the accelerometer's noise, as a fraction of that assumed.
 
     Attributes:
         state: everything that varies; assign an earlier one to restore it.
     """
 
-    def __init__(self, slots: int, gravity: float = STANDARD_GRAVITY) -> None:
+    def __init__(
+        self, slots: int, gravity: float = STANDARD_GRAVITY, accel_share: float = 1.0
+    ) -> None:
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
         undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
         self.state = EkfState.initial(undefined, slots)
-        super().__init__(len(self.state.P), considered=self.state.scale_row)
+        covariances = self.state.covariances
+        super().__init__(len(self.state.P), self.state.considered_rows)
+        self.covariances = covariances
         self.gravity = gravity
         self.slots = slots
+        self._accel_share = accel_share
 
     @property
-    def P(self) -> FloatArray:
-        """Covariance (n, n) of the error state."""
-        return self.state.P
+    def covariances(self) -> FloatArray:
+        """Covariances (2, n, n) of the error state."""
+        return self.state.covariances
 
-    @P.setter
-    def P(self, value: FloatArray) -> None:
-        self.state = changed(self.state, P=value)
+    @covariances.setter
+    def covariances(self, value: FloatArray) -> None:
+        self.state = changed(self.state, covariances=value)
 
     def initialise(self, state: NavState) -> None:
         """Set the state from one with plain errors, and drop all clones.
@@ -94,14 +113,16 @@ class StateCloningEkf(ErrorStateEngine):
         self.x[:] = 0.0
 
     def propagate(self, segment: Segment) -> None:
-        """Propagate the current state and its covariance through a preintegrated segment."""
+        """Propagate the current state and its covariances through a preintegrated segment."""
         s = self.state
         pose = s.X[0]
-        end = propagated(segment, pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a)
+        end = propagated(segment, pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a, self._accel_share)
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
-        P = self._propagated(s.P, end.transition, end.noise)
-        self.state = changed(s, time=segment.stop, X=X, P=P)
+        P = self._propagated(s.covariances, end.transition, end.noise)
+        kept = np.exp(-segment.duration / CONSIDERED_SECONDS)
+        P[ACTUAL] = gauss_markov(P[ACTUAL], s.considered_rows, kept, 1.0)
+        self.state = changed(s, time=segment.stop, X=X, covariances=P)
 
     def clone(self, instead_of: int | None = None) -> int:
         """Copy the current pose into a slot and return its number.
@@ -121,15 +142,12 @@ class StateCloningEkf(ErrorStateEngine):
         X = s.X.copy()
         X[1 + slot] = X[0]
         X[1 + slot, :, 3] = 0.0
-        first, P = CORE + CLONE * slot, s.P.copy()
-        for offset, core in ((0, slice(0, 3)), (3, slice(6, 9))):
-            P[first + offset : first + offset + 3] = P[core]
-        rows = P[first : first + CLONE]
-        P[:, first : first + CLONE] = rows.T
-        rows[:3, first : first + CLONE] = P[0:3, first : first + CLONE]
-        rows[3:, first : first + CLONE] = P[6:9, first : first + CLONE]
+        first, P = CORE + CLONE * slot, s.covariances.copy()
+        clone = slice(first, first + CLONE)
+        P[:, clone] = P[:, _CLONED]
+        P[:, :, clone] = P[:, :, _CLONED]
         times = (*s.clone_times[:slot], s.time, *s.clone_times[slot + 1 :])
-        self.state = changed(s, X=X, P=P, clone_times=times)
+        self.state = changed(s, X=X, covariances=P, clone_times=times)
         return slot
 
     def release(self, slot: int) -> None:
@@ -141,10 +159,10 @@ class StateCloningEkf(ErrorStateEngine):
         s = self.state
         s.time_of_clone(slot)
         times = (*s.clone_times[:slot], None, *s.clone_times[slot + 1 :])
-        P, first = s.P.copy(), CORE + CLONE * slot
-        P[first : first + CLONE] = 0.0
+        P, first = s.covariances.copy(), CORE + CLONE * slot
         P[:, first : first + CLONE] = 0.0
-        self.state = changed(s, P=P, clone_times=times)
+        P[:, :, first : first + CLONE] = 0.0
+        self.state = changed(s, covariances=P, clone_times=times)
 
     # --- measurements: README.md, "Displacement measurement" to "Fixes" --------------------------
 
@@ -157,12 +175,13 @@ class StateCloningEkf(ErrorStateEngine):
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
+        errors: DisplacementErrors | None = None,
     ) -> UpdateResult:
         """Update with the displacement from clone i to clone j, in the estimated world.
 
         The network's input was rotated by the estimated attitude, so the displacement contains the
         yaw error of clone i, p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own (turn).
-        Its scale error is considered.
+        Those of its errors that last are considered.
 
         Args:
             slot_i: slot of the window's first pose.
@@ -174,6 +193,7 @@ class StateCloningEkf(ErrorStateEngine):
                 with 3 degrees of freedom); None for no gate.
             gate_mode: what happens to outliers; see `update_linear`.
             power: how strongly outliers are inflated; see `update_linear`.
+            errors: its errors as they are; None if they are white with that covariance.
 
         Raises:
             InputError: a slot holds no clone.
@@ -187,8 +207,12 @@ class StateCloningEkf(ErrorStateEngine):
         if s.has_turn:
             d_W = exp_so3(np.array([0.0, 0.0, -s.network_turn])) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
-        blocks.append(scale_jacobian(d_W, s.scale_row))
-        return self.update_linear(d_W - (p_j - p_i), blocks, covariance, gate, gate_mode, power)
+        noise = None
+        if errors is not None:
+            noise = errors.white
+            blocks.append((s.considered_rows.start, errors.considered))
+        residual = d_W - (p_j - p_i)
+        return self.update_linear(residual, blocks, covariance, gate, gate_mode, power, noise)
 
     def update_mean_velocity(
         self,
@@ -227,7 +251,7 @@ class StateCloningEkf(ErrorStateEngine):
         predicted = self.state.X[0, :, 4]
         residual = p_W - self.state.origin_W - predicted
         blocks = position_jacobian(predicted)
-        return self.update_linear(residual, blocks, covariance, gate)
+        return self.update_linear(residual, blocks, covariance, gate, gains_from=ACTUAL)
 
     def update_velocity_W(
         self, v_W: FloatArray, covariance: FloatArray, gate: float | None = None
@@ -235,7 +259,7 @@ class StateCloningEkf(ErrorStateEngine):
         """Update with the current velocity (3,) [m/s] in the true W, covariance (3, 3)."""
         predicted = self.state.v_W
         blocks = velocity_jacobian(predicted)
-        return self.update_linear(v_W - predicted, blocks, covariance, gate)
+        return self.update_linear(v_W - predicted, blocks, covariance, gate, gains_from=ACTUAL)
 
     def update_yaw(self, yaw: float, sigma: float, gate: float | None = None) -> UpdateResult:
         """Update with the current yaw [rad] as defined by `yaw_twist`; rejected if upside down."""
@@ -244,7 +268,7 @@ class StateCloningEkf(ErrorStateEngine):
         if not math.isfinite(residual[0]):
             return UpdateResult(math.nan, 1, False, reason="yaw not defined upside down")
         covariance = np.array([[sigma * sigma]])
-        return self.update_linear(residual, yaw_jacobian(R), covariance, gate)
+        return self.update_linear(residual, yaw_jacobian(R), covariance, gate, gains_from=ACTUAL)
 
     def update_bearing(
         self, m_B: FloatArray, variance: float, gate: float | None = None
@@ -285,12 +309,19 @@ class StateCloningEkf(ErrorStateEngine):
             rows = P[GYRO_BIAS]
             S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
             K = np.linalg.solve(S, rows).T
-            P = self._considering(P - K @ rows, P)
+            change = -0.5 * (K @ rows + rows.T @ K.T)
+            actual = self.state.P_actual
+            if step > old:
+                actual = actual + change
+            else:  # what the update removes from the error depends on how large that is
+                HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
+                half = K @ (HP - 0.5 * (HP[:, GYRO_BIAS] + R) @ K.T)
+                actual = actual - half - half.T
             self.x = (K @ -self.state.b_g)[:, None]
-            self._inject(0.5 * (P + P.T))
+            self._inject(np.stack([P + change, actual]))
             old = step
 
-    def _inject(self, P: FloatArray) -> None:
+    def _inject(self, covariances: FloatArray) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
         s, dx = self.state, self.x[:, 0]
         xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
@@ -304,5 +335,6 @@ class StateCloningEkf(ErrorStateEngine):
             hard_iron_B = field.hard_iron_B + dx[s.first_field + 2 :]
             field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
         turn = s.network_turn + float(dx[s.turn_row])
-        self.state = changed(s, X=X, b_g=b_g, b_a=b_a, P=P, network_turn=turn, field=field)
+        values = {"X": X, "b_g": b_g, "b_a": b_a, "network_turn": turn, "field": field}
+        self.state = changed(s, covariances=covariances, **values)
         self.x = np.zeros((len(dx), 1))

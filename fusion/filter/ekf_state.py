@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.estimates import Estimate
+from stario.fusion.filter.estimates import ACTUAL, ASSUMED, Estimate
 from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
@@ -25,9 +25,10 @@ _CLONE_COLUMNS = [0, 1, 2, 4]
 GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
 
-_NEGLIGIBLE_SCALE_SIGMA = 1e-6
-"""Sigma of the network's scale error in P: it follows what a scale error would do to the state, yet
-gains do not depend on it (README.md, "The network's scale")."""
+CONSIDERED_SECONDS = np.array([1.2, 1.2, 1.2, math.inf, math.inf, 10.0])
+"""Correlation times [s] of the network's errors that are considered and never estimated: those that
+drift, along W's axes; those that last, along and across the displacement; the floor's slope
+(README.md, "Correlated errors")."""
 
 _MAX_ORIGIN_DISTANCE = 1e3
 """Positions farther than this from the origin [m] are expressed relative to a nearby point: in the
@@ -64,7 +65,9 @@ class EkfState:
         origin_W: (3,) [m].
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
-        P: (n, n) covariance of the error state; zero for an empty slot.
+        covariances: (2, n, n) covariances of the error state, zero for an empty slot: as assumed
+            for the gains, which take the network's errors for white, and as it is, given these
+            gains and the errors' correlation (README.md, "Correlated errors").
         clone_times: times of the clones [s]; None for an empty slot.
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
             zero until fixes determine the direction (`displacements.py`).
@@ -76,7 +79,7 @@ class EkfState:
     origin_W: FloatArray
     b_g: FloatArray
     b_a: FloatArray
-    P: FloatArray
+    covariances: FloatArray
     clone_times: tuple[float | None, ...]
     network_turn: float = 0.0
     field: FieldState | None = None
@@ -87,10 +90,22 @@ class EkfState:
         origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
-        P = np.zeros((CORE + CLONE * slots + 2,) * 2)
-        P[:CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
-        P[-1, -1] = _NEGLIGIBLE_SCALE_SIGMA**2
+        turn_row = CORE + CLONE * slots
+        n = turn_row + 1 + len(CONSIDERED_SECONDS)
+        P = np.zeros((2, n, n))
+        P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
+        P[ACTUAL, turn_row + 1 :, turn_row + 1 :] = np.eye(len(CONSIDERED_SECONDS))
         return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
+
+    @property
+    def P(self) -> FloatArray:
+        """Covariance (n, n) of the error as assumed for the gains."""
+        return self.covariances[ASSUMED]
+
+    @property
+    def P_actual(self) -> FloatArray:
+        """Covariance (n, n) of the error as it is."""
+        return self.covariances[ACTUAL]
 
     @property
     def R_WB(self) -> FloatArray:
@@ -114,7 +129,7 @@ class EkfState:
         Order: rotation about W's axes [rad] (R = (I + [theta]x) R^), velocity [m/s] and position
         [m] in W, biases [rad/s], [m/s^2].
         """
-        return plain_covariance(self.P[:CORE, :CORE], self.X[0, :, 3:].T)
+        return plain_covariance(self.P_actual[:CORE, :CORE], self.X[0, :, 3:].T)
 
     @property
     def turn_row(self) -> int:
@@ -127,19 +142,14 @@ class EkfState:
         return bool(self.P[self.turn_row, self.turn_row] > 0.0)
 
     @property
-    def scale_row(self) -> int:
-        """Row of the network's scale error, which is considered and never estimated."""
-        return self.turn_row + 1
-
-    @property
-    def scale_sensitivity(self) -> FloatArray:
-        """Sensitivity (n,) of the error state to the network's scale error."""
-        return np.asarray(self.P[:, self.scale_row] / self.P[self.scale_row, self.scale_row])
+    def considered_rows(self) -> slice:
+        """Rows of the network's errors that are considered and never estimated."""
+        return slice(self.turn_row + 1, self.first_field)
 
     @property
     def first_field(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return self.scale_row + 1
+        return self.turn_row + 1 + len(CONSIDERED_SECONDS)
 
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
@@ -166,9 +176,10 @@ class EkfState:
     def estimate(self, in_gap: bool = False, map_frame: int = 0) -> Estimate:
         """Return the estimate of the current pose and biases."""
         # Copies: a view would keep the whole covariance alive for as long as the estimate.
-        X, P = self.X[0].copy(), self.P[:CORE, :CORE].copy()
-        J = self.scale_sensitivity[:CORE]
-        return Estimate(self.time, X, self.origin_W, self.b_g, self.b_a, P, J, in_gap, map_frame)
+        X, covariances = self.X[0].copy(), self.covariances[:, :CORE, :CORE].copy()
+        return Estimate(
+            self.time, X, self.origin_W, self.b_g, self.b_a, covariances, in_gap, map_frame
+        )
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
         """Return the current estimate of a clone.
@@ -177,10 +188,12 @@ class EkfState:
             InputError: the slot holds no clone.
         """
         time, first = self.time_of_clone(slot), CORE + CLONE * slot
+        rows = slice(first, first + CLONE)
         X = self.X[1 + slot][:, _CLONE_COLUMNS].copy()
-        P = self.P[first : first + CLONE, first : first + CLONE].copy()
-        J = self.scale_sensitivity[first : first + CLONE]
-        return Estimate(time, X, self.origin_W, self.b_g, self.b_a, P, J, map_frame=map_frame)
+        covariances = self.covariances[:, rows, rows].copy()
+        return Estimate(
+            time, X, self.origin_W, self.b_g, self.b_a, covariances, map_frame=map_frame
+        )
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
@@ -197,22 +210,23 @@ class EkfState:
         shift = new_origin - origin_W  # the part that remains for the poses
         X = R @ self.X
         X[:, :, 4] += shift
-        A = np.eye(len(self.P))
+        A = np.eye(self.covariances.shape[1])
         for first, rho in self._poses():
             A[first : first + 3, first : first + 3] = R
             A[rho : rho + 3, rho : rho + 3] = R
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
         A[3:6, 3:6] = R
-        P = A @ self.P @ A.T
+        P = A @ self.covariances @ A.T
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        return changed(self, X=X, origin_W=origin_W, P=0.5 * (P + P.T), field=field)
+        P = 0.5 * (P + P.transpose(0, 2, 1))
+        return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
 
     def with_yaw_inflated(
         self, about_W: FloatArray, sigma: float, field_too: bool = True
     ) -> EkfState:
-        """Return the state with its covariance inflated by a turn of all poses about a vertical.
+        """Return the state with its covariances inflated by a turn of all poses about a vertical.
 
         Args:
             about_W: (3,) a point on the vertical [m].
@@ -221,27 +235,20 @@ class EkfState:
                 the device turned during a gap.
         """
         x, y, _ = about_W - self.origin_W
-        N = np.zeros((len(self.P), 1))
+        N = np.zeros((self.covariances.shape[1], 1))
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
         if self.field is not None and field_too:
             N[self.first_field, 0] = 1.0
-        return changed(self, P=self.P + sigma**2 * (N @ N.T))
-
-    def with_scale_sigma(self, sigma: float = 0.0) -> EkfState:
-        """Return the state with a covariance that contains this sigma of the network's scale."""
-        J = self.scale_sensitivity
-        sigma = max(sigma, _NEGLIGIBLE_SCALE_SIGMA)
-        added = sigma**2 - self.P[self.scale_row, self.scale_row]
-        return changed(self, P=self.P + added * np.outer(J, J))
+        return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:
-        """Return the state with its covariance inflated by a shift, `sigma` [m] per axis."""
-        N = np.zeros((len(self.P), 3))
+        """Return the state with its covariances inflated by a shift, `sigma` [m] per axis."""
+        N = np.zeros((self.covariances.shape[1], 3))
         for _, rho in self._poses():
             N[rho : rho + 3] = np.eye(3)
-        return changed(self, P=self.P + sigma**2 * (N @ N.T))
+        return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def _poses(self) -> list[tuple[int, int]]:
         """Return the first rows of theta and rho_p of the current pose and of every clone."""
@@ -249,17 +256,19 @@ class EkfState:
         return [(0, 6), *((first, first + 3) for first in rows)]
 
 
-def gauss_markov(P: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:
-    """Return a covariance (n, n) after one error has taken a Gauss-Markov step.
+def gauss_markov(
+    covariances: FloatArray, rows: slice, kept: FloatArray | float, sigma: float
+) -> FloatArray:
+    """Return covariances (..., n, n) after some errors have taken a Gauss-Markov step.
 
     Args:
-        P: covariance before the step.
-        row: row of the error, which varies about zero.
-        kept: correlation of the error with its value before the step.
-        sigma: stationary standard deviation of the error.
+        covariances: before the step.
+        rows: rows of the errors, which vary about zero.
+        kept: correlation of each error with its value before the step.
+        sigma: their stationary standard deviation of the error.
     """
-    P = P.copy()
-    P[row] *= kept
-    P[:, row] *= kept
-    P[row, row] += (1.0 - kept**2) * sigma**2
+    kept, P = np.atleast_1d(kept), covariances.copy()
+    P[..., rows, :] *= kept[:, None]
+    P[..., :, rows] *= kept
+    P[..., rows, rows] += sigma**2 * np.diag(1.0 - kept**2)
     return P

@@ -17,6 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
+from stario.fusion.filter.estimates import ACTUAL, ASSUMED
 from stario.fusion.filter.jacobians import CORE, Block
 from stario.sequences.sequence import FloatArray
 
@@ -30,14 +31,16 @@ class UpdateResult(NamedTuple):
     """Outcome of one measurement.
 
     Attributes:
-        nis: normalised innovation squared under the given covariance, before any inflation;
-            NaN if it could not be computed.
+        nis: normalised innovation squared under the covariance of the error, before any
+            inflation; NaN if it could not be computed.
         dof: dimension of the measurement, the expectation of `nis`.
         accepted: False if the state was left unchanged.
         scale: factor by which the measurement covariance was inflated (1: not gated).
         reason: why the measurement was rejected; empty if it was accepted.
         residual: (m,) measured minus predicted; None if the measurement was invalid.
-        sigma: (m,) standard deviations of the residual under the given covariance; None likewise.
+        sigma: (m,) standard deviations of the residual under the covariance of the error; None
+            likewise.
+        gate_nis: the same NIS under the covariance that the gains assume, which is what gates.
     """
 
     nis: float
@@ -47,6 +50,7 @@ class UpdateResult(NamedTuple):
     reason: str = ""
     residual: FloatArray | None = None
     sigma: FloatArray | None = None
+    gate_nis: float = math.nan
 
     @property
     def gated(self) -> bool:
@@ -62,7 +66,12 @@ class UpdateResult(NamedTuple):
 
 
 class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy is untyped
-    """Covariance of an error state whose mean is zero between steps.
+    """Covariances of an error state whose mean is zero between steps.
+
+    There are two of them: `P`, as assumed for the gains, and the covariance of the error that these
+    gains leave (Gelb 1974, ch. 7: covariance analysis of a filter whose model is not the truth).
+    They differ only by errors that updates consider without estimating them, whose rows of `P` are
+    zero, and by white noise that is smaller than assumed. README.md, "Correlated errors".
 
     filterpy's `P`, `R`, `y`, `z`, `S`, `SI`, `K`, `log_likelihood`, `mahalanobis`, `x_post`,
     `P_prior` and `P_post` describe the last step; `x` is the error's mean. Its `predict` and
@@ -70,14 +79,28 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     Args:
         dim: size of the error state; the first `CORE` rows belong to the current state.
-        considered: row of the error that no update estimates (Schmidt 1966): its gain is zero.
+        considered: rows of the error that no update estimates (Schmidt 1966): their gain is zero.
+
+    Attributes:
+        covariances: (2, n, n) both; replaced, never modified in place.
     """
 
-    def __init__(self, dim: int, considered: int) -> None:
-        super().__init__(dim_x=dim, dim_z=3)
+    covariances: FloatArray
+
+    def __init__(self, dim: int, considered: slice) -> None:
         self._considered = considered
-        self.P = np.zeros((dim, dim))
+        self.covariances = np.zeros((2, dim, dim))
+        super().__init__(dim_x=dim, dim_z=3)
         self.Q = np.zeros((dim, dim))
+
+    @property
+    def P(self) -> FloatArray:
+        """Covariance (n, n) of the error as assumed for the gains."""
+        return self.covariances[ASSUMED]
+
+    @P.setter
+    def P(self, value: FloatArray) -> None:
+        self.covariances = np.stack([value, value])
 
     def update_linear(
         self,
@@ -87,6 +110,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         gate: float | None = None,
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
+        noise: FloatArray | None = None,
+        gains_from: int = ASSUMED,
     ) -> UpdateResult:
         """Update with a measurement that is linear in the error.
 
@@ -99,6 +124,9 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             gate_mode: "inflate" multiplies an outlier's covariance by a power of NIS / gate, so
                 that a run of outliers can still correct a wrong filter; "reject" drops it.
             power: exponent of NIS / gate in that factor.
+            noise: (m, m) covariance of the measurement's white noise if it is not `covariance`,
+                which then also stands for considered errors.
+            gains_from: which covariance determines the gains: `ASSUMED` or `ACTUAL`.
 
         Returns:
             The outcome. Values that are not finite and covariances that are not positive definite
@@ -109,26 +137,33 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             return UpdateResult(math.nan, m, False, reason="value that is not finite")
         if dpotrf(covariance, lower=1)[1] != 0:
             return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
-        HP = _sum([H @ self.P[first : first + H.shape[1]] for first, H in blocks])
-        HPH = _sum([HP[:, first : first + H.shape[1]] @ H.T for first, H in blocks])
-        whitener = _whitener(HPH + covariance)
-        white = whitener @ residual
-        nis = float(white @ white)
-        sigma = np.sqrt((HPH + covariance).diagonal())
+        HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
+        HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
+        noise = covariance if noise is None else noise
+        nis, sigma = _normalised(residual, HPH[ACTUAL] + noise)
+        whitener = _whitener(HPH[gains_from] + covariance)
+        whitened = whitener @ residual
+        gate_nis = float(whitened @ whitened)
         scale = 1.0
-        if gate is not None and nis > gate:
+        if gate is not None and gate_nis > gate:
             if gate_mode == "reject":
-                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma)
-            scale = (nis / gate) ** power
+                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
+            scale = (gate_nis / gate) ** power
             covariance = covariance * scale
-            whitener = _whitener(HPH + covariance)
-        if not math.isfinite(nis):
+            whitener = _whitener(HPH[gains_from] + covariance)
+        if not math.isfinite(gate_nis):
             return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        self._inject(self._correct(residual, blocks, covariance, HP, HPH, whitener))
-        return UpdateResult(nis, m, True, scale, "", residual, sigma)
+        if gains_from == ASSUMED:
+            P = self._correct(residual, blocks, covariance, HP[ASSUMED], HPH[ASSUMED], whitener)
+        else:
+            self._set_gain(residual, covariance, HP[ACTUAL], HPH[ACTUAL], whitener)
+            P = self._with_gain(ASSUMED, blocks, covariance, HP, HPH)
+        actual = self._with_gain(ACTUAL, blocks, scale * noise, HP, HPH)
+        self._inject(np.stack([P, actual]))
+        return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
-    def _inject(self, P: FloatArray) -> None:
-        """Move the error's mean `x` into the state and set it to zero; P is its new covariance."""
+    def _inject(self, covariances: FloatArray) -> None:
+        """Move the error's mean `x` into the state and set it to zero, with new covariances."""
         raise NotImplementedError
 
     @property
@@ -142,12 +177,14 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
 
     # --- structured algebra ----------------------------------------------------------------------
 
-    def _propagated(self, P: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
-        P = P.copy()
-        P[:CORE] = transition @ P[:CORE]
-        P[CORE:, :CORE] = P[:CORE, CORE:].T
-        core = P[:CORE, :CORE] @ transition.T + noise
-        P[:CORE, :CORE] = 0.5 * (core + core.T)
+    def _propagated(
+        self, covariances: FloatArray, transition: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        P = covariances.copy()
+        P[:, :CORE] = transition @ P[:, :CORE]
+        P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
+        core = P[:, :CORE, :CORE] @ transition.T + noise
+        P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
         return P
 
     def _correct(
@@ -160,7 +197,23 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         whitener: FloatArray,
     ) -> FloatArray:
         """Return P - K S K^T, computed as P - W^T W with W = L^-1 H P, which is symmetric."""
-        W = whitener @ HP
+        W = self._set_gain(residual, covariance, HP, HPH, whitener)
+        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
+            return self._joseph(self.P, blocks, covariance)
+        # P is symmetric: its transpose is the same matrix in BLAS order.
+        P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
+        return P
+
+    def _set_gain(
+        self,
+        residual: FloatArray,
+        covariance: FloatArray,
+        HP: FloatArray,
+        HPH: FloatArray,
+        whitener: FloatArray,
+    ) -> FloatArray:
+        """Set the gain and filterpy's attributes of the step; return W."""
+        W: FloatArray = whitener @ HP
         self.R, self.S = covariance, HPH + covariance
         self.SI = whitener.T @ whitener
         self.K = (whitener.T @ W).T
@@ -169,27 +222,41 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
-            return self._correct_as_joseph(blocks)
-        # P is symmetric: its transpose is the same matrix in BLAS order.
-        P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
-        return self._considering(P, self.P)
+        return W
 
-    def _considering(self, P: FloatArray, before: FloatArray) -> FloatArray:
-        """Return a new covariance after an update, with the considered error's variance as before.
+    def _with_gain(
+        self,
+        which: int,
+        blocks: Sequence[Block],
+        covariance: FloatArray,
+        HP: FloatArray,
+        HPH: FloatArray,
+    ) -> FloatArray:
+        """Return a covariance after the update with the gain K, whatever determined it.
 
-        Its covariances with other errors depend on their gains alone, as in any update.
+        (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K (H P H^T + R) K^T
         """
-        P[self._considered, self._considered] = before[self._considered, self._considered]
-        return P
+        P = self.covariances[which]
+        if (HPH[which].diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
+            return self._joseph(P, blocks, covariance)
+        half = self.K @ (HP[which] - 0.5 * (HPH[which] + covariance) @ self.K.T)
+        return np.asarray(P - half - half.T)
 
-    def _correct_as_joseph(self, blocks: Sequence[Block]) -> FloatArray:
+    def _joseph(
+        self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray
+    ) -> FloatArray:
         """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
-        A = np.eye(len(self.P))
+        A = np.eye(len(P))
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= self.K @ H
-        P = A @ self.P @ A.T + self.K @ self.R @ self.K.T
+        P = A @ P @ A.T + self.K @ covariance @ self.K.T
         return np.asarray(0.5 * (P + P.T))
+
+
+def _normalised(residual: FloatArray, covariance: FloatArray) -> tuple[float, FloatArray]:
+    """Return the normalised square (NaN if there is none) and sigmas of a residual."""
+    white = _whitener(covariance) @ residual
+    return float(white @ white), np.sqrt(covariance.diagonal())
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

@@ -29,6 +29,7 @@ from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
 from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
 from stario.fusion.filter.map_frame import MapFrame
+from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
@@ -69,8 +70,10 @@ class Estimator:
     ) -> None:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
-        self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma, f.network_scale_sigma)
+        self.ekf = StateCloningEkf(
+            f.window_updates, config.gravity, ACCEL_SHARE if f.correlated_errors else 1.0
+        )
+        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
         )
@@ -285,6 +288,7 @@ class Estimator:
             self._displacements.outlier_share,
             self.bias.prior,
             self._displacements.accel_noise,
+            self._displacements.error_level,
             self._hypotheses.alternative,
             self._counts,
             self.in_gap,
@@ -299,6 +303,7 @@ class Estimator:
         self._magnetic, self.bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
         self._displacements.outlier_share = s.outlier_share
         self._displacements.accel_noise = s.accel_noise
+        self._displacements.error_level = s.error_level
         self._hypotheses.alternative = s.alternative
         self.in_gap, self.released, self._history = s.in_gap, s.released, s.history
 
@@ -315,8 +320,7 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`released` as a `SmoothedPose`; None at first."""
-        sigma = self._config.filter.network_scale_sigma
-        return smoothed_poses([self.released], sigma)[0] if self.released else None
+        return smoothed_poses([self.released])[0] if self.released else None
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
@@ -324,8 +328,7 @@ class Estimator:
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
-        states = nav_states([self.estimate()], self._config.filter.network_scale_sigma)
-        return with_undirected(states, self.frame.state.undirected)[0]
+        return with_undirected(nav_states([self.estimate()]), self.frame.state.undirected)[0]
 
     def innovations(self) -> Innovations:
         """Return every innovation so far."""
@@ -335,6 +338,7 @@ class Estimator:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self._displacements.accel_noise.factor
+        health.network_error_level = self._displacements.error_level.level
         if self._config.filter.declination is not None and not self.frame.state.oriented:
             health.notes.append("north could not be determined: the track starts with yaw zero")
         return health

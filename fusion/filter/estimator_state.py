@@ -16,6 +16,7 @@ from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.magnetic import MagneticReference
+from stario.fusion.filter.network_errors import ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts
@@ -158,6 +159,7 @@ class EstimatorState:
         outlier_share: fraction of outliers among recent displacements.
         bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
         accel_noise: estimated scale of the accelerometer's noise.
+        error_level: estimated level of the network's errors.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
         in_gap: whether the last interval had no samples.
@@ -173,6 +175,7 @@ class EstimatorState:
     outlier_share: float
     bias_prior: GyroBiasPrior
     accel_noise: AccelNoiseScale
+    error_level: ErrorLevel
     alternative: AlternativeHypothesis | None
     counts: UpdateCounts
     in_gap: bool

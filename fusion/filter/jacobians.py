@@ -9,6 +9,7 @@ Derivations: README.md, "Error state" to "Fixes".
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import gtsam
@@ -55,11 +56,6 @@ def displacement_jacobian(
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
     """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
     return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
-
-
-def scale_jacobian(d_W: FloatArray, scale_row: int) -> Block:
-    """Return the block for the network's scale error: -d over the floor, d (3,) [m]."""
-    return scale_row, np.array([[-d_W[0]], [-d_W[1]], [0.0]])
 
 
 def mean_velocity_jacobian(
@@ -155,7 +151,7 @@ class Propagation(NamedTuple):
     transition: FloatArray
     """(15, 15)."""
     noise: FloatArray
-    """(15, 15)."""
+    """(2, 15, 15) as assumed for the gains, and as it is."""
 
 
 def propagated(
@@ -165,6 +161,7 @@ def propagated(
     p_W: FloatArray,
     b_g: FloatArray,
     b_a: FloatArray,
+    accel_share: float = 1.0,
 ) -> Propagation:
     """Return `Segment.predict` with the transition and noise of the right-invariant error.
 
@@ -183,7 +180,11 @@ def propagated(
     adjoint[3:6, 6:9] = R
     adjoint[6:9, 3:6] = R
     adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
-    noise = adjoint @ segment.pim.residualCovariance() @ adjoint.T
+    local = segment.pim.residualCovariance()
+    actual = local.copy()
+    actual[3:9] *= math.sqrt(accel_share)
+    actual[:, 3:9] *= math.sqrt(accel_share)
+    noise = adjoint @ np.stack([local, actual]) @ adjoint.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian

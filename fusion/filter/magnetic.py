@@ -210,7 +210,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
     yaw = yaw_twist(s.R_WB)
     if s.field is None or reference.count < _MIN_NORTH_COUNT or not math.isfinite(yaw):
         return None
-    c, P = s.first_field, s.P
+    c, P = s.first_field, s.P_actual
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
     turn = math.pi / 2.0 - declination - s.field.azimuth
     sigma = math.sqrt(max(variance, 0.0) + NORTH_SIGMA**2)
@@ -221,10 +221,10 @@ def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
     variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
-    n = len(s.P)
-    P = np.zeros((n + len(variances),) * 2)
-    P[:n, :n], P[n:, n:] = s.P, np.diag(variances)
-    return changed(s, P=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
+    n = s.first_field
+    P = np.zeros((2, n + len(variances), n + len(variances)))
+    P[:, :n, :n], P[:, n:, n:] = s.covariances, np.diag(variances)
+    return changed(s, covariances=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
 def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
@@ -238,8 +238,9 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     assert s.field is not None  # set by `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.P, s.first_field + 1, correlation, sigma)
-    return changed(s, P=P, field=changed(s.field, wander=correlation * s.field.wander))
+    wander = slice(s.first_field + 1, s.first_field + 2)
+    P = gauss_markov(s.covariances, wander, correlation, sigma)
+    return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 
 def update_bearing(

@@ -70,32 +70,21 @@ class MapFrame:
         prior: prior on the first pose; None if the track starts without one.
         gate: probability of the chi-square test.
         turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
-        scale_sigma: sigma of its scale error, `FilterConfig.network_scale_sigma`.
 
     Attributes:
         state: state of the map frame.
     """
 
-    def __init__(
-        self, prior: PriorPose | None, gate: float, turn_sigma: float, scale_sigma: float
-    ) -> None:
+    def __init__(self, prior: PriorPose | None, gate: float, turn_sigma: float) -> None:
         self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
         if prior is not None:
             oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
             variance = 2.0 * prior.position_sigma**2
             self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
-        self._gate, self._turn_sigma, self._scale_sigma = gate, turn_sigma, scale_sigma
+        self._gate, self._turn_sigma = gate, turn_sigma
 
     def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
-        """Apply a fix at the filter's time, with gains that know the network's scale error."""
-        before = ekf.state
-        ekf.state = uncertain = before.with_scale_sigma(self._scale_sigma)
-        result = self._applied(ekf, fix)
-        # A refused fix changes nothing, not even by rounding.
-        ekf.state = before if ekf.state is uncertain else ekf.state.with_scale_sigma()
-        return result
-
-    def _applied(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+        """Apply a fix at the filter's time."""
         if fix.kind == "position" and self._needs_placing(ekf, fix):
             transform: FrameTransform | None = self._place(ekf, fix)
         elif self.state.oriented:

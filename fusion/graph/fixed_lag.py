@@ -17,7 +17,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimates import nav_states, plain_scale_sensitivities, with_error
+from stario.fusion.filter.estimates import ASSUMED, nav_states, with_actual_covariances
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement, EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
@@ -153,10 +153,8 @@ class FixedLagEstimator:
         """Return the newest state."""
         ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
         state = nav_states([ahead])[0].shifted(self._origin_W)
-        # The graph's measurements are the filter's, and so is its sensitivity to the scale.
-        error = plain_scale_sensitivities([self._filter.estimate()])[0]
-        error *= self._config.filter.network_scale_sigma
-        return with_undirected([with_error(state, error)], self._filter.frame.state.undirected)[0]
+        states = with_actual_covariances([state], [self._filter.estimate()])
+        return with_undirected(states, self._filter.frame.state.undirected)[0]
 
     def health(self, counts: SampleCounts) -> Health:
         """Return the filter's report with the graph's sigmas and the number of fallbacks."""
@@ -204,7 +202,7 @@ class FixedLagEstimator:
 
     def _begin(self, count: int) -> None:
         """Begin a new graph from the filter's state."""
-        first = nav_states([self._filter.estimate()])[0]
+        first = nav_states([self._filter.estimate()], ASSUMED)[0]
         self._map_frame, self._origin_W = first.map_frame, first.p_W
         self._jumps = self._filter.frame.state.jumps
         self._bias_prior = self._filter.bias.prior.variance

@@ -30,6 +30,11 @@ Displacement = tuple[FloatArray, FloatArray]
 """Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
 
+def slope_variance(d: FloatArray) -> FloatArray:
+    """Return the variance [m^2] of the heights of displacements (..., 3) [m] due to slopes."""
+    return np.asarray(SLOPE_SIGMA**2 * np.square(d[..., :2]).sum(axis=-1))
+
+
 class Predictor(Protocol):
     """Interface that a navigator requires of a model; `DisplacementModel` implements it.
 
@@ -126,7 +131,7 @@ def displacements_of(
     flagged = np.array([interval.window_flagged for interval in intervals])
     covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
     with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values
-        covariance_N[:, 2, 2] += SLOPE_SIGMA**2 * np.square(mean_N[:, :2]).sum(axis=1)
+        covariance_N[:, 2, 2] += slope_variance(mean_N)
     return [
         (d_N, floored(C, MIN_DISPLACEMENT_SIGMA))
         for d_N, C in zip(mean_N, covariance_N, strict=True)

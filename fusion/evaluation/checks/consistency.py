@@ -268,8 +268,7 @@ def _errors(
     b_g: FloatArray,
     b_a: FloatArray,
 ) -> tuple[float, float, float]:
-    X, J = now.X, now.scale_sensitivity
-    P = now.P + scale_sigma**2 * np.outer(J, J)
+    X, P = now.X, now.covariances[ACTUAL]
     R = walk.R_WB[k] @ X[:, :3].T
     pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])
     error = np.concatenate([pose, b_g - now.b_g, b_a - now.b_a])

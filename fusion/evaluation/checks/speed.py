@@ -15,6 +15,7 @@ import numpy as np
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, demonstration
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.navigator import Navigator
@@ -40,11 +41,14 @@ _DURATION, _IMU_RATE, _UPDATE_RATE, _WINDOW = 5.0, 200.0, 20.0, 1.0
 class DenseEkf(StateCloningEkf):
     """The same filter using filterpy's own `predict` and `update` on the full matrices."""
 
-    def _propagated(self, P: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
+    def _propagated(
+        self, covariances: FloatArray, transition: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        actual = super()._propagated(covariances, transition, noise)[ACTUAL]
         self.F[:CORE, :CORE] = transition
         self.Q[:CORE, :CORE] = noise
         self.predict()
-        return self.P
+        return np.stack([self.P, actual])
 
     def _correct(
         self,
@@ -58,9 +62,10 @@ class DenseEkf(StateCloningEkf):
         H = np.zeros((len(residual), self.dim_x))
         for first, block in blocks:
             H[:, first : first + block.shape[1]] = block
-        self.R, before = covariance, self.P
+        self.R, before = covariance, self.covariances
         self.update(residual[:, None], lambda x: H, lambda x: H @ x)
-        return self._considering(self.P, before)
+        P, self.covariances = self.P, before  # the other covariance is yet to be updated
+        return P
 
 
 def engine_speed() -> tuple[float, float]:
