@@ -16,12 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimates import Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.estimates import ACTUAL, Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.stateful import slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
 from stario.fusion.recording import cut_recording
 from stario.sequences.accuracy.nees import nees_bounds
@@ -201,19 +204,20 @@ def _run(
     for bias, density in ((b_g, noise.gyro_walk), (b_a, noise.accel_walk)):
         bias += density * rng.normal(size=bias.shape).cumsum(axis=0) / white
     gyro = walk.gyro + b_g + noise.gyro_noise * white * rng.normal(size=b_g.shape)
-    accel = walk.accel + b_a + noise.accel_noise * white * rng.normal(size=b_a.shape)
+    share = ACCEL_SHARE if config.filter.correlated_errors else 1.0
+    accel_noise = math.sqrt(share) * noise.accel_noise
+    accel = walk.accel + b_a + accel_noise * white * rng.normal(size=b_a.shape)
 
     intervals, front_end = cut_recording(ImuSequence("walk", walk.time, gyro, accel), config)
     assert front_end.start is not None  # two seconds are enough
     estimator = Estimator(config, front_end.start, prior)
-    scale_sigma = config.filter.network_scale_sigma
-    scale = 1.0 - scale_sigma * rng.normal()
+    network = _DrawnNetwork(walk, config, rng)
     rows = []
     for count, interval in enumerate(intervals, 1):
-        estimator.step(interval, _drawn_displacement(walk, interval, scale, config, rng))
+        estimator.step(interval, network.displacement(interval))
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
-            rows.append(_errors(estimator.estimate(), scale_sigma, walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
     return np.array(rows), float(estimator.innovations().nis.mean())
 
 
@@ -239,30 +243,49 @@ def _drawn_start(
     return prior, b_g, b_a
 
 
-def _drawn_displacement(
-    walk: AnalyticWalk,
-    interval: ImuInterval,
-    scale: float,
-    config: NavigatorConfig,
-    rng: np.random.Generator,
-) -> Displacement | None:
-    """Draw a window's displacement in its levelled frame, with the errors the filter assumes."""
-    if interval.R_NB_window is None:
-        return None
-    stop = round(interval.stop * RATE)
-    start = stop - round(WINDOW_SECONDS * RATE)
-    d_N = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T).T @ (
-        walk.position_W[stop] - walk.position_W[start]
-    )
-    # The filter treats overlapping windows as less certain than each one is.
-    sigma = _DISPLACEMENT_SIGMA * math.sqrt(config.filter.overlap_scale)
-    noise = sigma * rng.normal(size=3)
-    return d_N * (scale, scale, 1.0) + noise, _DISPLACEMENT_SIGMA**2 * np.eye(3)
+class _DrawnNetwork:
+    """Displacements with the errors that the filter's covariance contains.
+
+    Args:
+        walk: the walk.
+        config: configuration of the filter.
+        rng: source of the errors.
+    """
+
+    def __init__(
+        self, walk: AnalyticWalk, config: NavigatorConfig, rng: np.random.Generator
+    ) -> None:
+        self._walk, self._config, self._rng = walk, config, rng
+        self._lasting = rng.normal(size=len(CONSIDERED_SECONDS))
+        self._time = 0.0
+
+    def displacement(self, interval: ImuInterval) -> Displacement | None:
+        """Return the displacement of the window that ends with an interval, in its frame N."""
+        if interval.R_NB_window is None:
+            return None
+        walk, f, rng = self._walk, self._config.filter, self._rng
+        kept = np.exp((self._time - interval.stop) / CONSIDERED_SECONDS)
+        drawn = rng.normal(size=len(kept))
+        self._lasting = kept * self._lasting + np.sqrt(1.0 - kept**2) * drawn
+        self._time = interval.stop
+        stop = round(interval.stop * RATE)
+        start = stop - round(WINDOW_SECONDS * RATE)
+        d_W = walk.position_W[stop] - walk.position_W[start]
+        covariance = _DISPLACEMENT_SIGMA**2 * np.eye(3)
+        covariance[2, 2] += slope_variance(d_W)
+        if f.correlated_errors:
+            errors = displacement_errors(d_W, covariance, 1.0, False, f)
+            d_W = d_W + errors.considered @ self._lasting
+            white = errors.white
+        else:  # overlapping windows count as less certain than each one is
+            white = f.overlap_scale * covariance
+        d_W = d_W + np.linalg.cholesky(white) @ rng.normal(size=3)
+        R_WN = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T)
+        return R_WN.T @ d_W, covariance
 
 
 def _errors(
     now: Estimate,
-    scale_sigma: float,
     walk: AnalyticWalk,
     k: int,
     b_g: FloatArray,
